@@ -1,0 +1,22 @@
+"""Precomputed radiance transfer in JAX.
+
+Conventions, everywhere in this package:
+
+* The world is right-handed and +y is up. Latitude-longitude images have +y in the top row, +z in the
+  centre column and +x a quarter of the width from the left.
+* The local frame of a surface point is (tangent, bitangent, normal) = (x, y, z).
+* ``wi`` points to the light and ``wo`` to the viewer: unit vectors away from the surface, in the local frame;
+  a name that ends in ``_world`` is in the world's frame. Angles are in radians.
+* Radiance is linear Rec. 709 RGB. A BRDF is in 1/sr and holds its own 1/pi; the cosine and the solid angle live
+  in the transport. Nothing is clamped inside a linear operator; only display clamps.
+* Cubemaps are ``[6, n, n]``: faces +x, -x, +y, -y, +z, -z, rows and columns as OpenGL has them.
+* Images are ``[h, w, c]``, first row on top.
+* Axis letters: v vertices, f faces, d directions, b basis functions, k kept coefficients, r BRDF terms,
+  c colors, h w image, n texels along an edge.
+* Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
+"""
+
+from jaxprt import brdf, files, image, linalg, relight, scene, sphere, transport
+
+__all__ = ["brdf", "files", "image", "linalg", "relight", "scene", "sphere", "transport"]
+__version__ = "0.1.0"
