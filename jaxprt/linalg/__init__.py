@@ -1,1 +1,5 @@
-"""linalg."""
+"""Factorizations; they know no BRDF and no mesh."""
+
+from jaxprt.linalg import eigen
+
+__all__ = ["eigen"]

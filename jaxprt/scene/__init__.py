@@ -1,7 +1,8 @@
 """What is looked at: meshes, environments, cameras, embedded scenes."""
 
+from jaxprt.scene import builtin, camera, environment, mesh
 from jaxprt.scene.camera import Camera
-from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.environment import Environment, load_environment
+from jaxprt.scene.mesh import Mesh, load_mesh
 
-__all__ = ["Camera", "Environment", "Mesh"]
+__all__ = ["Camera", "Environment", "Mesh", "builtin", "camera", "environment", "load_environment", "load_mesh", "mesh"]

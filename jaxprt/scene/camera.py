@@ -1,7 +1,11 @@
 """The camera: where the picture is taken from."""
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from jaxprt.scene.mesh import Mesh, bounds
 
 
 class Camera(eqx.Module):
@@ -9,7 +13,7 @@ class Camera(eqx.Module):
 
     Attributes:
         eye: Position in world units.
-        target: The point that falls on the picture's centre.
+        target: The point that falls on the picture's center.
         up: Direction that points up in the picture; not parallel to the view.
         field_of_view: Full vertical angle of view in radians.
         width: Picture width in pixels.
@@ -22,3 +26,55 @@ class Camera(eqx.Module):
     field_of_view: Float[Array, ""]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+
+
+def orbit(
+    mesh: Mesh,
+    *,
+    azimuth: float = 0.0,
+    elevation: float = 0.0,
+    field_of_view: float = 0.6,
+    width: int = 512,
+    height: int = 512,
+) -> Camera:
+    """A camera around a mesh that sees all of it: its bounding sphere touches the picture's nearer edges.
+
+    The camera looks at the center of the bounding box, around which the sphere is; vertices without
+    faces do not count. From straight above or below, the picture's up direction is the one that
+    it approaches with the elevation.
+
+    Args:
+        mesh: What to look at.
+        azimuth: Turn around +y; 0 is on the +z side, positive towards +x.
+        elevation: Angle above the horizon, -pi/2 to pi/2.
+        field_of_view: Full vertical angle of view.
+        width: Picture width in pixels.
+        height: Picture height in pixels.
+
+    Returns:
+        The camera.
+
+    Raises:
+        ValueError: The picture has no pixels, or an angle is out of its range.
+    """
+    if width < 1 or height < 1:
+        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+    if not 0 < field_of_view < np.pi:
+        raise ValueError(f"field_of_view must be between 0 and pi, got {field_of_view}")
+    if not abs(elevation) <= np.pi / 2:
+        raise ValueError(f"elevation must be from -pi/2 to pi/2, got {elevation}")
+    if not np.isfinite(azimuth):
+        raise ValueError(f"azimuth must be finite, got {azimuth}")
+    low, high = bounds(mesh)
+    center = (low + high) / 2
+    corner = np.asarray(mesh.position, np.float64)[np.unique(mesh.face)]
+    radius = np.linalg.norm(corner - center, axis=1).max() or 1.0
+    half = np.arctan(np.tan(field_of_view / 2) * min(1.0, width / height))
+    around = np.array([np.sin(azimuth), np.cos(azimuth)])
+    back = np.array([around[0] * np.cos(elevation), np.sin(elevation), around[1] * np.cos(elevation)])
+    up = np.array([-around[0] * np.sin(elevation), np.cos(elevation), -around[1] * np.sin(elevation)])
+    eye, target, up, angle = (
+        jnp.asarray(value, mesh.position.dtype)
+        for value in (center + radius / np.sin(half) * back, center, up, field_of_view)
+    )
+    return Camera(eye, target, up, angle, width, height)

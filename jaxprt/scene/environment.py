@@ -1,7 +1,32 @@
-"""Environment maps: distant light on a cubemap."""
+"""Environment maps: distant light on a cubemap, from image files and arrays, turned and looked up."""
+
+import functools
+import pathlib
+import warnings
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64
+
+from jaxprt.files import images
+from jaxprt.sphere import cubemap
+
+# How each layout holds the six faces: its height and width in faces; the row and column of face +x, -x, +y,
+# -y, +z, -z; and the steps in row and column by which a face's pixels are read to be as OpenGL has them.
+_PLAIN = ((1, 1),) * 6
+_CROSS_STEP = ((1, -1), (1, -1), (-1, 1), (-1, 1), (-1, 1), (1, -1))
+_OPENEXR_STEP = ((1, -1), (1, -1), (-1, 1), (-1, 1), (1, -1), (1, -1))
+_CUBES = {
+    "vertical-cross": ((4, 3), ((1, 2), (1, 0), (0, 1), (2, 1), (3, 1), (1, 1)), _CROSS_STEP),
+    "vertical-strip": ((6, 1), tuple((i, 0) for i in range(6)), _PLAIN),
+    "horizontal-strip": ((1, 6), tuple((0, i) for i in range(6)), _PLAIN),
+    "openexr-cube": ((6, 1), tuple((i, 0) for i in range(6)), _OPENEXR_STEP),
+}
+_PARTS = 8  # A pixel is dealt out in at most as many parts in each direction; larger pixels are first divided.
+_CHUNK = 2**20  # Parts of pixels that are dealt out at a time.
+LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
 class Environment(eqx.Module):
@@ -12,3 +37,315 @@ class Environment(eqx.Module):
     """
 
     radiance: Float[Array, "*l 6 n n c"]
+
+
+def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | None = None) -> Environment:
+    """Loads distant light from an image file.
+
+    The layout is told from the EXR attribute ``envmap`` or else from the shape: twice as wide as high is
+    "latlong", 3 : 4 "vertical-cross", 1 : 6 "vertical-strip" and 6 : 1 "horizontal-strip"; a single pixel is
+    light of one color. See ``resample`` for what each means.
+
+    Args:
+        path: The file, see ``jaxprt.files.read_image``.
+        size: Texels along the edge of a cube face.
+        layout: One of ``LAYOUTS``; needed only where it cannot be told.
+
+    Returns:
+        Light in three colors. Negative values, which lossy files hold, are set to zero with a warning.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not an undamaged image of a known layout, or holds NaN or infinity.
+    """
+    image, attributes = images.read_image(path)
+    if layout is None and "envmap" in attributes:
+        layout = {"latlong": "openexr-latlong", "cube": "openexr-cube"}[attributes["envmap"]]
+    return environment_from_image(image, size=size, layout=layout, name=str(path))
+
+
+def environment_from_image(
+    image: Float[np.ndarray | Array, "h w c"],
+    *,
+    size: int = 64,
+    layout: str | None = None,
+    name: str = "image",
+) -> Environment:
+    """Makes distant light of an image in memory, with the checks of ``load_environment``.
+
+    Args:
+        image: Linear radiance with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels; alpha is ignored.
+        size: Texels along the edge of a cube face.
+        layout: One of ``LAYOUTS``; None tells it from the shape.
+        name: What to call the image in messages.
+
+    Returns:
+        Light in three colors.
+
+    Raises:
+        ValueError: The image is of no known layout or number of channels, or holds NaN or infinity.
+    """
+    image = np.asarray(image)
+    layout = layout or _layout_of(image, name)
+    _check_layout(image, layout, name)
+    return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
+
+
+def resample(
+    image: Float[np.ndarray, "h w c"], *, layout: str = "latlong", size: int = 64
+) -> Float64[np.ndarray, "6 n n c"]:
+    """Means of a picture of the whole sphere over cubemap texels, each pixel a box of constant radiance.
+
+    The integral over the sphere is conserved per channel and constants are reproduced, both to rounding,
+    whether the pixels are larger or smaller than the texels. Cubes are resampled exactly. Layouts:
+
+    * "latlong": the top row is +y, the center column +z, and +x a quarter of the width from the left;
+      direction (sin lon cos lat, sin lat, cos lon cos lat), lon from pi on the left to -pi.
+    * "openexr-latlong": the same, but the pixels are samples that include both poles and both ends of the
+      longitude, so that the boxes on the border are half as large.
+    * "vertical-cross": 3 x 4 faces seen from inside: +y on top; -x, -z and +x in the second row; then -y; and
+      +z at the bottom, upside down.
+    * "vertical-strip", "horizontal-strip": faces +x, -x, +y, -y, +z, -z as OpenGL has them.
+    * "openexr-cube": OpenEXR's faces, from top to bottom, whose pixels are samples that include the edges.
+
+    Args:
+        image: Radiance, any number of channels.
+        layout: One of ``LAYOUTS``.
+        size: Texels along the edge of a cube face.
+
+    Returns:
+        Mean radiance of each texel.
+
+    Raises:
+        ValueError: The layout is unknown or cannot have the image's shape.
+    """
+    _check_layout(image, layout, "image")
+    if size < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+    if layout in _CUBES:
+        face = _cut_faces(image, layout)
+        return _resample_cube(face, _box_edge(face.shape[1], on_edge=layout == "openexr-cube"), size)
+    on_edge = layout == "openexr-latlong"
+    latitude, longitude = (-_box_edge(count, on_edge=on_edge) for count in image.shape[:2])
+    return _resample_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size)
+
+
+@functools.partial(jax.jit, static_argnames="samples")
+def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
+    """Turns distant light: what came from s comes from R s.
+
+    Each texel is the mean of ``samples`` x ``samples`` parts. The value of a part is bilinear, with a
+    transition from texel to texel as wide as a part: the mean is then the overlap of turned texels with those
+    of the cube, as nearly as parts can follow it. So a sun in one texel glides instead of flickering, and
+    turns that map the cube onto itself permute the texels. As parts cover some texels of the old light more
+    than others, its values are weighted to make up for that; and each color is scaled so that its integral
+    over the sphere stays what it was. Constant light stays as it is. The light is meant to be non-negative.
+
+    Differentiable in both arguments; at the identity the gradient is the central one of a piecewise smooth
+    function.
+
+    Args:
+        light: One light, or a batch of them.
+        rotation: A proper rotation matrix.
+        samples: Parts along the edge of a texel.
+
+    Returns:
+        The turned light.
+
+    Raises:
+        ValueError: The number of samples is below 1.
+
+    Reference: the weights are one step of the balancing in Sinkhorn and Knopp 1967.
+    """
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, got {samples}")
+    radiance = light.radiance
+    n = radiance.shape[-2]
+    # Points on the cube have texel fractions for coordinates, which quarter turns keep exactly.
+    point = cubemap.point(size=n * samples).astype(radiance.dtype)
+    source = (point[..., None] * rotation.astype(radiance.dtype)).sum(-2)
+    area = cubemap.solid_angle(size=n).astype(radiance.dtype)[..., None]
+    weight = cubemap.solid_angle(size=n * samples).astype(radiance.dtype).reshape(6, n, samples, n, samples, 1)
+
+    def flux(value):
+        part = cubemap.lookup(value, source, sharpness=samples)
+        return (part.reshape(6, n, samples, n, samples, -1) * weight).sum((2, 4))
+
+    one = jnp.ones_like(area)
+    (covered,) = jax.linear_transpose(flux, one)(one)
+    balance = jnp.where(covered > 0, area / jnp.where(covered > 0, covered, 1), 1)
+    flat = jnp.moveaxis(radiance.reshape(-1, 6, n, n, radiance.shape[-1]), 0, 3).reshape(6, n, n, -1)
+    total = flux(jnp.concatenate([flat * balance, balance], axis=-1))
+    turned = total[..., :-1] / total[..., -1:]
+
+    before, after = ((area * value).sum((0, 1, 2)) for value in (flat, turned))
+    turned = turned * jnp.where(after == 0, 1, before / jnp.where(after == 0, 1, after))
+    batched = turned.reshape(6, n, n, -1, radiance.shape[-1])
+    return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
+
+
+@jax.jit
+def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+    """Radiance that arrives from some directions in the world, bilinear between texels.
+
+    Args:
+        light: One light, not a batch.
+        direction: Directions of any length.
+
+    Returns:
+        Radiance.
+    """
+    return cubemap.lookup(light.radiance, direction)
+
+
+def _layout_of(image: np.ndarray, name: str) -> str:
+    height, width = image.shape[:2]
+    if width == 2 * height or height == width == 1:
+        return "latlong"
+    for layout, ((rows, columns), *_) in _CUBES.items():
+        if height * columns == width * rows and height % rows == 0:
+            return layout
+    raise ValueError(
+        f"{name} must be 2 : 1 (latlong), 3 : 4 (vertical cross), 1 : 6 or 6 : 1 (faces in a strip), "
+        f"got {width} x {height} (width x height); or name its layout, one of {', '.join(LAYOUTS)}"
+    )
+
+
+def _check_layout(image: np.ndarray, layout: str, name: str) -> None:
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    height, width = image.shape[:2]
+    if 0 in image.shape:
+        raise ValueError(f"{name} must have pixels, got the shape {image.shape}")
+    if layout in _CUBES:
+        rows, columns = _CUBES[layout][0]
+        if height % rows or width % columns or height // rows != width // columns:
+            raise ValueError(
+                f"{name} must be {columns} n x {rows} n pixels (width x height) for the layout {layout}, "
+                f"got {width} x {height}"
+            )
+
+
+def _clean(image: np.ndarray, name: str) -> np.ndarray:
+    """Three finite, non-negative channels."""
+    channels = image.shape[-1]
+    if channels > 4:
+        raise ValueError(f"{name} must have 1 to 4 channels, got {channels}")
+    image = image[..., :3] if channels > 2 else np.repeat(image[..., :1], 3, axis=-1)
+    wrong = np.argwhere(~np.isfinite(image).all(axis=-1))
+    if len(wrong):
+        row, column = wrong[0]
+        raise ValueError(
+            f"{name} must hold finite radiance, got NaN or infinity in {len(wrong)} pixels, "
+            f"the first at row {row}, column {column}"
+        )
+    negative = (image < 0).any(axis=-1)
+    if negative.any():
+        warnings.warn(
+            f"{name}: {negative.sum()} of {negative.size} pixels are negative, the lowest {image.min():.3g}; "
+            "they are set to 0",
+            stacklevel=4,
+        )
+    return np.maximum(image, 0)
+
+
+def _box_edge(count: int, *, on_edge: bool) -> np.ndarray:
+    """Where the boxes around equidistant samples on [-1, 1] meet; the outermost may be on its ends."""
+    if not on_edge or count == 1:
+        return np.linspace(-1, 1, count + 1)
+    return np.clip((2 * np.arange(count + 1) - 1) / (count - 1) - 1, -1, 1)
+
+
+def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
+    (rows, _), corners, steps = _CUBES[layout]
+    n = image.shape[0] // rows
+    cut = [image[i * n : (i + 1) * n, j * n : (j + 1) * n] for i, j in corners]
+    return np.stack([face[::down, ::right] for face, (down, right) in zip(cut, steps, strict=True)])
+
+
+def _resample_cube(face: np.ndarray, edge: np.ndarray, size: int) -> np.ndarray:
+    """Exact area means: pixels and texels are both rectangles on a face, and so are their overlaps."""
+    texel_edge = np.linspace(-1, 1, size + 1)
+    cut = np.union1d(edge, texel_edge)
+    pixel = np.searchsorted(edge, (cut[1:] + cut[:-1]) / 2) - 1
+    start = np.searchsorted(cut, texel_edge[:-1])
+    weight = _solid_angle(cut)
+
+    def total(value):
+        return np.add.reduceat(np.add.reduceat(value, start, axis=0), start, axis=1)
+
+    area = total(weight)
+    result = np.empty((6, size, size, face.shape[-1]))
+    for f in range(6):
+        for c in range(face.shape[-1]):
+            result[f, :, :, c] = total(face[f, :, :, c][np.ix_(pixel, pixel)] * weight) / area
+    return result
+
+
+def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
+    """Deals out small parts of the pixels to texels, given the edges of the pixels' rows and columns."""
+    # A texel is at least 2 / (3 size) wide, in the corners of a face: let some eight parts fall across it.
+    around = max(12 * size * 2 * np.pi, 4096)
+    parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
+    repeat = [-(-count // _PARTS) for count in parts]
+    image = image.repeat(repeat[0], axis=0).repeat(repeat[1], axis=1)
+    rows, columns = (-(-count // times) for count, times in zip(parts, repeat, strict=True))
+    latitude = _subdivide(_subdivide(latitude, repeat[0]), rows).reshape(-1)
+    longitude = _subdivide(_subdivide(longitude, repeat[1]), columns).reshape(-1)
+
+    # Axes: rows of pixels, rows of parts, columns of pixels, columns of parts. The samples of a pixel lie on a
+    # sheared lattice: on a straight one, those along a texel's edge would fall on the same side together.
+    height, width = (
+        -np.diff(np.sin(latitude)).reshape(-1, rows, 1, 1),
+        -np.diff(longitude).reshape(-1, columns),
+    )
+    across, down = (np.arange(columns) + 0.5) / columns, (np.arange(rows)[:, None, None] + 0.5) / rows
+    latitude = latitude[:-1].reshape(-1, rows, 1, 1) + np.diff(latitude).reshape(-1, rows, 1, 1) * across
+    longitude = longitude[:-1].reshape(-1, columns) - width * down
+
+    flux, weight = np.zeros((image.shape[-1], 6 * size**2)), np.zeros(6 * size**2)
+    step = max(1, _CHUNK // (width.size * rows))
+    for first in range(0, image.shape[0], step):
+        row = slice(first, first + step)
+        index = _texel_index(latitude[row], longitude, size).ravel()
+        area = height[row] * width
+        weight += np.bincount(index, area.ravel(), minlength=weight.size)
+        for c, radiance in enumerate(np.moveaxis(image[row, None, :, None], -1, 0)):
+            flux[c] += np.bincount(index, (radiance * area).ravel(), minlength=weight.size)
+    mean = (flux / weight).reshape(-1, 6, size, size)
+
+    # Parts approximate the texels' areas; what that changes in the integral, per mille, is spread over the sphere.
+    after = (mean * _solid_angle(np.linspace(-1, 1, size + 1))).sum((1, 2, 3))
+    before = flux.sum(axis=1)
+    scale = np.divide(before, after, out=np.ones_like(before), where=after != 0)
+    return np.moveaxis(mean * scale[:, None, None, None], 0, -1)
+
+
+def _solid_angle(edge: np.ndarray) -> np.ndarray:
+    """Solid angles of the rectangles on a face between some lines, the same ones for rows and columns."""
+    corner = np.arctan2(edge[:, None] * edge, np.sqrt(1 + edge[:, None] ** 2 + edge**2))
+    return np.diff(np.diff(corner, axis=0), axis=1)
+
+
+def _subdivide(edge: np.ndarray, parts: int) -> np.ndarray:
+    """Divides every interval into equal parts."""
+    fraction = np.arange(parts) / parts
+    inner = edge[:-1, None] * (1 - fraction) + edge[1:, None] * fraction
+    return np.append(inner.ravel(), edge[-1])
+
+
+def _texel_index(latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
+    """Flat indices of the texels at some latitudes and longitudes, which are broadcast."""
+    # Around the horizon, a face spans a quarter turn and the column depends on the longitude alone.
+    turn = np.round(longitude / (np.pi / 2)).astype(int)
+    offset = longitude - turn * (np.pi / 2)
+    side = np.array([4, 0, 5, 1])[turn % 4]  # +z, +x, -z, -x
+    height = np.tan(latitude)
+    row = -height / np.cos(offset)
+    cap = np.abs(row) > 1
+    flat = 1 / height
+    column = np.where(cap, np.sin(longitude) * np.abs(flat), np.tan(offset))
+    row = np.where(cap, np.cos(longitude) * flat, row)
+    face = np.where(cap, np.where(height > 0, 2, 3), side)
+    i, j = (np.clip((size / 2 * (x + 1)).astype(int), 0, size - 1) for x in (row, column))
+    return (face * size + i) * size + j

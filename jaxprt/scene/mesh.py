@@ -1,7 +1,26 @@
-"""Triangle meshes: the type, loading from files, joining and splitting by region."""
+"""Triangle meshes: the type, making them from files and arrays, joining and splitting, the ground beneath."""
+
+import io
+import pathlib
+import re
+import warnings
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float, Int
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Integer
+
+from jaxprt.sphere import directions
+
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
+_CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alone is as near to it as this.
+_GAP = 5e-4  # Of the diagonal, between a mesh and the ground: more than rays start off a surface.
+_BLOCK = 8192
+_DENSE = 0.4  # Spacing of the ground's vertices in its center, over that of a uniform grid.
 
 
 class Mesh(eqx.Module):
@@ -20,3 +39,348 @@ class Mesh(eqx.Module):
     normal: Float[Array, "v 3"]
     tangent: Float[Array, "v 3"]
     region: Int[Array, " v"]
+
+
+def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
+    """Loads a PLY, OBJ, STL, OFF, GLB or glTF file.
+
+    Vertices and faces keep the file's order; nothing is merged. Polygons become fans of triangles. Where an OBJ's
+    corners differ in normal or texture coordinates, a vertex is split. All geometries of a scene are
+    placed by their nodes and joined. Materials and textures are neither needed nor read, save for glTF's names.
+
+    Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
+    by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither
+    shared vertices nor creases: its vertices have the normals of their faces, flat.
+
+    Args:
+        path: The file.
+        groups: Number the regions by an OBJ's objects and groups or a glTF's nodes, instead of by material.
+
+    Returns:
+        The mesh; an OBJ's regions are numbered in the order of their first appearance, a glTF's as trimesh has them.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is of no known kind, damaged or empty, has positions that are not finite, or faces that
+            name missing vertices.
+    """
+    path = pathlib.Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no mesh file {path}")
+    position, face, normal, region = _concatenate(_read(path, suffix, groups), suffix, groups, str(path))
+    return _make(position, face, normal, None, region, name=str(path), welded=suffix != ".stl")
+
+
+def make_mesh(
+    position: Float[ArrayLike, "v 3"],
+    face: Integer[ArrayLike, "f 3"],
+    *,
+    normal: Float[ArrayLike, "v 3"] | None = None,
+    tangent: Float[ArrayLike, "v 3"] | None = None,
+    region: Integer[ArrayLike, " v"] | None = None,
+    name: str = "mesh",
+) -> Mesh:
+    """Makes a mesh of arrays in memory, with the checks of ``load_mesh``.
+
+    Args:
+        position: Vertex positions.
+        face: Vertex indices of each triangle; counter-clockwise seen from the front.
+        normal: Normals of any length. Those that are zero or NaN, and all where it is None, are the mean of the faces
+            around weighted by their angles: split a vertex to have a crease. Where faces cancel, one
+            of them is taken; a vertex without faces gets +y.
+        tangent: Tangents of any length, made orthogonal to the normals; ``directions.tangent`` where it is None,
+            and for those that are zero, NaN or parallel to the normal.
+        region: Numbers from 0; None makes all 0.
+        name: What to call the mesh in messages.
+
+    Returns:
+        The mesh, in float32 and int32.
+
+    Raises:
+        ValueError: There are no vertices or faces, a position is not finite, a face names a missing vertex, or a
+            region is negative.
+    """
+    return _make(position, face, normal, tangent, region, name=name, welded=False)
+
+
+def join(meshes: Sequence[Mesh]) -> Mesh:
+    """Puts meshes into one, with regions renumbered in order: 0 ... of the first, then those of the next.
+
+    Args:
+        meshes: One or more; the numbers of their regions may have gaps.
+
+    Returns:
+        A mesh that ``split`` takes apart again.
+
+    Raises:
+        ValueError: There are no meshes.
+    """
+    if not meshes:
+        raise ValueError("meshes must hold at least one mesh, got none")
+    region, face = [], []
+    first_region = first_vertex = 0
+    for mesh in meshes:
+        used, dense = np.unique(mesh.region, return_inverse=True)
+        region.append(dense + first_region)
+        face.append(np.asarray(mesh.face) + first_vertex)
+        first_region += len(used)
+        first_vertex += len(mesh.position)
+    # In NumPy, so that new shapes do not compile; likewise below.
+    position, normal, tangent = (
+        jnp.asarray(np.concatenate([getattr(mesh, field) for mesh in meshes]))
+        for field in ("position", "normal", "tangent")
+    )
+    face, region = (jnp.asarray(np.concatenate(field), jnp.int32) for field in (face, region))
+    return Mesh(position, face, normal, tangent, region)
+
+
+def split(mesh: Mesh) -> list[Mesh]:
+    """Takes a mesh apart into its regions, in ascending order; each becomes region 0 of a mesh of its own.
+
+    Raises:
+        ValueError: The corners of a face are in different regions. Duplicate such vertices first.
+    """
+    region, face = np.asarray(mesh.region), np.asarray(mesh.face)
+    corner = region[face]
+    mixed = np.flatnonzero((corner != corner[:, :1]).any(1))
+    if mixed.size:
+        raise ValueError(
+            f"the corners of a face must be in one region, got {mixed.size} faces of {len(face)} in several, "
+            f"the first is face {mixed[0]} in the regions {corner[mixed[0]].tolist()}"
+        )
+    parts = []
+    for number in np.unique(region):
+        own = np.flatnonzero(region == number)
+        index = np.zeros(len(region), np.int32)
+        index[own] = np.arange(len(own))
+        own_face = index[face[corner[:, 0] == number]]
+        position, normal, tangent = (
+            jnp.asarray(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
+        )
+        parts.append(Mesh(position, jnp.asarray(own_face), normal, tangent, jnp.zeros(len(own), jnp.int32)))
+    return parts
+
+
+def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
+    """A square grid of ground for a mesh to stand on, centered under it.
+
+    It lies 5e-4 of the mesh's diagonal below the lowest face. Vertices are 2.5 times as dense in the center as
+    a uniform grid's, and half as dense at the edge, since shadows are finest where the mesh touches down.
+
+    Args:
+        mesh: What stands on it; vertices without faces do not count.
+        vertices: About how many; the nearest square number of at least 4 is taken.
+        extent: Side of the square over the longer horizontal side of the mesh.
+
+    Returns:
+        A mesh of one region with normals +y.
+
+    Raises:
+        ValueError: Fewer than 4 vertices, or an extent that is not positive.
+    """
+    if vertices < 4:
+        raise ValueError(f"vertices must be at least 4, got {vertices}")
+    if not extent > 0:
+        raise ValueError(f"extent must be positive, got {extent}")
+    low, high = bounds(mesh)
+    diagonal = float(np.linalg.norm(high - low)) or 1.0
+    half = extent / 2 * (max(high[0] - low[0], high[2] - low[2]) or diagonal)
+    n = max(2, round(vertices**0.5))
+    u = np.linspace(-1, 1, n)
+    z, x = np.meshgrid(*[half * (_DENSE * u + (1 - _DENSE) * u**3)] * 2, indexing="ij")
+    center = (low + high) / 2
+    height = np.full_like(x, low[1] - _GAP * diagonal)
+    position = np.stack([center[0] + x, height, center[2] + z], -1).reshape(-1, 3)
+    return make_mesh(position, grid_face(rows=n, columns=n), name="ground plane")
+
+
+def bounds(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Lowest and highest coordinates of the faces, in float64; vertices without faces do not count."""
+    corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)].reshape(-1, 3)
+    return corner.min(0), corner.max(0)
+
+
+def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
+    """Triangles between rows of vertices; their front is where (next row) x (next column) points."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
+    return (corner + np.array([0, columns, columns + 1, 0, columns + 1, 1])).reshape(-1, 3)
+
+
+def _make(position, face, normal, tangent, region, *, name: str, welded: bool) -> Mesh:
+    with np.errstate(over="ignore"):  # What overflows float32 is reported below.
+        position = np.asarray(position, np.float32)
+    face = np.asarray(face)
+    count = len(position)
+    region = np.zeros(count, np.int32) if region is None else np.asarray(region)
+    _check(position, face, region, name)
+    given = np.zeros(position.shape) if normal is None else np.asarray(normal, np.float64)
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    bad = ~(np.isfinite(length) & (length > 0))
+    given = np.where(bad, 0, given) / np.where(bad, 1, length)
+    if bad.any():
+        given = np.where(bad, _vertex_normal(position.astype(np.float64), face, welded), given)
+    brought = np.zeros(position.shape) if tangent is None else np.asarray(tangent, np.float64)
+    brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
+    normal, tangent = _frame(given, brought)
+    return Mesh(jnp.asarray(position), jnp.asarray(face, jnp.int32), normal, tangent, jnp.asarray(region, jnp.int32))
+
+
+def _check(position: np.ndarray, face: np.ndarray, region: np.ndarray, name: str) -> None:
+    if not len(position) or not len(face):
+        raise ValueError(f"{name} must hold vertices and faces, got {len(position)} vertices and {len(face)} faces")
+    wrong = np.flatnonzero(~np.isfinite(position).all(1))
+    if wrong.size:
+        raise ValueError(
+            f"{name}: positions must be finite, got {wrong.size} of {len(position)} that are not, "
+            f"the first is {position[wrong[0]].tolist()} at vertex {wrong[0]}"
+        )
+    wrong = np.flatnonzero(((face < 0) | (face >= len(position))).any(1))
+    if wrong.size:
+        raise ValueError(
+            f"{name}: faces must name vertices 0 to {len(position) - 1}, got {wrong.size} of {len(face)} faces "
+            f"that name others, the first is {face[wrong[0]].tolist()} at face {wrong[0]}"
+        )
+    wrong = np.flatnonzero(region < 0)
+    if wrong.size:
+        raise ValueError(
+            f"{name}: regions must not be negative, got {wrong.size} of {len(region)} that are, "
+            f"the first is {region[wrong[0]]} at vertex {wrong[0]}"
+        )
+
+
+def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
+    """Unit normals and tangents, in blocks of one shape so that not every mesh compiles anew."""
+    count = len(normal)
+    pad = ((0, -count % _BLOCK), (0, 0))
+    normal, tangent = (np.pad(field.astype(np.float32), pad).reshape(-1, _BLOCK, 3) for field in (normal, tangent))
+    unit = [directions.normalize(block) for block in normal]
+    across = [directions.frame(n, t)[:, 0] for n, t in zip(unit, tangent, strict=True)]
+    return tuple(jnp.asarray(np.concatenate(block)[:count]) for block in (unit, across))
+
+
+def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.ndarray:
+    """Unit normals: means of face normals weighted by their angles at the vertex."""
+    corner = position[face]
+    edge = np.roll(corner, -1, 1) - corner
+    cross = np.cross(edge[:, 0], edge[:, 1])
+    area = np.linalg.norm(cross, axis=1)
+    # A face thinner than what float32 tells apart has a direction by rounding alone.
+    thickness = 2 * np.spacing(np.abs(corner).max((1, 2)).astype(np.float32)).astype(np.float64)
+    thin = area <= thickness * np.linalg.norm(edge, axis=2).max(1)
+    unit = cross / np.where(area > 0, area, 1)[:, None]
+    angle = np.arctan2(area[:, None], -(edge * np.roll(edge, 1, 1)).sum(2))
+    weighted = (np.where(thin[:, None], 0, angle)[:, :, None] * unit[:, None]).reshape(-1, 3)
+
+    def mean(index, count):
+        total = np.stack([np.bincount(index, weighted[:, axis], count) for axis in range(3)], -1)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.where(length > 1e-6, total / np.maximum(length, 1e-6), 0)
+
+    vertex = face.ravel()
+    normal = mean(vertex, len(position))
+    if welded:
+        _, place = np.unique(position, axis=0, return_inverse=True)
+        shared = mean(place.reshape(-1)[vertex], place.max() + 1)[place.reshape(-1)]
+        smooth = (shared * normal).sum(1, keepdims=True) > _CREASE
+        normal = np.where(smooth, shared, normal)
+    # Where faces cancel any of them will do, thin ones last.
+    order = np.argsort(~thin, kind="stable")
+    some = np.tile([0.0, 1.0, 0.0], (len(position), 1))
+    order = order[area[order] > 0]
+    some[face[order]] = unit[order, None]
+    return np.where((normal == 0).all(1, keepdims=True), some, normal)
+
+
+def _read(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
+    """The file as trimesh has it, or an error that names it."""
+    options: dict[str, Any] = {}
+    source = path
+    if suffix == ".obj":
+        source = io.BytesIO(_obj_text(path).encode())
+        options = {
+            "skip_materials": True,
+            "group_material": not groups,
+            "split_objects": groups,
+            "split_groups": groups,
+        }
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return trimesh.load_scene(source, file_type=suffix[1:], process=False, **options)
+    except Exception as error:  # trimesh's parsers raise what they stumble over.
+        text = isinstance(error, ModuleNotFoundError)  # It guesses encodings with a package that is not needed.
+        detail = "it is not text" if text else f"{type(error).__name__}: {error}"
+        raise ValueError(
+            f"{path} must be an undamaged {suffix[1:].upper()} file, got one that cannot be read: {detail}"
+        ) from error
+
+
+def _obj_text(path: pathlib.Path) -> str:
+    """An OBJ with absolute indices: trimesh counts relative ones from the end of the file, not from their line."""
+    content = path.read_bytes()
+    if b"\0" in content:
+        raise ValueError(f"{path} must be an undamaged OBJ file, got one that is not text")
+    text = content.decode(errors="replace").replace("\t", " ").replace("\r\n", "\n").replace("\\\n", " ")
+    lines = [line.strip() for line in text.splitlines()]
+    count = {"v": 0, "vt": 0, "vn": 0}
+    absolute = lines.copy()
+    faces = []  # Line number, number of corners, lowest and highest vertex.
+    for number, line in enumerate(lines):
+        kind, _, rest = line.partition(" ")
+        if kind in count:
+            count[kind] += 1
+        elif kind == "f":
+            corners = rest.partition("#")[0].split()
+            if "-" in rest or "#" in rest:
+                corners = ["/".join(map(_absolute, corner.split("/"), count.values())) for corner in corners]
+                absolute[number] = "f " + " ".join(corners)
+            vertex = [int(index) if index.isdecimal() else 0 for index in (c.partition("/")[0] for c in corners)]
+            faces.append((number, len(vertex), min(vertex, default=0), max(vertex, default=0)))
+    wrong = [number for number, corners, low, high in faces if corners < 3 or low < 1 or high > count["v"]]
+    if wrong:
+        raise ValueError(
+            f"{path}: faces must name three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
+            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
+        )
+    return "\n".join(absolute)
+
+
+def _absolute(index: str, count: int) -> str:
+    """An index counted back from the latest element, counted from the first one instead."""
+    return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
+
+
+def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
+    """Positions, faces, normals (NaN where the file has none) and regions of all geometries in their places."""
+    parts, labels = [], {}
+    first = 0
+    nodes = list(scene.graph.nodes_geometry)
+    for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
+        transform, key = scene.graph[node]
+        geometry = scene.geometry[key]
+        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
+            continue
+        position, face = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise ValueError(f"{name} must have three coordinates per vertex, got the shape {position.shape}")
+        # Asked for by name, normals that the file lacks would be computed.
+        normal = geometry._cache.cache.get("vertex_normals", np.full(position.shape, np.nan))
+        if transform is not None and not np.array_equal(transform, np.eye(4)):
+            linear = transform[:3, :3]
+            position = position @ linear.T + transform[:3, 3]
+            # The adjugate also serves a node that is scaled to nothing.
+            cofactor = np.stack([np.cross(linear[i - 2], linear[i - 1]) for i in range(3)])
+            mirrored = np.linalg.det(linear) < 0
+            normal = normal @ cofactor.T * (-1 if mirrored else 1)
+            face = face[:, ::-1] if mirrored else face
+        material = getattr(getattr(geometry.visual, "material", None), "name", None)
+        label = node if groups or suffix == ".obj" or not material else (material,)
+        region = np.full(len(position), labels.setdefault(label, len(labels)))
+        parts.append((position, face + first, normal, region))
+        first += len(position)
+    if not parts:
+        raise ValueError(f"{name} must hold vertices and faces, got no faces")
+    return tuple(np.concatenate(field) for field in zip(*parts, strict=True))

@@ -1,0 +1,53 @@
+# A fresh machine needs Python 3.11 to 3.13, git and make; everything else is installed into .venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Another benchmark: make bench NAME=relight_separable ARGS=--quick; some of the tests: make test ARGS="-k haar".
+NAME ?=
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo check test bench notebooks clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(VENV)/.setup ## install the package, with what the demo needs
+demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
+	$(BIN)/python -m jaxprt --output output/demo
+
+check: $(VENV)/.setup-test ## format, lint and types
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/pyright
+
+test: check ## check, then all tests, doctests and notebooks; real data where JAXPRT_DATA names its folder
+	$(BIN)/python -m pytest $(ARGS)
+
+bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
+	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \
+		$(filter-out __init__ harness,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
+	$(BIN)/python -m benchmarks.$(NAME) $(ARGS)
+
+notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place
+	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
+	$(BIN)/jupyter nbconvert --to notebook --execute --inplace $(sort $(wildcard notebooks/*.ipynb))
+
+clean: ## remove what was computed and cached; .venv stays
+	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache
+	find jaxprt tests benchmarks notebooks -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf
+
+# Installed again only when the requirements have changed. Each extra has a stamp of its own.
+$(VENV)/.setup: pyproject.toml constraints.txt
+	@command -v $(PYTHON) > /dev/null || \
+		{ echo "$(PYTHON) not found; name a Python from 3.11 to 3.13: make PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v <= (3, 13) else \
+		"Python must be 3.11 to 3.13, got %d.%d from $(PYTHON); name another: make PYTHON=python3.13" % v)'
+	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/.setup-%: $(VENV)/.setup
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$*]'
+	@touch $@

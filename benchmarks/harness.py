@@ -1,0 +1,140 @@
+"""Times functions, alone or against a peer, and reports each measurement as one line of JSON.
+
+    arguments = harness.parser("What the relighting of a frame costs.").parse_args()
+    mine, peer = harness.compare(lambda: radiance(light), lambda: matrix @ vector, repeats=20)
+    harness.report({"benchmark": "relight", "case": "bunny", **mine.line(), "error": 2e-2, "bytes": 10,
+                    "peer": "scipy CSR", "peer_seconds": peer.seconds, "peer_error": 0.0}, arguments.output)
+
+An absolute time is a fact about a machine; a ratio and an error are facts about the program.
+"""
+
+import argparse
+import json
+import math
+import pathlib
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+
+_KEYS = ("benchmark", "case", "seconds", "compile_seconds", "error", "bytes")
+_PEER_KEYS = ("peer", "peer_seconds", "peer_error")
+
+
+class Timing(NamedTuple):
+    """How long a function took.
+
+    Attributes:
+        seconds: Median over the repeated calls.
+        compile_seconds: The first call, which traces and compiles, less that median; at least zero.
+        repeats: How many calls the median is of.
+    """
+
+    seconds: float
+    compile_seconds: float
+    repeats: int
+
+    def line(self) -> dict[str, float]:
+        """The two keys of a reported line."""
+        return {"seconds": self.seconds, "compile_seconds": self.compile_seconds}
+
+
+def parser(description: str) -> argparse.ArgumentParser:
+    """Command line that every benchmark shares; a benchmark may add options of its own."""
+    result = argparse.ArgumentParser(description=description)
+    result.add_argument("--quick", action="store_true", help="a small case, within 60 s on two cores")
+    result.add_argument("--output", type=pathlib.Path, metavar="FILE", help="append the JSON lines to FILE")
+    return result
+
+
+def measure(function: Callable[[], Any], *, repeats: int) -> Timing:
+    """Times a function of no arguments until its result is ready.
+
+    Args:
+        function: What to time. JAX work is waited for.
+        repeats: Calls after the first, which is told apart since it compiles.
+
+    Returns:
+        The median, and what the first call took beyond it.
+
+    Raises:
+        ValueError: There are no repeats.
+    """
+    return _alternate([function], repeats)[0]
+
+
+def compare(function: Callable[[], Any], peer: Callable[[], Any], *, repeats: int) -> tuple[Timing, Timing]:
+    """Times two functions alternately, so that whatever else the machine does meets both alike.
+
+    Args:
+        function: What to time.
+        peer: What to time it against, on the same input.
+        repeats: Calls of each after the first.
+
+    Returns:
+        Timings as from ``measure``.
+
+    Raises:
+        ValueError: There are no repeats.
+    """
+    mine, theirs = _alternate([function, peer], repeats)
+    return mine, theirs
+
+
+def report(line: Mapping[str, Any], output: pathlib.Path | None = None) -> dict[str, Any]:
+    """Prints a measurement as one line of JSON and appends it to a file.
+
+    Args:
+        line: ``benchmark`` and ``case`` (names), ``seconds``, ``compile_seconds``, ``error`` (relative) and
+            ``bytes`` (of what is stored), None where the case has none; where there is a peer also ``peer``
+            (its name), ``peer_seconds`` and ``peer_error``. Further keys are kept as they are.
+        output: The file; None prints only.
+
+    Returns:
+        The line as reported: with ``ratio`` = peer_seconds / seconds where there is a peer.
+
+    Raises:
+        ValueError: A key is missing, or a number is NaN or infinite.
+    """
+    expected = _KEYS + (_PEER_KEYS if any(key in line for key in _PEER_KEYS) else ())
+    missing = [key for key in expected if key not in line]
+    if missing:
+        raise ValueError(f"a line must have {', '.join(expected)}; {', '.join(missing)} is missing")
+    line = {key: value.item() if hasattr(value, "item") else value for key, value in line.items()}
+    wrong = [key for key, value in line.items() if isinstance(value, float) and not math.isfinite(value)]
+    if wrong:
+        raise ValueError(f"numbers must be finite, got {', '.join(f'{key} = {line[key]}' for key in wrong)}")
+    if "peer" in line:
+        line["ratio"] = line["peer_seconds"] / line["seconds"]
+    text = json.dumps(line)
+    print(text, flush=True)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with output.open("a", encoding="utf-8") as file:
+            file.write(text + "\n")
+    return line
+
+
+def peak_memory() -> int:
+    """Largest resident set of this process so far, in bytes; what a GPU holds is not in it."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB.
+
+
+def _alternate(functions: list[Callable[[], Any]], repeats: int) -> list[Timing]:
+    if repeats < 1:
+        raise ValueError(f"repeats must be at least 1, got {repeats}")
+    first = [_seconds(function) for function in functions]
+    rounds = [[_seconds(function) for function in functions] for _ in range(repeats)]
+    median = [statistics.median(times) for times in zip(*rounds, strict=True)]
+    return [Timing(m, max(f - m, 0.0), repeats) for f, m in zip(first, median, strict=True)]
+
+
+def _seconds(function: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start

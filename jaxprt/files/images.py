@@ -1,0 +1,208 @@
+"""Image files: EXR by OpenEXR, everything else by OpenImageIO."""
+
+import pathlib
+import typing
+
+import numpy as np
+import OpenEXR
+import OpenImageIO
+from jaxtyping import Array, Float, Float32
+
+_MAGIC = (
+    (b"\x76\x2f\x31\x01", "openexr"),
+    (b"#?", "hdr"),
+    (b"\x89PNG", "png"),
+    (b"\xff\xd8\xff", "jpeg"),
+    (b"II*\x00", "tiff"),
+    (b"MM\x00*", "tiff"),
+    (b"PF", "pnm"),
+    (b"Pf", "pnm"),
+    (b"BM", "bmp"),
+)
+# Channel sets read from EXR files, first match wins; alpha comes along where there is one.
+_CHANNELS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
+# More is taken for a broken header: 16384 x 32768 pixels are 6 GB as float32 RGB.
+_MAX_PIXELS = 2**29
+
+
+def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+    """Reads an image file as linear values.
+
+    The format is told from the file's first bytes, not from its name: EXR, Radiance HDR, PNG, JPEG, TIFF,
+    PFM or BMP. Files of whole numbers (PNG, JPEG, ...) are decoded from sRGB unless they say that they are
+    linear; those of floats are taken as they are. Primaries and the exposure of HDR headers are not applied;
+    they are among the attributes. Of an EXR the first part is read, at the finest level; a data window
+    smaller than the display window is placed in it on black, and what lies outside the display is cut off.
+    Alpha is returned unapplied, as the last of two or four channels.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels, and the header's attributes;
+        for EXR environment maps ``envmap`` is "latlong" or "cube".
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is a directory, empty, of an unknown format, damaged, or of channels other than these.
+    """
+    path = pathlib.Path(path).absolute()
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if not path.is_file():
+        raise ValueError(f"{path} must be an image file, got a {'directory' if path.is_dir() else 'special file'}")
+    with path.open("rb") as file:
+        start = file.read(2048)
+    form = next((form for magic, form in _MAGIC if start.startswith(magic)), None)
+    if form is None:
+        got = f"one that starts with {start[:8]!r}" if start else "an empty file"
+        raise ValueError(f"{path} must be an EXR, HDR, PNG, JPEG, TIFF, PFM or BMP image, got {got}")
+    if form == "openexr":
+        return _read_exr(path)
+    if form == "hdr" and b"32-bit_rle_xyze" in start:
+        raise ValueError(f"{path} must hold RGB (32-bit_rle_rgbe), got XYZ (32-bit_rle_xyze): convert it first")
+    return _read_other(path, form)
+
+
+def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
+    """Writes linear values to an EXR file of 32-bit floats, losslessly compressed.
+
+    Args:
+        path: The file; one that exists is replaced.
+        image: 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
+
+    Raises:
+        ValueError: The image is empty or has another number of channels.
+        OSError: The file cannot be written.
+    """
+    names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
+    _check_folder(path)
+    # OpenEXR writes arrays that are not contiguous wrongly, without saying so.
+    values = np.asarray(image, np.float32)
+    channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
+def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
+    """Writes an image that is already encoded for display to a PNG file of 8 bits.
+
+    Args:
+        path: The file; one that exists is replaced.
+        image: Display values; 0 is black and 1 white, what lies outside is clamped. 1, 3 or 4 channels.
+
+    Raises:
+        ValueError: The image is empty, has another number of channels, or holds NaN.
+        OSError: The file cannot be written.
+    """
+    _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
+    _check_folder(path)
+    values = np.asarray(image, np.float64)
+    wrong = np.argwhere(np.isnan(values).any(axis=-1))
+    if len(wrong):
+        raise ValueError(f"image must not hold NaN, got {len(wrong)} such pixels, first at {tuple(map(int, wrong[0]))}")
+    values = np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
+    height, width, count = values.shape
+    spec = OpenImageIO.ImageSpec(width, height, count, "uint8")
+    spec.attribute("oiio:ColorSpace", "sRGB")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = OpenImageIO.ImageOutput.create("png")
+    assert output is not None  # PNG is compiled into OpenImageIO's wheels.
+    if not (output.open(str(path), spec) and output.write_image(values) and output.close()):
+        raise OSError(f"{path}: {output.geterror() or 'cannot be written'}")
+
+
+def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
+    if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
+        raise ValueError(f"image must be [h, w, c] with c one of {list(names)} and no empty axis, got {image.shape}")
+    return names[image.shape[-1]]
+
+
+def _check_folder(path: str | pathlib.Path) -> None:
+    folder = pathlib.Path(path).absolute().parent
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {folder}")
+
+
+def _check_size(path: pathlib.Path, height: int, width: int) -> None:
+    if height < 1 or width < 1 or height * width > _MAX_PIXELS:
+        raise ValueError(f"{path} must have 1 to {_MAX_PIXELS} pixels, got {width} x {height}")
+
+
+def _read_exr(path: pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            header = dict(file.parts[0].header)
+    except Exception as error:
+        raise ValueError(f"{path} must be an undamaged EXR file, got: {error}") from error
+    if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+        raise ValueError(f"{path} must be an EXR image of scan lines or tiles, got {header['type'].name}")
+    (x0, y0), (x1, y1) = (corner.tolist() for corner in header["dataWindow"])
+    (left, top), (right, bottom) = (corner.tolist() for corner in header["displayWindow"])
+    _check_size(path, y1 - y0 + 1, x1 - x0 + 1)
+    _check_size(path, bottom - top + 1, right - left + 1)
+    found = {channel.name: channel for channel in header["channels"]}
+    names = next((names for names in _CHANNELS if set(names) <= set(found)), None)
+    if names is None or {"RY", "BY"} & set(found):
+        raise ValueError(f"{path} must have channels R, G, B or Y and perhaps A, got {', '.join(found)}")
+    if any(found[name].xSampling != 1 or found[name].ySampling != 1 for name in names):
+        raise ValueError(f"{path} must have all its channels at full resolution, got subsampled ones")
+    if x0 > right or y0 > bottom or x1 < left or y1 < top:
+        raise ValueError(f"{path} must show some of its data, got the data window {x0}..{x1}, {y0}..{y1} outside")
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            if not file.parts:  # OpenEXR has printed why.
+                raise ValueError("pixels that cannot be read")
+            channels = file.parts[0].channels
+            data = np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)
+    except Exception as error:
+        raise ValueError(f"{path} must be an undamaged EXR file, got: {error}") from error
+    if data.shape[:2] != (y1 - y0 + 1, x1 - x0 + 1):
+        raise ValueError(f"{path} must hold {x1 - x0 + 1} x {y1 - y0 + 1} pixels, got {data.shape[1::-1]}")
+    image = np.zeros((bottom - top + 1, right - left + 1, len(names)), np.float32)
+    rows = slice(max(y0, top), min(y1, bottom) + 1)
+    columns = slice(max(x0, left), min(x1, right) + 1)
+    image[_shift(rows, top), _shift(columns, left)] = data[_shift(rows, y0), _shift(columns, x0)]
+    if "envmap" in header:
+        header["envmap"] = header["envmap"].name.removeprefix("ENVMAP_").lower()
+    return image, header
+
+
+def _shift(span: slice, origin: int) -> slice:
+    return slice(span.start - origin, span.stop - origin)
+
+
+def _read_other(path: pathlib.Path, form: str) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+    config = OpenImageIO.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # Else colors come multiplied by alpha.
+    reader = OpenImageIO.ImageInput.open(str(path), config)
+    if reader is None:
+        raise ValueError(f"{path} must be an undamaged {form} file, got: {OpenImageIO.geterror()}")
+    try:
+        spec = reader.spec()
+        _check_size(path, spec.height, spec.width)
+        if spec.nchannels > 4 or spec.depth > 1:
+            raise ValueError(f"{path} must have 1 to 4 channels and be flat, got {spec.nchannels}, depth {spec.depth}")
+        image = reader.read_image("float")
+        # Some readers return what they have and only say that the rest is missing.
+        error = reader.geterror()
+        if image is None or error:
+            raise ValueError(f"{path} must be an undamaged {form} file, got: {error or 'no pixels'}")
+    finally:
+        reader.close()
+    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    if attributes.get("Orientation", 1) != 1:
+        raise ValueError(f"{path} must be stored upright (orientation 1), got orientation {attributes['Orientation']}")
+    image = np.asarray(image, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    space = str(attributes.get("oiio:ColorSpace", ""))
+    if spec.format.basetype in (OpenImageIO.UINT8, OpenImageIO.UINT16) and not space.lower().startswith("lin"):
+        colors = spec.nchannels - (spec.nchannels in (2, 4))
+        image[..., :colors] = _decode_srgb(image[..., :colors])
+    return image, attributes
+
+
+def _decode_srgb(value: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,62 @@
+"""Radiance to display: exposure and the sRGB transfer function."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Of linear Rec. 709 RGB.
+
+
+@jax.jit
+def expose(radiance: Float[Array, "*b"], *, stops: Float[Array, ""] | float) -> Float[Array, "*b"]:
+    """Scales radiance by 2^stops, as a camera's exposure would; nothing is clamped."""
+    return radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype))
+
+
+@jax.jit
+def automatic_exposure(
+    image: Float[Array, "h w 3"], *, percentile: Float[Array, ""] | float = 99.0, white: Float[Array, ""] | float = 0.9
+) -> Float[Array, ""]:
+    """Stops that bring a high percentile of the luminance near white.
+
+    The percentile is over the pixels with light, so that a black background does not matter. 0 stops for a picture
+    without light. For display: its derivative is of no use.
+
+    Args:
+        image: Linear radiance.
+        percentile: Part of the lit pixels that stays at or below `white`, in percent.
+        white: Linear value that the percentile is brought to; 1 is display white.
+    """
+    luminance = image @ jnp.asarray(LUMINANCE, image.dtype)
+    lit = luminance > 0
+    level = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
+    level = jnp.where(jnp.any(lit), level, white)
+    return jnp.log2(white / level)
+
+
+@jax.jit
+def encode_srgb(linear: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Encodes linear values by the sRGB transfer function.
+
+    The exact piecewise curve, continued outside of [0, 1]: linear below 0, a power above 1, nothing is clamped.
+    The derivative is finite everywhere, 12.92 at zero.
+
+    Reference: IEC 61966-2-1.
+    """
+    dark = linear <= 0.0031308
+    bright = jnp.where(dark, 1, linear)
+    return jnp.where(dark, 12.92 * linear, 1.055 * bright ** (1 / 2.4) - 0.055)
+
+
+@jax.jit
+def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Inverse of `encode_srgb`, continued outside of [0, 1] in the same way."""
+    dark = encoded <= 0.04045
+    bright = jnp.where(dark, 1, encoded)
+    return jnp.where(dark, encoded / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
+
+
+@jax.jit
+def display(radiance: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Exposed linear radiance as values in [0, 1] to show or save as 8 bits: clamps, then encodes."""
+    return encode_srgb(jnp.clip(radiance, 0, 1))

@@ -1,0 +1,275 @@
+"""Functions on the sphere as six square faces: texel geometry, and seamless lookups.
+
+Faces are +x, -x, +y, -y, +z, -z, with rows and columns as OpenGL has them. A point of a face is given by its
+column coordinate s and its row coordinate t, both from -1 at the outer edge of the first texel to 1:
+
+    face   +x           -x            +y          -y            +z           -z
+    s      -z           +z            +x          +x            +x           -x
+    t      -y           -y            +z          -z            -y           -y
+
+so that a direction is proportional to s S + t T + N, with the face's three axes S, T, N.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Int32
+
+_FRAME = np.array(
+    [
+        [[0, 0, -1], [0, -1, 0], [1, 0, 0]],
+        [[0, 0, 1], [0, -1, 0], [-1, 0, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, -1], [0, -1, 0]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+        [[-1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    ],
+    dtype=np.float64,
+)  # The axes S, T and N of each face.
+
+
+def direction(*, size: int) -> Float[Array, "6 n n 3"]:
+    """Unit directions through the centers of the texels.
+
+    Args:
+        size: Texels along the edge of a face.
+
+    Returns:
+        Directions in the world.
+
+    Raises:
+        ValueError: The size is below 1.
+    """
+    return jnp.asarray(_direction(size))
+
+
+def point(*, size: int) -> Float[Array, "6 n n 3"]:
+    """Centers of the texels on the cube [-1, 1]^3: directions whose coordinates are fractions of texels.
+
+    Args:
+        size: Texels along the edge of a face.
+
+    Returns:
+        Points in the world.
+
+    Raises:
+        ValueError: The size is below 1.
+    """
+    return jnp.asarray(_point(size))
+
+
+def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
+    """Exact solid angles of the texels, in steradians; they sum to 4 pi.
+
+    A rectangle on a face with a corner in its center covers arctan(s t / sqrt(1 + s^2 + t^2)).
+
+    Args:
+        size: Texels along the edge of a face.
+
+    Returns:
+        Solid angles.
+
+    Raises:
+        ValueError: The size is below 1.
+    """
+    return jnp.asarray(_solid_angle(size))
+
+
+def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
+    """Exact integral of the unit direction over the solid angle of each texel.
+
+    The product with a normal is thus the exact integral of the cosine over a texel that lies wholly above
+    that normal's horizon; summed over the hemisphere around an axis it is pi. This is Lambert's formula for a
+    polygon, half the sum over the edges of the angle times the normal of the edge's plane, in closed form.
+
+    Args:
+        size: Texels along the edge of a face.
+
+    Returns:
+        Vectors a little shorter than the solid angle.
+
+    Raises:
+        ValueError: The size is below 1.
+    """
+    return jnp.asarray(_vector_area(size))
+
+
+@jax.jit
+def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Float[Array, "*b 2"]]:
+    """The face that a direction meets, and where.
+
+    On an edge or a corner, the first of the faces that meet there is taken. A zero direction counts as the
+    center of face +x, with finite gradients.
+
+    Args:
+        direction: Directions of any length.
+
+    Returns:
+        Number of the face, and the coordinates (s, t) on it, column first, in [-1, 1].
+    """
+    magnitude = jnp.abs(direction)
+    axis = jnp.argmax(magnitude, axis=-1)
+    forward = jnp.take_along_axis(direction, axis[..., None], axis=-1)[..., 0]
+    face = 2 * axis + (forward < 0)
+    frame = jnp.asarray(_FRAME[:, :2], direction.dtype)[face]
+    length = jnp.abs(forward)
+    length = jnp.where(length > 0, length, 1)
+    # A sum with zeros is exact, so that neighboring faces agree on their common edge to the last bit.
+    return face, (frame * direction[..., None, :]).sum(-1) / length[..., None]
+
+
+@functools.partial(jax.jit, static_argnames="sharpness")
+def lookup(
+    cubemap: Float[Array, "6 n n *c"], direction: Float[Array, "*b 3"], *, sharpness: int = 1
+) -> Float[Array, "..."]:
+    """The cubemap's values in some directions: bilinear, continuous over the edges and corners of the cube.
+
+    Past a face's outermost texel centers the neighboring face's texels are taken; in a corner of the cube,
+    where only three texels meet, their mean stands in for the fourth. Constants are reproduced exactly; smooth
+    functions to second order, but to first order within half a texel of the cube's edges.
+
+    Differentiable in both arguments. The gradient in the direction is one-sided on the lines between texel
+    centers; with a sharpness above 1 it is the mean of both sides where a transition begins or ends.
+
+    Args:
+        cubemap: Any number of values per texel.
+        direction: Directions of any length.
+        sharpness: The transition from texel to texel takes 1/sharpness of their distance.
+
+    Returns:
+        Values [*b, *c], in the type of the cubemap.
+
+    Raises:
+        ValueError: The sharpness is below 1.
+    """
+    if sharpness < 1:
+        raise ValueError(f"sharpness must be at least 1, got {sharpness}")
+    n = cubemap.shape[1]
+    padded = _pad(cubemap)
+    face, place = coordinates(direction)
+    place = (place.astype(cubemap.dtype) + 1) * (n / 2) + 0.5  # In texels; the border's first center is at 0.
+    corner = jnp.clip(jnp.floor(place), 0, n)
+    weight = place - jax.lax.stop_gradient(corner)
+    if sharpness > 1:
+        weight = jnp.minimum(jnp.maximum((weight - 0.5) * sharpness + 0.5, 0), 1)
+    column, row = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
+    u, v = (weight[..., i].reshape(face.shape + (1,) * (cubemap.ndim - 3)) for i in range(2))
+
+    def along_row(r):
+        return _mix(padded[face, r, column], padded[face, r, column + 1], u)
+
+    return _mix(along_row(row), along_row(row + 1), v)
+
+
+def border_index(*, size: int) -> Int32[np.ndarray, "6 m m"]:
+    """For every face with a border of one texel around it, where each texel comes from.
+
+    The border holds the texels of the neighboring faces that touch the edge. In its four corners, where the
+    cube has no texel, stands the corner texel of the face on the left or right, the next in the border.
+
+    Args:
+        size: Texels along the edge of a face.
+
+    Returns:
+        Indices into the 6 size^2 texels in their order; m is size + 2.
+
+    Raises:
+        ValueError: The size is below 1.
+    """
+    return _border_index(size).copy()
+
+
+def _mix(first: Array, second: Array, weight: Array) -> Array:
+    """Linear interpolation that is exact at both ends and for constants."""
+    step = second - first
+    return jnp.where(weight < 0.5, first + weight * step, second - (1 - weight) * step)
+
+
+def _pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
+    """The faces with a border of one texel; its corners are means of the three texels that meet."""
+    n = cubemap.shape[1]
+    texel, index = cubemap.reshape(6 * n * n, *cubemap.shape[3:]), _border_index(n)
+    outer, inner = np.array([0, n + 1]), np.array([1, n])
+    own, beside, above = (texel[index[:, i[:, None], j]] for i, j in ((inner, inner), (inner, outer), (outer, inner)))
+    corner = own + ((beside - own) + (above - own)) / 3
+    return texel[index].at[:, outer[:, None], outer].set(corner, unique_indices=True)
+
+
+def _check(size: int) -> None:
+    if size < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+
+
+def _freeze(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
+
+
+def _mixed_difference(function, size: int) -> np.ndarray:
+    """Integral over each texel of one face, from the antiderivative in s and t."""
+    edge = np.linspace(-1, 1, size + 1)
+    return np.diff(np.diff(function(edge[None, :], edge[:, None]), axis=0), axis=1)
+
+
+@functools.lru_cache(maxsize=16)
+def _point(size: int) -> np.ndarray:
+    _check(size)
+    center = (2 * np.arange(size) + 1) / size - 1
+    t, s = np.meshgrid(center, center, indexing="ij")
+    local = np.stack([s, t, np.ones_like(s)], axis=-1)
+    return _freeze(np.einsum("ija,fac->fijc", local, _FRAME))
+
+
+@functools.lru_cache(maxsize=16)
+def _direction(size: int) -> np.ndarray:
+    point = _point(size)
+    return _freeze(point / np.linalg.norm(point, axis=-1, keepdims=True))
+
+
+@functools.lru_cache(maxsize=16)
+def _solid_angle(size: int) -> np.ndarray:
+    _check(size)
+    face = _mixed_difference(lambda s, t: np.arctan2(s * t, np.sqrt(1 + s**2 + t**2)), size)
+    return _freeze(np.repeat(face[None], 6, axis=0))
+
+
+@functools.lru_cache(maxsize=16)
+def _vector_area(size: int) -> np.ndarray:
+    _check(size)
+
+    def tangential(s, t):  # Of s / (1 + s^2 + t^2)^2, which is the s component times the solid angle's density.
+        length = np.sqrt(1 + s**2)
+        return -np.arctan(t / length) / length / 2
+
+    def forward(s, t):  # Of 1 / (1 + s^2 + t^2)^2.
+        return -(s * tangential(s, t) + t * tangential(t, s))
+
+    parts = [tangential, lambda s, t: tangential(t, s), forward]
+    local = np.stack([_mixed_difference(part, size) for part in parts], axis=-1)
+    return _freeze(np.einsum("ija,fac->fijc", local, _FRAME))
+
+
+@functools.lru_cache(maxsize=16)
+def _border_index(size: int) -> np.ndarray:
+    _check(size)
+    half = 1 / size
+    center = (2 * np.arange(-1, size + 1) + 1) / size - 1
+    t, s = np.meshgrid(center, center, indexing="ij")
+    # Fold what lies past an edge onto the neighbor, columns first: its center is half a texel past the edge.
+    past_column, past_row = np.abs(s) > 1, np.abs(t) > 1
+    folded = past_column | past_row
+    limit = 1 - half
+    s = np.where(past_column, np.sign(s), s)
+    t = np.where(past_column, np.clip(t, -limit, limit), np.where(past_row, np.sign(t), t))
+    local = np.stack([s, t, np.where(folded, limit, 1)], axis=-1)
+    world = np.einsum("ija,fac->fijc", local, _FRAME)
+
+    # Inside, neither s nor t reaches 1 and N wins; in the border S or T is the only one at 1.
+    axis = np.abs(world).argmax(axis=-1)
+    forward = np.take_along_axis(world, axis[..., None], axis=-1)[..., 0]
+    face = 2 * axis + (forward < 0)
+    place = np.einsum("fijac,fijc->fija", _FRAME[face][..., :2, :], world)
+    column, row = np.moveaxis(np.clip(np.floor((place + 1) * size / 2).astype(np.int32), 0, size - 1), -1, 0)
+    return _freeze(((face * size + row) * size + column).astype(np.int32))

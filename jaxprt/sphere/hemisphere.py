@@ -1,0 +1,138 @@
+"""Maps between the upper hemisphere and the unit square, and bilinear lookup in such maps.
+
+Texture coordinates are in [0, 1], first coordinate along columns; texel (row, column) of an n x n map has its
+center at ((column + 1/2) / n, (row + 1/2) / n).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_TINY = 1e-12
+
+
+@jax.jit
+def disk_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
+    """Orthographic projection of local directions, ((d.s + 1) / 2, (d.t + 1) / 2).
+
+    Args:
+        direction: Unit directions in the local frame; those below the horizon fall on their mirror image's place.
+
+    Returns:
+        Texture coordinates; the hemisphere fills the inscribed disk.
+
+    Reference: Wang, Tran, Luebke 2004, equation 7.
+    """
+    return (direction[..., :2] + 1) / 2
+
+
+@jax.jit
+def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
+    """Inverse of `disk_coordinates`; points outside the disk give the nearest horizontal direction.
+
+    The gradient at and beyond the rim is that of the horizontal direction, so it is finite everywhere.
+    """
+    xy = 2 * coordinates - 1
+    square = jnp.sum(xy**2, -1, keepdims=True)
+    outside = square >= 1
+    radius = jnp.sqrt(jnp.where(outside, square, 1))
+    z = jnp.sqrt(jnp.where(outside, 1, 1 - square))
+    return jnp.concatenate([xy / radius, jnp.where(outside, 0, z)], -1)
+
+
+@jax.jit
+def polar_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
+    """Polar map (atan2(d.s, d.t), sqrt(1 - d.n)), the angle scaled from a full turn to [0, 1].
+
+    At the normal the angle is 0 and the gradient is zero.
+
+    Reference: Wang, Tran, Luebke 2004, equation 8.
+    """
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+    pole = x**2 + y**2 < _TINY
+    angle = jnp.arctan2(jnp.where(pole, 0, x), jnp.where(pole, 1, y))
+    height = jnp.sqrt(jnp.maximum(jnp.where(pole, 1, 1 - z), 0))
+    return jnp.stack([(angle / (2 * jnp.pi)) % 1, jnp.where(pole, 0, height)], -1)
+
+
+@jax.jit
+def polar_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
+    """Inverse of `polar_coordinates`.
+
+    Reference: Wang, Tran, Luebke 2004, equation 8.
+    """
+    angle = 2 * jnp.pi * coordinates[..., 0]
+    square = coordinates[..., 1] ** 2
+    radius = coordinates[..., 1] * jnp.sqrt(2 - square)
+    return jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), 1 - square], -1)
+
+
+@jax.jit
+def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
+    """Parabolic map d.xy / (1 + d.z), scaled from [-1, 1] to [0, 1].
+
+    Args:
+        direction: Unit directions in the local frame, not the one straight down.
+
+    Reference: Heidrich and Seidel 1998; Kautz, Sloan, Snyder 2002, section 3.
+    """
+    return (direction[..., :2] / (1 + direction[..., 2:]) + 1) / 2
+
+
+@jax.jit
+def parabolic_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
+    """Inverse of `parabolic_coordinates`; points outside the disk give directions below the horizon."""
+    xy = 2 * coordinates - 1
+    square = jnp.sum(xy**2, -1, keepdims=True)
+    return jnp.concatenate([2 * xy, 1 - square], -1) / (1 + square)
+
+
+@jax.jit
+def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
+    """Bilinear lookup between texel centers, constant beyond the outermost centers.
+
+    What is right at the rim of the disk is the map's business: texels outside the disk hold the values of the
+    nearest directions inside (see `texel_direction`).
+
+    Args:
+        texel: A map with any trailing axes.
+        coordinates: Texture coordinates; values outside [0, 1] read the border.
+
+    Returns:
+        Interpolated values, [*b *c], in the map's units; differentiable in both arguments.
+    """
+    n = texel.shape[0]
+    place = jnp.clip(coordinates * n - 0.5, 0, n - 1)
+    base = jnp.clip(jnp.floor(place), 0, max(n - 2, 0))
+    weight = place - base
+    column, row = jnp.unstack(base.astype(jnp.int32), axis=-1)
+    down, right = (n, 1) if n > 1 else (0, 0)
+    start = row * n + column
+    table = texel.reshape((n * n, *texel.shape[2:]))
+    x, y = (w.reshape(w.shape + (1,) * (texel.ndim - 2)) for w in jnp.unstack(weight, axis=-1))
+    top = table[start] * (1 - x) + table[start + right] * x
+    bottom = table[start + down] * (1 - x) + table[start + down + right] * x
+    return top * (1 - y) + bottom * y
+
+
+def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
+    """Directions at which an n x n disk map is sampled: one per texel, outside the disk too.
+
+    A texel whose center lies outside the disk stands for a direction a quarter of a texel inside the rim, so that
+    bilinear lookup up to the horizon never meets an undefined texel.
+    """
+    center = (jnp.arange(resolution) + 0.5) / resolution
+    xy = 2 * jnp.stack(jnp.meshgrid(center, center), -1) - 1
+    radius = jnp.linalg.norm(xy, axis=-1, keepdims=True)
+    xy = jnp.where(radius >= 1, xy * (1 - 0.5 / resolution) / jnp.maximum(radius, 1), xy)
+    return jnp.concatenate([xy, jnp.sqrt(1 - jnp.sum(xy**2, -1, keepdims=True))], -1)
+
+
+def texel_area(*, resolution: int) -> Float[Array, "n n"]:
+    """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
+
+    dx dy = cos(theta) d omega on the orthographic disk, so these are the weights of a cosine-weighted integral.
+    """
+    center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
+    inside = center[:, None] ** 2 + center[None, :] ** 2 < 1
+    return jnp.where(inside, (2 / resolution) ** 2, 0.0)

@@ -1,0 +1,166 @@
+"""Transport of the separable system: per vertex and BRDF term, visibility x cosine x light map in Haar wavelets."""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Shaped, UInt8
+
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.files.arrays import Layout
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, directions, haar, hemisphere
+from jaxprt.transport import blocks, sparse, visibility
+from jaxprt.transport.sparse import SparseTransport
+
+_BLOCK = 64  # vertices; at 6 x 64 x 64 and 4 terms some 100 MB of intermediate values on each core
+
+
+def precompute(
+    mesh: Mesh,
+    brdf: SeparableBrdf,
+    *,
+    keep: int = 96,
+    size: int = 64,
+    occluder: Mesh | None = None,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> SparseTransport:
+    """Precomputes the transport of a mesh: what it takes to relight it.
+
+    Args:
+        mesh: The vertices to light.
+        brdf: Their factored BRDF.
+        keep: Wavelet coefficients kept per vertex and term.
+        size: Edge of the light's cubemap faces in texels, a power of two.
+        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
+        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+            Process pools must not fork a process in which JAX runs: use the "spawn" context.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The transport of every vertex.
+
+    Raises:
+        ValueError: A size that is no power of two, more coefficients to keep than there are, positions or normals
+            that are not finite, or a store at `path` made from something else.
+        BlockingIOError: The store is being written by another process.
+        RuntimeError: A worker of the executor died.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.3.
+    """
+    if size < 1 or size & (size - 1):
+        raise ValueError(f"size must be a power of two, got {size}")
+    if not 1 <= keep <= 6 * size * size:
+        raise ValueError(f"keep must be at most {6 * size * size} and at least 1, got {keep}")
+    job = _Job.make(mesh, mesh if occluder is None else occluder, np.asarray(brdf.light_map, np.float32), keep, size)
+    result = blocks.compute(job, path=path, executor=executor, progress=progress)
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    rms = sparse.rms(result["index"], result["value"], 6 * size * size)
+    return SparseTransport(jnp.asarray(result["index"]), jnp.asarray(result["value"]), mesh.position, frame, rms)
+
+
+@jax.jit
+def project(
+    seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], light_map: Float[Array, "r n n l"]
+) -> Float[Array, "b d r l"]:
+    """Haar coefficients of visibility x cosine x solid angle x light map.
+
+    The cosine is integrated exactly over each texel, so that unoccluded Lambert transport of constant light has the
+    closed form to within the texels that the horizon cuts.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        light_map: Light maps of the BRDF on the orthographic disk.
+
+    Returns:
+        Coefficients on d = 6 n n, each face by `haar.forward`.
+
+    Raises:
+        ValueError: d is not 6 n n for a power of two n.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.3.
+    """
+    size = haar.face_edge(seen.shape[1])
+    direction = cubemap.direction(size=size).reshape(-1, 3)
+    area = cubemap.vector_area(size=size).reshape(-1, 3)
+    local = jnp.einsum("bij,dj->bdi", frame[:, :2], direction)
+    flux = jnp.maximum(jnp.einsum("bj,dj->bd", frame[:, 2], area), 0) * seen.astype(frame.dtype)
+    maps = jnp.moveaxis(light_map, 0, 2)
+    value = hemisphere.lookup(maps, hemisphere.disk_coordinates(local)) * (flux / visibility.LEVELS)[..., None, None]
+    faces = value.reshape(seen.shape[0] * 6, size, size, -1)
+    return haar.forward(faces).reshape(value.shape)
+
+
+@partial(jax.jit, static_argnames=("keep",))
+def compress(
+    seen: UInt8[Array, "b d"],
+    frame: Float[Array, "b 3 3"],
+    light_map: Float[Array, "r n n l"],
+    *,
+    keep: int,
+) -> tuple[Shaped[Array, "k b r"], Float[Array, "k b r l"]]:
+    """`project`, and of that the largest coefficients: one block of a `SparseTransport`."""
+    return sparse.largest(project(seen, frame, light_map), keep=keep)
+
+
+@dataclass(frozen=True)
+class _Job(blocks.Job):
+    """Blocks of transport; see `blocks.Job`."""
+
+    start: np.ndarray
+    normal: np.ndarray
+    frame: np.ndarray
+    occluder: Mesh
+    light_map: np.ndarray
+    keep: int
+    size: int
+    mesh_key: str
+
+    @classmethod
+    def make(cls, mesh: Mesh, occluder: Mesh, light_map: np.ndarray, keep: int, size: int) -> "_Job":
+        occluder = jax.tree.map(np.asarray, occluder)
+        start = visibility.start_points(mesh, visibility.Occluder(occluder))
+        frame = np.asarray(directions.frame(mesh.normal, mesh.tangent), np.float32)
+        key = blocks.fingerprint(start, frame, occluder.position, occluder.face)
+        return cls(start, np.asarray(mesh.normal, np.float32), frame, occluder, light_map, keep, size, key)
+
+    @cached_property
+    def rays(self) -> visibility.Occluder:
+        return visibility.Occluder(self.occluder)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def vertices(self) -> int:
+        return len(self.start)
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        light_map = blocks.fingerprint(self.light_map)
+        return {"system": "separable", "mesh": self.mesh_key, "brdf": light_map, "keep": self.keep, "size": self.size}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        terms, _, _, colors = self.light_map.shape
+        index = "uint16" if 6 * self.size**2 <= 1 << 16 else "uint32"
+        return {
+            "index": Layout((self.keep, _BLOCK, terms), 1, index),
+            "value": Layout((self.keep, _BLOCK, terms, colors), 1, "float32"),
+        }
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        part = np.minimum(np.arange(block * _BLOCK, (block + 1) * _BLOCK), self.vertices - 1)
+        seen, count = visibility.fractional(self.rays, self.start[part], self.normal[part], size=self.size)
+        index, value = compress(seen, self.frame[part], self.light_map, keep=self.keep)
+        return {"index": np.asarray(index), "value": np.asarray(value)}, count.rays

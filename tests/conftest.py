@@ -1,0 +1,72 @@
+"""Fixtures that every test may ask for: ``data``, ``x64`` and ``close``."""
+
+import os
+import pathlib
+from collections.abc import Callable, Iterator
+
+import jax
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+# Rounding error that a few thousand operations may leave, relative to the norm of the result.
+TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
+
+
+@pytest.fixture(scope="session")
+def data() -> pathlib.Path:
+    """The folder of real meshes, environments and BRDFs, named by JAXPRT_DATA.
+
+    Without it the test is skipped, or fails where JAXPRT_DATA_REQUIRED=1 says that it must be there.
+    """
+    name = os.environ.get("JAXPRT_DATA", "")
+    if name and pathlib.Path(name).is_dir():
+        return pathlib.Path(name).resolve()
+    reason = (
+        f"JAXPRT_DATA must name the data folder, got {name!r}, which is no folder" if name else "JAXPRT_DATA is not set"
+    )
+    if os.environ.get("JAXPRT_DATA_REQUIRED") == "1":
+        pytest.fail(f"{reason}; JAXPRT_DATA_REQUIRED=1 asks for it")
+    pytest.skip(reason)
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Float64 for one test."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def close() -> Callable[..., None]:
+    """The function ``assert_close``: ``close(actual, expected, tolerance=None)``."""
+    return assert_close
+
+
+def assert_close(actual: ArrayLike, expected: ArrayLike, *, tolerance: float | None = None) -> None:
+    """Asserts that |actual - expected| <= tolerance |expected| in the Euclidean norm over all elements.
+
+    Shapes must agree, NaN and infinity never pass. Where ``expected`` is zero the bound is absolute.
+
+    Args:
+        actual: What was computed.
+        expected: What it should be.
+        tolerance: Another bound than ``TOLERANCE`` has for the dtype of ``actual``; integers and booleans
+            must be equal.
+    """
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    assert actual.shape == expected.shape, f"shape {actual.shape}, expected {expected.shape}"
+    if tolerance is None:
+        tolerance = 0.0 if actual.dtype.kind in "biu" else TOLERANCE[actual.dtype.name]
+    wide = np.result_type(actual, expected, np.float64)
+    actual, expected = actual.astype(wide), expected.astype(wide)
+    assert np.isfinite(expected).all(), "the expected value must be finite"
+    broken = np.argwhere(~np.isfinite(actual))
+    assert not len(broken), f"{len(broken)} values are not finite, the first at {tuple(map(int, broken[0]))}"
+    difference, size = np.linalg.norm(actual - expected), np.linalg.norm(expected)
+    error = difference / size if size else difference
+    worst = np.unravel_index(np.argmax(np.abs(actual - expected)), actual.shape) if actual.size else ()
+    assert error <= tolerance, (
+        f"relative error {error:.3g}, tolerance {tolerance:.3g}; largest difference at "
+        f"{tuple(map(int, worst))}: {actual[worst]}, expected {expected[worst]}"
+    )

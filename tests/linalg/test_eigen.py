@@ -1,0 +1,80 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxprt.linalg import eigen
+
+
+def _planted(value, size=60):
+    basis = scipy.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0][:, : len(value)]
+    return jnp.asarray((basis * value) @ basis.T, jnp.float32), basis
+
+
+def test_planted_eigenvalues_of_either_sign_come_by_magnitude():
+    matrix, basis = _planted([1.0, -8.0, 4.0, -2.0, 0.5])
+    value, vector, residual = eigen.symmetric(matrix, terms=3)
+    np.testing.assert_allclose(value, [-8, 4, -2], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, [1, 2, 3]]), np.eye(3), atol=1e-4)
+    assert residual[-1] < 1e-5
+
+
+def test_nearly_equal_pairs_of_opposite_sign_are_separated():
+    matrix, basis = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=4)
+    np.testing.assert_allclose(value, [242, -241.99, 240, -239.8], rtol=1e-5)
+    np.testing.assert_allclose(jnp.linalg.norm(matrix @ vector - vector * value), 0, atol=2e-2)
+
+
+def test_repeated_eigenvalues_give_an_orthonormal_basis_of_their_space():
+    matrix, basis = _planted([3.0, 3.0, 3.0, 1.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=3)
+    np.testing.assert_allclose(value, 3, rtol=1e-5)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(vector @ vector.T, basis[:, :3] @ basis[:, :3].T, atol=1e-4)
+
+
+def test_zero_matrix_gives_zero_values_and_orthonormal_vectors():
+    value, vector, residual = eigen.symmetric(jnp.zeros((20, 20)), terms=4)
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(residual, 0)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(4), atol=1e-5)
+
+
+def test_rank_below_the_terms_pads_with_zero_values():
+    matrix, _ = _planted([5.0, -2.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=5)
+    np.testing.assert_allclose(value, [5, -2, 0, 0, 0], atol=1e-5)
+    assert jnp.all(jnp.isfinite(vector))
+
+
+def test_left_singular_vectors_equal_scipy_of_the_weighted_matrix():
+    rng = np.random.default_rng(1)
+    matrix = rng.standard_normal((40, 25)) * 0.7 ** np.arange(25)
+    root = rng.standard_normal((25, 25))
+    u, s, _ = scipy.linalg.svd(matrix @ root)
+    value, vector, residual = eigen.left_singular(
+        jnp.asarray(matrix, jnp.float32), jnp.asarray(root @ root.T, jnp.float32), terms=5
+    )
+    np.testing.assert_allclose(value, s[:5] ** 2, rtol=1e-4)
+    np.testing.assert_allclose(np.abs(vector.T @ u[:, :5]), np.eye(5), atol=2e-3)
+    assert residual[-1] < 1e-4
+
+
+def test_residual_falls_with_the_steps():
+    matrix, _ = _planted(0.9 ** np.arange(50))
+    _, _, residual = eigen.symmetric(matrix, terms=6, steps=40)
+    assert residual.shape == (40,)
+    assert residual[39] < residual[5] < residual[0]
+
+
+@pytest.mark.parametrize("terms", [0, 21])
+def test_more_terms_than_rows_are_refused(terms):
+    with pytest.raises(ValueError, match="terms must be between 1 and"):
+        eigen.symmetric(jnp.eye(20), terms=terms)
+
+
+def test_identity_inside_a_jitted_function_gives_ones():
+    value, _, _ = jax.jit(lambda m: eigen.symmetric(m, terms=2))(jnp.eye(20))
+    np.testing.assert_allclose(value, 1, rtol=1e-5)

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+
+from jaxprt.scene.builtin import sphere
+from jaxprt.scene.camera import orbit
+from jaxprt.scene.mesh import make_mesh
+
+
+def basis(camera):
+    eye, target, up = (np.asarray(value, np.float64) for value in (camera.eye, camera.target, camera.up))
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    return right, up, forward
+
+
+def project(camera, point):
+    """Coordinates on the picture, -1 to 1 from edge to edge."""
+    right, up, forward = basis(camera)
+    away = point - np.asarray(camera.eye, np.float64)
+    scale = np.tan(float(camera.field_of_view) / 2) * (away @ forward)
+    return np.stack([away @ right / scale * camera.height / camera.width, away @ up / scale], -1)
+
+
+def offset_ball():
+    ball = sphere()
+    return make_mesh(3 * np.asarray(ball.position) + [5, -2, 7], ball.face)
+
+
+@pytest.mark.parametrize(("width", "height"), [(512, 512), (800, 300), (300, 800)])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, 0.0), (2.0, 0.7), (-1.0, -1.4)])
+def test_the_bounding_sphere_touches_the_nearer_edges_of_the_picture(azimuth, elevation, width, height):
+    mesh = offset_ball()
+    camera = orbit(mesh, azimuth=azimuth, elevation=elevation, field_of_view=0.8, width=width, height=height)
+    # The outline of a tessellated sphere is within half a percent of the sphere's.
+    extent = np.abs(project(camera, np.asarray(mesh.position, np.float64))).max(0)
+    assert extent.max() == pytest.approx(1, abs=0.005)
+    assert extent.max() == extent[0 if width <= height else 1] or width == height
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "direction"),
+    [
+        (0.0, 0.0, [0, 0, 1]),
+        (np.pi / 2, 0.0, [1, 0, 0]),
+        (-np.pi / 2, 0.0, [-1, 0, 0]),
+        (0.0, np.pi / 2, [0, 1, 0]),
+        (np.pi / 4, np.pi / 6, [np.sqrt(3 / 8), 0.5, np.sqrt(3 / 8)]),
+    ],
+)
+def test_the_camera_is_in_the_direction_of_its_angles(azimuth, elevation, direction, close):
+    camera = orbit(offset_ball(), azimuth=azimuth, elevation=elevation)
+    away = np.asarray(camera.eye - camera.target)
+    close(away / np.linalg.norm(away), np.array(direction, float), tolerance=1e-5)
+    close(camera.target, np.array([5.0, -2.0, 7.0]))
+
+
+@pytest.mark.parametrize("elevation", [-np.pi / 2, -1.0, 0.0, 1.0, np.pi / 2])
+def test_up_is_unit_and_orthogonal_to_the_view_even_at_the_poles(elevation):
+    camera = orbit(offset_ball(), azimuth=0.3, elevation=elevation)
+    right, up, forward = basis(camera)
+    assert np.linalg.norm(up) == pytest.approx(1, abs=1e-6)
+    assert up @ forward == pytest.approx(0, abs=1e-6)
+    assert right[1] == pytest.approx(0, abs=1e-6)
+
+
+def test_vertices_without_faces_do_not_count():
+    ball = sphere()
+    stray = make_mesh(np.concatenate([ball.position, [[1e6, 0, 0]]]), ball.face)
+    np.testing.assert_allclose(orbit(stray).eye, orbit(ball).eye, rtol=1e-6)
+
+
+def test_a_mesh_without_extent_is_seen_from_a_distance():
+    point = make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    camera = orbit(point)
+    assert np.isfinite(camera.eye).all()
+    assert np.linalg.norm(camera.eye) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"width": 0}, "width and height must be at least 1, got 0 x 512"),
+        ({"field_of_view": 0.0}, "field_of_view must be between 0 and pi, got 0"),
+        ({"field_of_view": 3.2}, "field_of_view must be between 0 and pi, got 3.2"),
+        ({"elevation": 1.6}, "elevation must be from -pi/2 to pi/2, got 1.6"),
+        ({"azimuth": float("nan")}, "azimuth must be finite, got nan"),
+    ],
+)
+def test_impossible_cameras_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        orbit(sphere(), **options)

@@ -1,0 +1,409 @@
+import time
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import OpenEXR
+import pytest
+
+from jaxprt.files import write_exr, write_png
+from jaxprt.scene import environment
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import cubemap
+
+AXIS = np.concatenate([np.eye(3), -np.eye(3)])
+COLOR = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0]], np.float32)
+# A corner of the cube where x, y and z differ, with its mirror images: only the first is gray.
+OCTANT = np.array([0.5, 0.75, 0.45])
+# Share of the integral that the parts' areas may be off by before the global scale puts it right (measured: 0.0023).
+SCALE_BOUND = 0.005
+# Two pictures of one light on different grids, each resampled (measured: 0.008).
+GRACE_BOUND = 0.02
+
+
+def labeled(direction):
+    """Six colors around the world's axes, and a gray spot that no mirror image of the scene has at its place."""
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    color = COLOR[(direction @ AXIS.T).argmax(-1)]
+    spot = direction @ (OCTANT / np.linalg.norm(OCTANT)) > np.cos(0.15)
+    return np.where(spot[..., None], np.float32(0.5), color)
+
+
+def latlong_direction(height, width, *, on_edge=False):
+    """OpenEXR's formula, written out for pixel centers and for samples on the edges."""
+    row, column = np.arange(height)[:, None], np.arange(width)[None]
+    v = row / (height - 1) if on_edge else (row + 0.5) / height
+    u = column / (width - 1) if on_edge else (column + 0.5) / width
+    latitude, longitude = np.pi * (0.5 - v), 2 * np.pi * (0.5 - u)
+    return np.stack(
+        [
+            np.sin(longitude) * np.cos(latitude),
+            np.sin(latitude) + 0 * longitude,
+            np.cos(longitude) * np.cos(latitude),
+        ],
+        -1,
+    )
+
+
+def openexr_cube_direction(n):
+    """The functions pixelPosition and direction of OpenEXR's ImfEnvmap.cpp, inverted by hand."""
+    top, left = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    right, bottom = n - 1 - left, n - 1 - top
+    unit = lambda position: position / (n - 1) * 2 - 1  # noqa: E731
+    one = np.ones((n, n))
+    face = [
+        (one, unit(bottom), unit(left)),
+        (-one, unit(bottom), unit(right)),
+        (unit(left), one, unit(bottom)),
+        (unit(left), -one, unit(top)),
+        (unit(right), unit(bottom), one),
+        (unit(left), unit(bottom), -one),
+    ]
+    return np.concatenate([np.stack(f, -1) for f in face])
+
+
+def vertical_cross_direction(n):
+    """A camera in the middle that looks at -z with +y up, turned to each face; the back hangs below the bottom."""
+    v, u = np.meshgrid(*[(2 * np.arange(n) + 1) / n - 1] * 2, indexing="ij")
+    one = np.ones((n, n))
+    blank = np.full((n, n, 3), np.nan)
+    top = np.stack([u, one, -v], -1)
+    left, front, right = np.stack([-one, -v, -u], -1), np.stack([u, -v, -one], -1), np.stack([one, -v, u], -1)
+    bottom, back = np.stack([u, -one, v], -1), np.stack([u, v, one], -1)
+    rows = [[blank, top, blank], [left, front, right], [blank, bottom, blank], [blank, back, blank]]
+    return np.concatenate([np.concatenate(row, 1) for row in rows])
+
+
+def picture(layout, n):
+    direction = {
+        "latlong": lambda: latlong_direction(2 * n, 4 * n),
+        "openexr-latlong": lambda: latlong_direction(2 * n, 4 * n, on_edge=True),
+        "openexr-cube": lambda: openexr_cube_direction(n),
+        "vertical-cross": lambda: vertical_cross_direction(n),
+        "vertical-strip": lambda: np.concatenate(np.asarray(cubemap.direction(size=n))),
+        "horizontal-strip": lambda: np.concatenate(np.asarray(cubemap.direction(size=n)), 1),
+    }[layout]()
+    return np.where(np.isnan(direction).any(-1, keepdims=True), 0, labeled(np.nan_to_num(direction, nan=1.0)))
+
+
+def integral(radiance):
+    size = radiance.shape[-2]
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64)
+    return (area[..., None] * np.asarray(radiance, np.float64)).sum((-4, -3, -2))
+
+
+def latlong_integral(image):
+    edge = np.cos(np.linspace(0, np.pi, image.shape[0] + 1))
+    area = (edge[:-1] - edge[1:]) * 2 * np.pi / image.shape[1]
+    return (area[:, None, None] * image.astype(np.float64)).sum((0, 1))
+
+
+def random_light(size, *, seed=0, channels=3):
+    radiance = np.exp(2 * np.random.default_rng(seed).normal(size=(6, size, size, channels)))
+    return Environment(jnp.asarray(radiance, jnp.float32))
+
+
+def turn(vector):
+    """Rodrigues' formula, in float64 NumPy."""
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+@pytest.mark.parametrize("layout", environment.LAYOUTS)
+def test_every_layout_puts_each_color_on_its_axis_and_mirrors_nothing(layout):
+    light = environment.environment_from_image(picture(layout, 128), layout=layout, size=32)
+    direction = np.concatenate([AXIS, OCTANT[None], OCTANT * [[-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]]])
+    seen = environment.background(light, jnp.asarray(direction, jnp.float32))
+    np.testing.assert_allclose(seen, labeled(direction), atol=1e-4)  # The global scale of latlong pictures.
+    # Not only there: everywhere but on the lines where colors meet.
+    everywhere = np.asarray(cubemap.direction(size=32), np.float64)
+    wrong = np.abs(np.asarray(light.radiance) - labeled(everywhere)).max(-1) > 0.5
+    assert wrong.mean() < 0.03
+
+
+def test_layouts_are_told_from_the_shape_and_the_envmap_attribute(tmp_path):
+    expected = np.asarray(environment.environment_from_image(picture("vertical-cross", 64), size=16).radiance)
+    for layout in environment.LAYOUTS:
+        path = tmp_path / f"{layout}.exr"
+        image = picture(layout, 64)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        if layout.startswith("openexr"):
+            header["envmap"] = OpenEXR.ENVMAP_CUBE if layout.endswith("cube") else OpenEXR.ENVMAP_LATLONG
+        channels = {name: np.ascontiguousarray(image[..., i]) for i, name in enumerate("RGB")}
+        with OpenEXR.File(header, channels) as file:
+            file.write(str(path))
+        found = np.asarray(environment.load_environment(path, size=16).radiance)
+        np.testing.assert_array_equal(found, environment.load_environment(path, size=16, layout=layout).radiance)
+        assert (np.abs(found - expected).max(-1) > 0.3).mean() < 0.08
+
+
+@pytest.mark.parametrize("size", [1, 3, 64])
+@pytest.mark.parametrize(
+    ("layout", "height", "width"),
+    [
+        ("latlong", 1, 1),
+        ("latlong", 4, 8),
+        ("latlong", 50, 100),
+        ("openexr-latlong", 1, 1),
+        ("openexr-latlong", 3, 5),
+        ("openexr-latlong", 64, 128),
+        ("vertical-cross", 4, 3),
+        ("vertical-cross", 400, 300),
+        ("openexr-cube", 6, 1),
+        ("openexr-cube", 60, 10),
+        ("horizontal-strip", 2, 12),
+    ],
+)
+def test_constants_are_reproduced_exactly(layout, height, width, size):
+    color = np.array([0.1, 7.7, 3e4], np.float32)
+    light = environment.environment_from_image(np.broadcast_to(color, (height, width, 3)), layout=layout, size=size)
+    np.testing.assert_array_equal(light.radiance, np.broadcast_to(color, (6, size, size, 3)))
+
+
+@pytest.mark.parametrize("size", [8, 32, 64])
+def test_the_integral_of_a_latlong_picture_is_conserved_and_nearly_so_before_the_scale(size):
+    image = np.exp(np.random.default_rng(0).normal(size=(128, 256, 2)))
+    image[50, 70, 1] += 3e5  # A sun that holds nearly all the light.
+    result = environment.resample(image, layout="latlong", size=size)
+    np.testing.assert_allclose(
+        integral(result) / integral(np.ones((6, size, size, 1))), latlong_integral(image) / (4 * np.pi), rtol=1e-6
+    )
+    # Sky texels far from the sun tell the scale: the first channel has the same noise but no sun.
+    quiet = environment.resample(image - [0, 3e5] * (image > 1e5), layout="latlong", size=size)
+    assert np.abs(np.median(result[..., 1] / quiet[..., 1]) - 1) < 2 * SCALE_BOUND
+
+
+@pytest.mark.parametrize("n", [6, 10, 32])
+def test_the_integral_of_a_cube_is_conserved(n):
+    face = random_light(n).radiance
+    strip = np.concatenate(np.asarray(face))
+    for size in (1, 4, 7, 64):
+        result = environment.resample(strip, layout="vertical-strip", size=size)
+        np.testing.assert_allclose(integral(result), integral(face), rtol=1e-6)
+
+
+def test_cubes_of_a_multiple_of_the_size_are_box_filtered_exactly():
+    face = np.asarray(random_light(32).radiance, np.float64)
+    result = environment.resample(np.concatenate(face), layout="vertical-strip", size=8)
+    area = np.asarray(cubemap.solid_angle(size=32), np.float64)[..., None]
+    block = (6, 8, 4, 8, 4, -1)
+    expected = (face * area).reshape(block).sum((2, 4)) / area.reshape(block).sum((2, 4))
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
+    same = environment.resample(np.concatenate(face), layout="vertical-strip", size=32)
+    np.testing.assert_allclose(same, face, rtol=1e-14)
+
+
+def test_a_texel_of_a_coarse_latlong_picture_holds_the_pixel_it_lies_in():
+    image = np.random.default_rng(0).random((4, 8, 3))
+    result = environment.resample(image, layout="latlong", size=64)
+    x, y, z = np.moveaxis(np.asarray(cubemap.direction(size=64), np.float64), -1, 0)
+    row = np.floor((0.5 - np.arcsin(y) / np.pi) * 4).astype(int)
+    column = np.floor((0.5 - np.arctan2(x, z) / (2 * np.pi)) * 8).astype(int)
+    expected = image[row, column]
+    assert (np.abs(result - expected).max(-1) > 1e-3).mean() < 0.1  # Texels across a border of pixels.
+
+
+def test_a_single_pixel_is_constant_light():
+    light = environment.environment_from_image(np.full((1, 1, 3), 0.3, np.float32), size=4)
+    np.testing.assert_array_equal(light.radiance, np.full((6, 4, 4, 3), np.float32(0.3)))
+
+
+def test_black_stays_black():
+    light = environment.environment_from_image(np.zeros((8, 16, 3), np.float32), size=16)
+    assert not np.asarray(light.radiance).any()
+    assert not np.asarray(
+        environment.rotate(light, jnp.asarray(turn(np.array([0.1, 0.2, 0.3])), jnp.float32)).radiance
+    ).any()
+
+
+def test_gray_and_alpha_become_three_colors():
+    gray = np.random.default_rng(0).random((8, 16, 1)).astype(np.float32)
+    alpha = np.full_like(gray, 0.25)
+    expected = environment.environment_from_image(gray.repeat(3, -1), size=4).radiance
+    for image in (gray, np.concatenate([gray, alpha], -1), np.concatenate([gray, gray, gray, alpha], -1)):
+        np.testing.assert_array_equal(environment.environment_from_image(image, size=4).radiance, expected)
+
+
+def test_values_that_are_not_finite_are_refused_with_the_first_place(tmp_path):
+    image = np.ones((8, 16, 3), np.float32)
+    image[3, 5, 1], image[6, 0, 2] = np.inf, np.nan
+    write_exr(tmp_path / "sky.exr", image)
+    with pytest.raises(ValueError, match=r"sky\.exr .* in 2 pixels, the first at row 3, column 5"):
+        environment.load_environment(tmp_path / "sky.exr")
+
+
+def test_negative_values_are_set_to_zero_with_one_warning():
+    image = np.ones((8, 16, 3), np.float32)
+    image[3, 5] = [-0.25, -0.1, 1]
+    with pytest.warns(UserWarning, match=r"image: 1 of 128 pixels are negative, the lowest -0\.25") as record:
+        light = environment.environment_from_image(image, size=4)
+    assert len(record) == 1
+    assert np.asarray(light.radiance).min() >= 0
+    clamped = environment.environment_from_image(np.maximum(image, 0), size=4)
+    np.testing.assert_array_equal(light.radiance, clamped.radiance)
+
+
+def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible(tmp_path):
+    image = np.ones((10, 17, 3), np.float32)
+    with pytest.raises(ValueError, match=r"one of latlong, openexr-latlong, .* got 'angular'"):
+        environment.environment_from_image(image, layout="angular")
+    with pytest.raises(ValueError, match=r"3 n x 4 n pixels .* layout vertical-cross, got 17 x 10"):
+        environment.environment_from_image(image, layout="vertical-cross")
+    write_png(tmp_path / "photo.png", image)
+    with pytest.raises(ValueError, match=r"photo\.png must be 2 : 1 .* got 17 x 10 .* latlong, openexr-latlong"):
+        environment.load_environment(tmp_path / "photo.png")
+    with pytest.raises(ValueError, match="1 to 4 channels, got 5"):
+        environment.environment_from_image(np.ones((2, 4, 5), np.float32))
+    with pytest.raises(ValueError, match=r"must have pixels, got the shape \(0, 0, 3\)"):
+        environment.environment_from_image(np.ones((0, 0, 3), np.float32), layout="latlong")
+    with pytest.raises(ValueError, match="size must be at least 1, got 0"):
+        environment.environment_from_image(np.ones((2, 4, 3), np.float32), size=0)
+    with pytest.raises(FileNotFoundError, match="missing"):
+        environment.load_environment(tmp_path / "missing.exr")
+
+
+def test_rotating_by_the_identity_changes_nothing():
+    light = random_light(16)
+    turned = environment.rotate(light, jnp.eye(3))
+    np.testing.assert_allclose(turned.radiance, light.radiance, rtol=2e-6)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("size", [5, 16])
+def test_quarter_turns_permute_the_texels(axis, size):
+    light = random_light(size)
+    vector = np.zeros(3)
+    vector[axis] = np.pi / 2
+    turned = environment.rotate(light, jnp.asarray(turn(vector), jnp.float32))
+    # The texel seen at R s is the one that was at s.
+    destination = cubemap.point(size=size) @ jnp.asarray(np.round(turn(vector)), jnp.float32).T
+    found = cubemap.lookup(turned.radiance, destination, sharpness=100)
+    # Relative to the brightest texel: rounding lets a trace of the neighbors in.
+    np.testing.assert_allclose(found, light.radiance, atol=1e-5 * float(light.radiance.max()))
+
+
+def test_rotation_moves_light_from_s_to_r_s():
+    direction = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
+    center = np.asarray(cubemap.direction(size=32), np.float64)
+    light = Environment(jnp.asarray(np.exp(20 * (center @ direction - 1))[..., None], jnp.float32))
+    rotation = turn(np.array([0.5, -1.2, 2.0]))
+    expected = np.exp(20 * (center @ (rotation @ direction) - 1))[..., None]
+    turned = environment.rotate(light, jnp.asarray(rotation, jnp.float32))
+    # The box filter's blur of a lobe some ten texels wide.
+    assert np.linalg.norm(turned.radiance - expected) < 0.02 * np.linalg.norm(expected)
+
+
+def test_rotation_conserves_the_integral_of_each_color():
+    light = random_light(16)
+    for seed in range(5):
+        rotation = turn(np.random.default_rng(seed).normal(size=3))
+        turned = environment.rotate(light, jnp.asarray(rotation, jnp.float32))
+        np.testing.assert_allclose(integral(turned.radiance), integral(light.radiance), rtol=2e-6)
+
+
+def test_rotation_keeps_constant_light():
+    light = Environment(jnp.full((6, 16, 16, 3), 0.7))
+    turned = environment.rotate(light, jnp.asarray(turn(np.array([0.3, 0.4, 0.5])), jnp.float32))
+    np.testing.assert_allclose(turned.radiance, 0.7, rtol=1e-6)
+
+
+@pytest.mark.parametrize("place", [(4, 16, 16), (4, 0, 0), (2, 5, 30)])
+def test_a_turning_sun_of_one_texel_neither_vanishes_nor_flickers_nor_lags(place):
+    size = 32
+    radiance = np.full((6, size, size, 1), 1e-3, np.float32)
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64)[..., None]
+    radiance[place] = 1 / area[place[0], place[1], place[2]]  # About 80 times the light of the sky.
+    center = np.asarray(cubemap.direction(size=size), np.float64)
+    sky = []
+    for step in range(12):
+        rotation = turn(np.array([0.02, 0.05, 0.11]) * (step + 1))
+        turned = np.asarray(
+            environment.rotate(Environment(jnp.asarray(radiance)), jnp.asarray(rotation, jnp.float32)).radiance
+        )
+        sky.append(np.median(turned))
+        sun = (area * (turned - sky[-1]))[..., 0]
+        centroid = (sun[..., None] * center).sum((0, 1, 2))
+        angle = np.arccos(centroid @ (rotation @ center[place]) / np.linalg.norm(centroid))
+        assert angle < 0.6 * 2 / size  # Well below a texel's width.
+        assert (sun > 0.02).sum() <= 16
+    # What the sky takes over when the sun's parts are counted a few too many or too few.
+    assert np.std(sky) / np.mean(sky) < 0.15
+
+
+def test_batches_of_lights_turn_like_each_light():
+    lights = [random_light(16, seed=seed) for seed in range(3)]
+    rotation = jnp.asarray(turn(np.array([1.0, 0.2, -0.4])), jnp.float32)
+    batch = environment.rotate(Environment(jnp.stack([light.radiance for light in lights])), rotation)
+    for i, light in enumerate(lights):
+        np.testing.assert_allclose(batch.radiance[i], environment.rotate(light, rotation).radiance, rtol=1e-5)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("vector", [np.array([1e-30, 0, 0]), np.array([0.3, 0.5, -0.7])], ids=["identity", "oblique"])
+def test_the_gradient_of_a_rotation_equals_the_central_difference(vector):
+    light = Environment(jnp.asarray(np.exp(np.random.default_rng(0).normal(size=(6, 8, 8, 1)))))
+    probe = np.random.default_rng(1).normal(size=(6, 8, 8, 1))
+    generator = np.array([[0, -0.3, 0.5], [0.3, 0, -0.9], [-0.5, 0.9, 0]])
+
+    def measured(matrix):
+        return (probe * environment.rotate(light, matrix).radiance).sum()
+
+    start = jnp.asarray(turn(vector))
+    slope = (jax.grad(measured)(start) * (generator @ start)).sum()
+    step = 1e-6
+    forward, backward = (measured(start + sign * step * generator @ start) for sign in (1, -1))
+    assert float(slope) == pytest.approx(float((forward - backward) / (2 * step)), rel=1e-4)
+
+
+def test_rotation_and_background_refuse_what_they_cannot_do():
+    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
+        environment.rotate(random_light(2), jnp.eye(3), samples=0)
+
+
+def test_the_two_kerner_files_hold_the_same_light(data):
+    cube, latlong = (
+        np.asarray(environment.load_environment(data / "env" / f"KernerEnv{name}.exr", size=32).radiance)
+        for name in ("Cube", "LatLong")
+    )
+    np.testing.assert_allclose(integral(cube), integral(latlong), rtol=2e-4)
+    # Measured 0.0013, most of it around the sun; one wrong sample at the edge would give a hundred times that.
+    assert np.linalg.norm(cube - latlong) < 0.004 * np.linalg.norm(latlong)
+
+
+def test_the_cross_and_the_latlong_copy_of_grace_are_inversions_of_each_other(data):
+    # pbrt's copy is the cross with its rows upside down, half a turn further and scaled: copy(-s) = cross(s) / 127.3.
+    cross, copy = (
+        environment.load_environment(data / "env" / name, size=32)
+        for name in ("grace_cross.hdr", "grace_latlong_pbrt.exr")
+    )
+    factor = integral(cross.radiance) / integral(copy.radiance)
+    np.testing.assert_allclose(factor, 127.3, rtol=0.003)
+    inverted = 127.3 * environment.background(copy, -cubemap.direction(size=32))
+    assert np.linalg.norm(inverted - cross.radiance) < GRACE_BOUND * np.linalg.norm(cross.radiance)
+
+
+def test_a_sunrise_keeps_its_sun_in_time(data):
+    start = time.perf_counter()
+    with pytest.warns(UserWarning, match=r"polyhaven_sunrise_1k\.exr: .* pixels are negative"):
+        light = environment.load_environment(data / "env" / "polyhaven_sunrise_1k.exr")
+    seconds = time.perf_counter() - start
+    radiance = np.asarray(light.radiance, np.float64)
+    assert radiance.max() > 5000
+    area = np.asarray(cubemap.solid_angle(size=64))[..., None]
+    brightest = np.sort((area * radiance).sum(-1).ravel())[::-1]
+    assert 0.4 < brightest[:10].sum() / brightest.sum() < 0.7
+    assert seconds < 10  # Alone it takes one.
+
+
+@pytest.mark.parametrize("name", ["uffizi_latlong_256x128.hdr", "eucalyptus_rnl_cross.hdr", "grace_cross.hdr"])
+def test_real_environments_are_brighter_above(data, name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        light = environment.load_environment(data / "env" / name, size=16)
+    _, y, _ = np.moveaxis(np.asarray(cubemap.direction(size=16)), -1, 0)
+    luminance = np.log(np.asarray(light.radiance).mean(-1) + 1e-4)
+    # Half the sphere above the horizon, without the poles where tripods and lamps are.
+    assert luminance[(y > 0.2) & (y < 0.8)].mean() > luminance[(y < -0.2) & (y > -0.8)].mean()

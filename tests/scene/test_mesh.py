@@ -1,0 +1,262 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxprt.scene import builtin
+from jaxprt.scene.mesh import Mesh, ground_plane, join, load_mesh, make_mesh, split
+from jaxprt.sphere import directions
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+SQUARE_FACE = np.array([[0, 1, 2], [0, 2, 3]])
+CUBE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"
+CUBE_FACE = "f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"
+ICOSPHERE = 1e-2  # How far means of its face normals are from a sphere's normals.
+
+
+def write(folder, name, content):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def assert_equal(a: Mesh, b: Mesh):
+    for field in ("position", "face", "normal", "tangent", "region"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field), err_msg=field)
+
+
+def assert_frames(mesh: Mesh):
+    frame = np.asarray(directions.frame(mesh.normal, mesh.tangent), np.float64)
+    assert np.abs(frame @ frame.swapaxes(1, 2) - np.eye(3)).max() < 1e-5
+    assert np.abs(np.linalg.det(frame) - 1).max() < 1e-5
+    assert np.abs(frame[:, 0] - np.asarray(mesh.tangent)).max() < 1e-5
+
+
+def ball(**options):
+    return trimesh.creation.icosphere(subdivisions=2, **options)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "off", "glb"])
+def test_a_ball_comes_back_from_every_format_with_its_vertices_in_order(tmp_path, suffix, close):
+    source = ball()
+    source.export(tmp_path / f"ball.{suffix}")
+    mesh = load_mesh(tmp_path / f"ball.{suffix}")
+    close(mesh.position, source.vertices, tolerance=1e-6)
+    np.testing.assert_array_equal(mesh.face, source.faces)
+    close(mesh.normal, source.vertices, tolerance=ICOSPHERE)
+    assert_frames(mesh)
+
+
+def test_suffixes_may_be_capitals_and_paths_strings(tmp_path):
+    ball().export(tmp_path / "ball.ply")
+    (tmp_path / "ball.ply").rename(tmp_path / "ball.PLY")
+    assert load_mesh(str(tmp_path / "ball.PLY")).position.shape == (162, 3)
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_stl_is_flat_with_three_vertices_per_face(tmp_path, kind, close):
+    source = ball()
+    source.export(tmp_path / "ball.stl", file_type=kind)
+    mesh = load_mesh(tmp_path / "ball.stl")
+    assert mesh.position.shape == (3 * len(source.faces), 3)
+    close(np.asarray(mesh.normal).reshape(-1, 3, 3), np.repeat(source.face_normals[:, None], 3, 1), tolerance=1e-5)
+
+
+def test_normals_are_weighted_by_angle_not_by_triangulation(close):
+    # At a corner of a cube each square counts as a right angle, whether one triangle of it or two meet there.
+    position = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
+    mesh = make_mesh(position, np.asarray(trimesh.creation.box().faces))
+    close(mesh.normal, position / np.sqrt(3))
+
+
+def test_reversing_the_faces_reverses_the_normals(close):
+    source = ball()
+    mesh, reverse = (make_mesh(source.vertices, source.faces[:, order]) for order in ([0, 1, 2], [2, 1, 0]))
+    close(reverse.normal, -np.asarray(mesh.normal))
+
+
+def test_normals_do_not_depend_on_scale_and_place(close):
+    source = ball()
+    mesh = make_mesh(source.vertices, source.faces)
+    close(make_mesh(source.vertices * 1e-12, source.faces).normal, np.asarray(mesh.normal), tolerance=1e-5)
+    # 100 diameters off, float32 positions have five digits left.
+    close(make_mesh(source.vertices + 200, source.faces).normal, np.asarray(mesh.normal), tolerance=1e-3)
+
+
+def test_faces_without_area_leave_normals_alone(close):
+    on_diagonal = (2 * SQUARE[3] + SQUARE[1]) / 3  # But for rounding, which gives face 1 3 4 a normal at random.
+    thin = np.array([[0, 0, 1], [2, 2, 2], [1, 3, 4]])
+    mesh = make_mesh(np.concatenate([SQUARE, [on_diagonal]]), np.concatenate([SQUARE_FACE, thin]))
+    close(mesh.normal[:4], np.tile([0.0, 0, 1], (4, 1)))
+    close(np.abs(mesh.normal[4]), np.array([0.0, 0, 1]))
+
+
+def test_vertices_whose_faces_cancel_or_that_have_none_get_unit_normals():
+    sheet = np.concatenate([SQUARE_FACE, SQUARE_FACE[:, ::-1]])
+    mesh = make_mesh(np.concatenate([SQUARE, [[5.0, 5, 5]]]), sheet)
+    np.testing.assert_array_equal(np.abs(mesh.normal[:4, 2]), 1)
+    np.testing.assert_array_equal(mesh.normal[4], [0, 1, 0])
+    np.testing.assert_array_equal(make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])).normal, [[0, 1, 0]] * 3)
+
+
+def test_given_normals_are_made_unit_and_missing_ones_computed(close):
+    given = np.array([[3.0, 0, 4], [0, 0, 0], [np.nan, 0, 1], [0, 1e-30, 0]])
+    mesh = make_mesh(SQUARE, SQUARE_FACE, normal=given)
+    close(mesh.normal, np.array([[0.6, 0, 0.8], [0, 0, 1], [0, 0, 1], [0, 1, 0]]))
+    assert_frames(mesh)
+
+
+def test_given_tangents_are_made_orthogonal_and_missing_ones_computed(close):
+    given = np.array([[0.0, 2, 5], [np.nan, 0, 0], [0, 0, 0], [0, 0, 7]])
+    mesh = make_mesh(SQUARE, SQUARE_FACE, tangent=given)
+    own = np.asarray(directions.tangent(mesh.normal))
+    close(mesh.tangent, np.concatenate([[[0, 1, 0]], own[1:]]))
+
+
+def test_arrays_come_out_in_single_precision(x64):
+    mesh = make_mesh(SQUARE, SQUARE_FACE.astype(np.uint8))
+    assert [f.dtype for f in (mesh.position, mesh.normal, mesh.tangent)] == [jnp.float32] * 3
+    assert [f.dtype for f in (mesh.face, mesh.region)] == [jnp.int32] * 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position": np.zeros((0, 3))}, "hat must hold vertices and faces, got 0 vertices and 2 faces"),
+        ({"face": np.zeros((0, 3), int)}, "hat must hold vertices and faces, got 4 vertices and 0 faces"),
+        ({"face": np.array([[0, 1, 2], [0, 1, 4]])}, r"name vertices 0 to 3, got 1 of 2 .* \[0, 1, 4\] at face 1"),
+        (
+            {"face": np.array([[0, -1, 2], [0, 1, 2**40]])},
+            r"got 2 of 2 faces that name others.* \[0, -1, 2\] at face 0",
+        ),
+        (
+            {"position": SQUARE + np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, np.inf], [0, 0, 0]])},
+            "got 2 of 4 .* at vertex 1",
+        ),
+        ({"position": SQUARE * 1e39}, "positions must be finite, got 3 of 4"),
+        ({"region": np.array([0, 0, -1, 0])}, "regions must not be negative, got 1 of 4 .* -1 at vertex 2"),
+    ],
+)
+def test_impossible_arrays_are_refused_with_name_count_and_first_offender(change, message):
+    fields = {"position": SQUARE, "face": SQUARE_FACE} | change
+    with pytest.raises(ValueError, match=message):
+        make_mesh(fields.pop("position"), fields.pop("face"), name="hat", **fields)
+
+
+def test_normals_are_smooth_across_seams_of_an_obj_but_not_across_creases(tmp_path, close):
+    # Texture coordinates that differ per face split every vertex of this sphere and of this cube.
+    source = ball()
+    corner = "".join(f"vt {i / 960} 0\n" for i in range(3 * len(source.faces)))
+    vertex = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in source.vertices)
+    face = "".join(
+        "f " + " ".join(f"{v + 1}/{3 * i + j + 1}" for j, v in enumerate(f)) + "\n" for i, f in enumerate(source.faces)
+    )
+    mesh = load_mesh(write(tmp_path, "ball.obj", vertex + corner + face))
+    assert len(mesh.position) == 3 * len(source.faces)
+    close(mesh.normal, np.asarray(mesh.position), tolerance=ICOSPHERE)
+
+    face = "".join(
+        "f " + " ".join(f"{v}/{4 * i + j + 1}" for j, v in enumerate(line.split()[1:])) + "\n"
+        for i, line in enumerate(CUBE_FACE.splitlines())
+    )
+    mesh = load_mesh(write(tmp_path, "cube.obj", CUBE + "".join(f"vt {i} 0\n" for i in range(24)) + face))
+    assert len(mesh.position) == 24
+    np.testing.assert_allclose(np.abs(mesh.normal).max(1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("groups", [False, True])
+def test_regions_of_an_obj_are_materials_or_groups_in_order_of_appearance(tmp_path, groups):
+    lines = "usemtl steel\ng left\nf 1 2 3\nusemtl wood\nf 1 3 4\nusemtl steel\ng right\nf 5 6 7\nf 5 7 8\n"
+    path = write(tmp_path, "two.obj", "mtllib absent.mtl\n" + CUBE + lines)
+    parts = split(load_mesh(path, groups=groups))
+    assert [len(part.face) for part in parts] == ([2, 2] if groups else [3, 1])
+    assert float(parts[0].position[:, 2].max()) == (0 if groups else 1)
+
+
+def test_relative_indices_of_an_obj_count_back_from_their_own_line(tmp_path):
+    first, second = (f"v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvn 0 0 1\nf -3//-1 -2//-1 -1//-1 # -9\n" for z in (0, 5))
+    mesh = load_mesh(write(tmp_path, "strips.obj", first + second))
+    np.testing.assert_array_equal(np.sort(mesh.position[mesh.face][..., 2], 0), [[0, 0, 0], [5, 5, 5]])
+    np.testing.assert_array_equal(mesh.normal[:, 2], 1)
+
+
+def test_odd_spellings_of_an_obj_are_read(tmp_path):
+    text = CUBE.replace("\n", "\r\n").replace("v 0", "v\t0") + "# caf\xe9\nf 1 2 \\\n 3 4\n  f 5 6 7 8 # far\nl 1 2\n"
+    mesh = load_mesh(write(tmp_path, "odd.obj", text.encode("latin-1")))
+    assert mesh.face.shape == (4, 3)
+
+
+@pytest.mark.parametrize("groups", [False, True])
+def test_nodes_of_a_scene_are_placed_and_regions_are_materials_or_nodes(tmp_path, groups, close):
+    def part(name):
+        material = trimesh.visual.material.PBRMaterial(name=name)
+        return ball(visual=trimesh.visual.TextureVisuals(uv=np.zeros((162, 2)), material=material))
+
+    scene = trimesh.Scene()
+    mirror = np.diag([-1.0, 2, 1, 1])
+    mirror[0, 3] = 5
+    for i, (name, transform) in enumerate([("red", np.eye(4)), ("blue", mirror), ("red", np.diag([2.0, 2, 2, 1]))]):
+        geometry = part(name)
+        assert geometry.vertex_normals.shape  # So that they are written.
+        scene.add_geometry(geometry, node_name=f"node{i}", geom_name=f"geometry{i}", transform=transform)
+    scene.export(tmp_path / "scene.glb", include_normals=True)
+    mesh = load_mesh(tmp_path / "scene.glb", groups=groups)
+    assert len(np.unique(mesh.region)) == (3 if groups else 2)
+    volume = trimesh.Trimesh(mesh.position, mesh.face, process=False).volume
+    assert volume == pytest.approx(ball().volume * (1 + 2 + 8), rel=1e-5)
+    moved = np.asarray(mesh.position[:, 0]) > 3
+    center, axes = np.array([5.0, 0, 0]), np.array([1, 2, 1])
+    expected = (np.asarray(mesh.position) - center)[moved] / axes**2
+    close(mesh.normal[moved], expected / np.linalg.norm(expected, axis=1, keepdims=True), tolerance=ICOSPHERE)
+
+
+def test_joined_meshes_come_apart_again():
+    parts = [builtin.sphere(rings=4, sectors=5), builtin.plane(cells=2), builtin.sphere(rings=3, sectors=3)]
+    joined = join(parts)
+    assert np.unique(joined.region).tolist() == [0, 1, 2]
+    for part, again in zip(parts, split(joined), strict=True):
+        assert_equal(part, again)
+    assert_equal(join(split(joined)), joined)
+    assert_equal(join([joined]), joined)
+
+
+def test_join_renumbers_regions_consecutively_in_order():
+    gap = make_mesh(SQUARE, SQUARE_FACE, region=np.array([7, 7, 7, 7]))
+    pair = join([gap, gap])
+    assert np.asarray(join([pair, gap]).region).reshape(3, 4).tolist() == [[0] * 4, [1] * 4, [2] * 4]
+    with pytest.raises(ValueError, match="at least one mesh, got none"):
+        join([])
+
+
+def test_a_face_in_two_regions_cannot_be_split():
+    mesh = make_mesh(SQUARE, SQUARE_FACE, region=np.array([0, 0, 0, 1]))
+    with pytest.raises(
+        ValueError, match=r"got 1 faces of 2 in several, the first is face 1 in the regions \[0, 0, 1\]"
+    ):
+        split(mesh)
+
+
+def test_the_ground_lies_under_the_mesh_and_faces_up():
+    source = ball()
+    mesh = make_mesh(source.vertices * 3 + [10, 4, -7], source.faces)
+    ground = ground_plane(mesh, vertices=900, extent=5.0)
+    assert ground.position.shape == (900, 3)
+    low, high = np.asarray(ground.position.min(0)), np.asarray(ground.position.max(0))
+    np.testing.assert_allclose((low + high)[[0, 2]] / 2, [10, -7], atol=1e-4)
+    np.testing.assert_allclose((high - low)[[0, 2]], 30, rtol=1e-5)
+    gap = (float(mesh.position[:, 1].min()) - ground.position[:, 1]) / (6 * np.sqrt(3))
+    np.testing.assert_allclose(gap, 5e-4, rtol=1e-2)
+    np.testing.assert_array_equal(ground.normal, np.tile([0.0, 1, 0], (900, 1)))
+    face_normal = trimesh.Trimesh(ground.position, ground.face, process=False).face_normals
+    np.testing.assert_allclose(face_normal[:, 1], 1, atol=1e-6)
+    step = np.diff(np.unique(ground.position[:, 0]))
+    assert step.min() > 0
+    assert step[len(step) // 2] < 0.5 * 30 / 29 < step[0]
+
+
+def test_the_ground_under_a_mesh_without_extent_is_a_square_all_the_same():
+    assert float(ground_plane(make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), vertices=4).position[:, 0].max()) == 2
+    with pytest.raises(ValueError, match="vertices must be at least 4, got 3"):
+        ground_plane(builtin.plane(), vertices=3)
+    with pytest.raises(ValueError, match="extent must be positive, got 0"):
+        ground_plane(builtin.plane(), extent=0.0)

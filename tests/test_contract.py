@@ -1,0 +1,401 @@
+"""What every public pure function of the package promises, checked for all of them from one table of examples.
+
+Public functions are found by walking the package; one without an example fails. To add one, add a line to EXAMPLES:
+
+    "room.module.function": example(lambda draw: call(draw.unit(5), draw.normal(4)), keep=3),
+
+* ``call(...)`` holds the arrays (and pytrees of arrays), as the function takes them, by position or by name.
+  ``draw`` makes small random ones in the dtype under test; see ``Draw``.
+* Further keywords are static options.
+* ``gradient=("light", "eye")`` names the arguments in which the function is differentiable where these are not all
+  that hold floating-point arrays; ``gradient=()`` says none. ``batch=False`` says that ``jax.vmap`` is not promised.
+  A comment gives the reason.
+
+Public classes that can be called, as BRDF models can, have examples too: the first argument is the instance.
+Functions that are not pure, or run on the host, are named in HOST with the reason.
+"""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt
+from jaxprt import brdf, scene, transport
+
+GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
+STEP = 1e-6
+BATCH = 3
+JITTED = type(jax.jit(lambda: 0))
+
+HOST = {
+    "files": "reads and writes files",
+    "transport.visibility": "traces rays",
+    "transport.blocks": "runs workers and writes files",
+    "transport.separable.precompute": "traces rays",
+    "transport.sparse.rms": "counts on the host, after precomputation",
+    "relight.reference.radiance": "traces rays; its pure part is integrate",
+    "brdf.separable.factor": "checks values, and chooses the number of terms by them",
+    "brdf.separable.factor_symmetric": "checks values",
+    "scene.mesh": "loads, checks and builds meshes",
+    "scene.builtin": "builds meshes and lights",
+    "scene.camera.orbit": "measures a mesh on the host",
+    "scene.environment.load_environment": "reads a file",
+    "scene.environment.environment_from_image": "checks values",
+    "scene.environment.resample": "NumPy in float64, where data enters",
+    "image.metrics.flip": "calls the reference implementation",
+    "sphere.cubemap.border_index": "a NumPy table of indices",
+    "sphere.haar.face_edge": "arithmetic on shapes",
+}
+
+
+class Draw:
+    """Random arguments in the default dtype, the same for the same seed."""
+
+    def __init__(self, seed: int):
+        self.random = np.random.default_rng(seed)
+
+    def normal(self, *shape):
+        """Of any sign, around 1."""
+        return jnp.asarray(self.random.normal(size=shape), jnp.result_type(float))
+
+    def uniform(self, *shape, low=0.1, high=0.9):
+        """Between two positive bounds."""
+        return jnp.asarray(self.random.uniform(low, high, size=shape), jnp.result_type(float))
+
+    def integer(self, high, *shape, dtype=jnp.int32):
+        """From 0 to high - 1."""
+        return jnp.asarray(self.random.integers(high, size=shape), dtype)
+
+    def unit(self, *shape):
+        """Unit vectors all around."""
+        vector = self.normal(*shape, 3)
+        return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
+
+    def upper(self, *shape):
+        """Unit vectors well above the horizon of their local frame."""
+        vector = self.unit(*shape)
+        vector = vector.at[..., 2].set(jnp.abs(vector[..., 2]) + 0.3)
+        return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
+
+    def rotation(self, *shape):
+        """Proper rotations."""
+        matrix, _ = np.linalg.qr(self.random.normal(size=(*shape, 3, 3)))
+        return jnp.asarray(matrix * np.sign(np.linalg.det(matrix))[..., None, None], jnp.result_type(float))
+
+    def symmetric(self, size):
+        """A matrix whose eigenvalues of both signs lie well apart."""
+        vector, _ = np.linalg.qr(self.random.normal(size=(size, size)))
+        value = 3.0 ** -np.arange(size) * (-1.0) ** np.arange(size)
+        return jnp.asarray((vector * value) @ vector.T, jnp.result_type(float))
+
+    def mesh(self):
+        """Two triangles; the one at the back fills the picture of ``camera``."""
+        position = jnp.array([[-9, -9, 0], [9, -8, 0], [1, 9, 0], [-0.6, -0.8, 0.5], [1, -0.6, 0.6], [0.2, 0.7, 0.4]])
+        position = position + 0.05 * self.uniform(6, 3)
+        normal, tangent = self.rotation(6)[:, 2], self.rotation(6)[:, 0]
+        return scene.Mesh(position, jnp.array([[0, 1, 2], [3, 4, 5]]), normal, tangent, jnp.zeros(6, jnp.int32))
+
+    def camera(self):
+        """Looks at ``mesh`` with a few pixels."""
+        eye = jnp.array([0.2, 0.1, 4.0]) + 0.1 * self.uniform(3)
+        return scene.Camera(eye, 0.1 * self.uniform(3), jnp.array([0.0, 1, 0]), self.uniform(low=0.6, high=0.7), 6, 5)
+
+    def light(self, size=4):
+        """An environment."""
+        return scene.Environment(self.uniform(6, size, size, 3))
+
+    def separable(self, terms=2, size=4):
+        """A factored BRDF."""
+        maps = self.normal(terms, size, size, 1), self.normal(terms, size, size, 3)
+        return brdf.separable.SeparableBrdf(*maps, self.uniform())
+
+    def sparse(self, size=4, *, kept=5, vertices=3, terms=2):
+        """Transport for ``light`` and ``separable``."""
+        index = self.integer(6 * size * size, kept, vertices, terms, dtype=jnp.uint16)
+        value = self.normal(kept, vertices, terms, 1)
+        position, frame = self.normal(vertices, 3), self.rotation(vertices)
+        return transport.SparseTransport(index, value, position, frame, self.uniform(6 * size * size))
+
+    def seen(self, count, size=4):
+        """Visibility in sixteenths."""
+        return self.integer(17, count, 6 * size * size, dtype=jnp.uint8)
+
+    def above(self, transport):
+        """A place that the first vertex of ``sparse`` sees; the others see it or not."""
+        return transport.position[0] + transport.frame[0].T @ (3 * self.upper())
+
+
+class Call(NamedTuple):
+    """Arrays that a function is called with."""
+
+    position: tuple
+    name: dict[str, Any]
+
+
+class Example(NamedTuple):
+    """How one function is called, and what it promises."""
+
+    build: Callable[[Draw], Call]
+    gradient: tuple[str, ...] | None
+    batch: bool
+    options: dict[str, Any]
+
+
+def call(*position, **name):
+    """Arrays, as the function takes them."""
+    return Call(position, name)
+
+
+def example(build, /, *, gradient=None, batch=True, **options):
+    """One line of the table."""
+    return Example(build, gradient, batch, options)
+
+
+def nothing(draw):
+    """No arrays: the function makes a table."""
+    return call()
+
+
+def lit(draw):
+    """Transport, BRDF and light that fit together."""
+    return draw.sparse(), draw.separable(), draw.light()
+
+
+EXAMPLES = {
+    "sphere.directions.normalize": example(lambda draw: call(draw.normal(5, 3))),
+    "sphere.directions.tangent": example(lambda draw: call(draw.unit(5))),
+    "sphere.directions.frame": example(lambda draw: call(draw.unit(5), draw.normal(5, 3))),
+    "sphere.cubemap.direction": example(nothing, size=3),
+    "sphere.cubemap.point": example(nothing, size=3),
+    "sphere.cubemap.solid_angle": example(nothing, size=3),
+    "sphere.cubemap.vector_area": example(nothing, size=3),
+    "sphere.cubemap.coordinates": example(lambda draw: call(draw.normal(7, 3))),
+    "sphere.cubemap.lookup": example(lambda draw: call(draw.normal(6, 3, 3, 2), draw.unit(7)), sharpness=2),
+    "sphere.hemisphere.disk_coordinates": example(lambda draw: call(draw.upper(5))),
+    "sphere.hemisphere.disk_direction": example(lambda draw: call(draw.uniform(5, 2, low=0.2, high=0.8))),
+    "sphere.hemisphere.polar_coordinates": example(lambda draw: call(draw.upper(5))),
+    "sphere.hemisphere.polar_direction": example(lambda draw: call(draw.uniform(5, 2))),
+    "sphere.hemisphere.parabolic_coordinates": example(lambda draw: call(draw.upper(5))),
+    "sphere.hemisphere.parabolic_direction": example(lambda draw: call(draw.uniform(5, 2))),
+    "sphere.hemisphere.lookup": example(lambda draw: call(draw.normal(4, 4, 2), draw.uniform(5, 2))),
+    "sphere.hemisphere.texel_direction": example(nothing, resolution=5),
+    "sphere.hemisphere.texel_area": example(nothing, resolution=5),
+    "sphere.haar.forward": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
+    "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
+    "sphere.haar.area": example(nothing, size=4),
+    # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
+    "linalg.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
+    "linalg.eigen.left_singular": example(
+        lambda draw: call(draw.symmetric(12)[:9], jnp.eye(12)), gradient=(), terms=3, steps=12
+    ),
+    "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
+    "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
+    "brdf.models.Lambert": example(
+        lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
+        gradient=("self",),  # The value is the same for all directions.
+    ),
+    "brdf.models.AshikhminShirley": example(
+        lambda draw: call(
+            brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5), draw.upper(5)
+        )
+    ),
+    "brdf.separable.SeparableBrdf": example(
+        lambda draw: call(draw.separable(), draw.upper(5), draw.upper(5)),
+    ),
+    # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
+    "brdf.separable.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
+    "image.raster.ray_direction": example(lambda draw: call(draw.camera())),
+    "image.raster.view_axes": example(lambda draw: call(draw.camera())),
+    # What is seen is constant for derivatives.
+    "image.raster.rasterize": example(lambda draw: call(draw.mesh(), draw.camera()), gradient=()),
+    "image.raster.interpolate": example(
+        lambda draw: call(jaxprt.image.rasterize(mesh := draw.mesh(), draw.camera()), mesh.face, draw.normal(6, 2)),
+        gradient=("attribute",),
+    ),
+    "image.raster.render": example(
+        lambda draw: call(draw.mesh(), draw.normal(6, 3), draw.camera(), background=draw.uniform(5, 6, 3)),
+        gradient=("color",),  # The background is hidden here.
+    ),
+    "image.metrics.relative_l2": example(lambda draw: call(draw.normal(4, 5, 3), draw.normal(4, 5, 3))),
+    "image.metrics.psnr": example(lambda draw: call(draw.normal(4, 5, 3), draw.normal(4, 5, 3), peak=draw.uniform())),
+    "image.tonemap.expose": example(lambda draw: call(draw.uniform(4, 5, 3), stops=draw.normal())),
+    "image.tonemap.automatic_exposure": example(lambda draw: call(draw.uniform(4, 5, 3))),
+    "image.tonemap.encode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
+    "image.tonemap.decode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
+    "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2))),
+    "transport.separable.project": example(
+        lambda draw: call(draw.seen(2), draw.rotation(2), draw.normal(2, 4, 4, 1)),
+    ),
+    "transport.separable.compress": example(
+        lambda draw: call(draw.seen(2), draw.rotation(2), draw.normal(2, 4, 4, 1)), keep=5
+    ),
+    "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
+    "transport.sparse.apply": example(lambda draw: call(draw.sparse(), draw.normal(96, 3))),
+    "relight.reference.integrate": example(
+        lambda draw: call(
+            draw.seen(2),
+            jnp.zeros((2, 3)),
+            jnp.broadcast_to(frame := draw.rotation(), (2, 3, 3)),
+            brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0),
+            draw.light(),
+            frame.T @ (3 * draw.upper()),
+        )
+    ),
+    "relight.separable.project": example(lambda draw: call(draw.light())),
+    "relight.separable.choose_by_magnitude": example(lambda draw: call(draw.normal(24, 3)), threshold=9000),
+    "relight.separable.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),
+    "relight.separable.choose_by_transport": example(
+        lambda draw: call(draw.normal(24, 3), draw.uniform(24)),
+        gradient=("coefficient",),  # The weights only choose.
+        count=7,
+    ),
+    "relight.separable.light_tuple": example(lambda draw: call(draw.sparse(), draw.light()), light_keep=40),
+    "relight.separable.view_tuple": example(
+        lambda draw: call(mesh := draw.sparse(), draw.separable(), draw.above(mesh)),
+    ),
+    "relight.separable.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
+    "relight.separable.radiance": example(
+        lambda draw: call(*(all := lit(draw)), eye=draw.above(all[0])),
+    ),
+}
+
+
+def _public() -> dict[str, Callable]:
+    """Public functions, and public classes that can be called, by their name without the package's."""
+    result = {}
+    for module in pkgutil.walk_packages(jaxprt.__path__, "jaxprt."):
+        if module.name.endswith("__main__"):
+            continue
+        for name, value in vars(importlib.import_module(module.name)).items():
+            if name.startswith("_") or getattr(value, "__module__", None) != module.name:
+                continue
+            key = f"{module.name.removeprefix('jaxprt.')}.{name}"
+            if isinstance(value, type):
+                if "__call__" in vars(value):
+                    result[key] = value.__call__
+            elif callable(value) and hasattr(value, "__qualname__"):
+                result[key] = value
+    return result
+
+
+def on_host(name: str) -> bool:
+    """Whether HOST names the function or a module that it is in."""
+    parts = name.split(".")
+    return any(".".join(parts[:count]) in HOST for count in range(1, len(parts) + 1))
+
+
+PUBLIC = _public()
+PURE = [name for name in PUBLIC if not on_host(name)]
+TAKING_ARRAYS = [name for name in PURE if name in EXAMPLES and EXAMPLES[name].build is not nothing]
+each_pure = pytest.mark.parametrize("name", [name for name in PURE if name in EXAMPLES])
+
+
+def run(name: str, arrays: Call) -> Any:
+    """Calls a function with its static options."""
+    return PUBLIC[name](*arrays.position, **arrays.name, **EXAMPLES[name].options)
+
+
+def build(name: str, seed: int = 0) -> Call:
+    """Arguments of a function."""
+    return EXAMPLES[name].build(Draw(seed))
+
+
+def floats(tree: Any) -> list:
+    """Floating-point arrays in a tree."""
+    return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+
+
+@pytest.mark.parametrize("name", PURE)
+def test_has_an_example(name):
+    assert name in EXAMPLES, f"add {name} to EXAMPLES, or to HOST with the reason"
+
+
+def test_every_example_and_every_exception_is_of_something_public():
+    assert not EXAMPLES.keys() - set(PURE)
+    modules = {name.rsplit(".", count)[0] for name in PUBLIC for count in (1, 2)}
+    assert not HOST.keys() - modules - PUBLIC.keys()
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_defaults_are_keyword_only(name):
+    parameter = inspect.signature(PUBLIC[name]).parameters.values()
+    wrong = [p.name for p in parameter if p.default is not p.empty and p.kind is not p.KEYWORD_ONLY]
+    assert not wrong
+
+
+@each_pure
+def test_jit_equals_eager(name, close):
+    arrays, function = build(name), PUBLIC[name]
+    if isinstance(function, JITTED):
+        compiled = run(name, arrays)
+        eager = function.__wrapped__(*arrays.position, **arrays.name, **EXAMPLES[name].options)
+    else:
+        compiled = jax.jit(lambda arrays: run(name, arrays))(arrays)
+        eager = run(name, arrays)
+    jax.tree.map(close, compiled, eager)
+
+
+@each_pure
+def test_float32_in_gives_float32_out(name):
+    _check_dtype(name, jnp.float32)
+
+
+@each_pure
+def test_float64_in_gives_float64_out(name, x64):
+    _check_dtype(name, jnp.float64)
+
+
+def _check_dtype(name, dtype):
+    arrays = build(name)
+    assert all(leaf.dtype == dtype for leaf in floats(arrays)), "the example itself must have the dtype"
+    result = floats(run(name, arrays))
+    assert [leaf.dtype for leaf in result] == [dtype] * len(result)
+    assert result, "a function without floating-point results is for HOST"
+
+
+@pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].batch])
+def test_vmap_equals_a_loop(name, close):
+    arrays = [build(name, seed) for seed in range(BATCH)]
+    stacked = jax.tree.map(lambda *leaf: jnp.stack(leaf), *arrays)
+    together = jax.vmap(lambda arrays: run(name, arrays))(stacked)
+    apart = jax.tree.map(lambda *leaf: jnp.stack(leaf), *[run(name, each) for each in arrays])
+    jax.tree.map(close, together, apart)
+
+
+@pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].gradient != ()])
+def test_gradient_equals_finite_differences(name, x64):
+    arrays, options = build(name), EXAMPLES[name].options
+    given = dict(inspect.signature(PUBLIC[name]).bind_partial(*arrays.position, **arrays.name).arguments)
+    asked = EXAMPLES[name].gradient or [key for key in given if floats(given[key])]
+    moving, still = eqx.partition({key: given[key] for key in asked}, eqx.is_inexact_array)
+    random = Draw(200)
+
+    def weigh(moving):
+        result = floats(PUBLIC[name](**given | eqx.combine(moving, still), **options))
+        return sum(jnp.vdot(Draw(100 + i).normal(*leaf.shape), leaf) for i, leaf in enumerate(result))
+
+    value_and_gradient = jax.jit(jax.value_and_grad(weigh))
+    _, gradient = value_and_gradient(moving)
+    for key in asked:
+        slope, direction = gradient[key], jax.tree.map(lambda leaf: random.normal(*leaf.shape), moving[key])
+        norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in floats(slope)))
+        assert jnp.isfinite(norm), f"the gradient in {key} is not finite"
+        assert norm > 0, f"the gradient in {key} is zero: not what an example is for"
+        analytic = sum(jnp.vdot(*pair) for pair in zip(floats(slope), floats(direction), strict=True))
+        ahead, back = (
+            value_and_gradient(moving | {key: _moved(moving[key], direction, step)})[0] for step in (STEP, -STEP)
+        )
+        numeric = (ahead - back) / (2 * STEP)
+        assert abs(analytic - numeric) <= GRADIENT_TOLERANCE * norm, f"in {key}: {analytic}, differences {numeric}"
+
+
+def _moved(tree, direction, step):
+    return jax.tree.map(lambda leaf, along: leaf + step * along, tree, direction)

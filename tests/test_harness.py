@@ -1,0 +1,153 @@
+"""The helpers that judge everything else are judged here: ``close`` and the benchmark harness."""
+
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import harness
+
+LINE = {"benchmark": "b", "case": "c", "seconds": 2.0, "compile_seconds": 1.0, "error": 1e-3, "bytes": 8}
+
+
+@pytest.mark.parametrize(("name", "relative"), [("float32", 0.5e-5), ("float64", 0.5e-12), ("float64", 0.0)])
+def test_close_passes_within_the_tolerance_of_the_dtype(close, name, relative):
+    expected = np.array([3.0, 4.0, 1e-9])
+    close((expected * (1 + relative)).astype(name), expected)
+
+
+@pytest.mark.parametrize(("name", "relative"), [("float32", 2e-5), ("float64", 2e-12)])
+def test_close_fails_beyond_the_tolerance_of_the_dtype(close, name, relative):
+    expected = np.array([3.0, 4.0])
+    with pytest.raises(AssertionError, match="relative error"):
+        close((expected * (1 + relative)).astype(name), expected)
+
+
+def test_close_honors_the_given_tolerance_in_both_directions(close):
+    close(np.float32([1.01]), [1.0], tolerance=0.02)
+    with pytest.raises(AssertionError, match="relative error"):
+        close(np.float32([1.01]), [1.0], tolerance=0.005)
+
+
+def test_close_is_relative_to_the_norm_and_not_to_each_element(close):
+    close([1.0, 1e-14], [1.0, 0.0])
+    with pytest.raises(AssertionError, match=r"largest difference at \(1,\)"):
+        close([1e-6, 2e-6], [1e-6, 1e-6])
+
+
+def test_close_is_absolute_where_zero_is_expected(close):
+    close([0.0, 1e-13], [0.0, 0.0])
+    with pytest.raises(AssertionError, match="relative error"):
+        close([0.0, 1e-11], [0.0, 0.0])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_close_never_accepts_values_that_are_not_finite(close, value):
+    with pytest.raises(AssertionError, match="not finite"):
+        close([1.0, value], [1.0, 1.0], tolerance=np.inf)
+    with pytest.raises(AssertionError, match="must be finite"):
+        close([1.0, value], [1.0, value], tolerance=np.inf)
+
+
+def test_close_does_not_broadcast(close):
+    with pytest.raises(AssertionError, match="shape"):
+        close(np.ones(3), 1.0)
+
+
+def test_close_wants_integers_equal(close):
+    close([1, 2], [1, 2])
+    with pytest.raises(AssertionError, match="relative error"):
+        close(np.array([1000000, 2]), np.array([1000001, 2]))
+
+
+def test_close_accepts_jax_arrays_and_empty_ones(close):
+    close(jnp.ones((2, 3)), np.ones((2, 3)))
+    close(jnp.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def test_x64_is_on_for_a_test_that_asks_for_it(x64):
+    assert jnp.zeros(1).dtype == jnp.float64
+
+
+def test_x64_is_off_for_a_test_that_does_not():
+    assert jnp.zeros(1).dtype == jnp.float32
+
+
+def test_compiling_is_measured_apart():
+    calls = []
+
+    def function():
+        calls.append(1)
+        time.sleep(0.05 if len(calls) == 1 else 0.001)
+
+    timing = harness.measure(function, repeats=3)
+    assert len(calls) == 4
+    assert timing.compile_seconds > 0.03 > timing.seconds
+
+
+def test_median_ignores_one_slow_call():
+    calls = []
+
+    def function():
+        calls.append(1)
+        time.sleep(0.1 if len(calls) == 3 else 0.001)
+
+    assert harness.measure(function, repeats=3).seconds < 0.05
+
+
+def test_measure_waits_for_the_result(monkeypatch):
+    waited = []
+    monkeypatch.setattr(jax, "block_until_ready", waited.append)
+    harness.measure(lambda: "result", repeats=2)
+    assert waited == ["result"] * 3
+
+
+def test_compare_alternates():
+    order = []
+    harness.compare(lambda: order.append("a"), lambda: order.append("b"), repeats=3)
+    assert "".join(order) == "abababab"
+
+
+def test_repeats_must_be_positive():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        harness.measure(lambda: None, repeats=0)
+
+
+def test_report_appends_lines_of_json_and_prints_them(tmp_path, capsys):
+    output = tmp_path / "folder" / "lines.jsonl"
+    harness.report(LINE, output)
+    harness.report({**LINE, "error": np.float32(0.5), "bytes": jnp.int32(4)}, output)
+    lines = [json.loads(text) for text in output.read_text().splitlines()]
+    assert lines == [LINE, {**LINE, "error": 0.5, "bytes": 4}]
+    assert capsys.readouterr().out == output.read_text()
+
+
+def test_ratio_is_how_many_times_slower_the_peer_is():
+    line = harness.report({**LINE, "peer": "p", "peer_seconds": 6.0, "peer_error": 0.0})
+    assert line["ratio"] == 3.0
+
+
+def test_report_names_what_is_missing():
+    with pytest.raises(ValueError, match="bytes is missing"):
+        harness.report({key: value for key, value in LINE.items() if key != "bytes"})
+    with pytest.raises(ValueError, match="peer_error is missing"):
+        harness.report({**LINE, "peer": "p", "peer_seconds": 6.0})
+
+
+def test_report_refuses_nan():
+    with pytest.raises(ValueError, match="error = nan"):
+        harness.report({**LINE, "error": float("nan")})
+
+
+def test_parser_reads_the_two_shared_options(tmp_path):
+    arguments = harness.parser("d").parse_args(["--quick", "--output", str(tmp_path / "o")])
+    assert arguments.quick
+    assert arguments.output == tmp_path / "o"
+    assert harness.parser("d").parse_args([]).output is None
+
+
+def test_peak_memory_is_in_bytes():
+    assert 1e7 < harness.peak_memory() < 1e12  # Python with JAX, on a machine of less than a terabyte
