@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks import harness
 from jaxprt.image import rasterize, ray_direction
@@ -29,7 +29,7 @@ def main() -> None:
     cases = {"torus": torus(n, m)}
     folder = pathlib.Path(os.environ.get("JAXPRT_DATA", "")) / "meshes"
     if not arguments.quick and (folder / "dragon_100k.ply").exists():
-        loaded = trimesh.load(folder / "dragon_100k.ply", process=False)
+        loaded = trimesh.load_mesh(folder / "dragon_100k.ply", process=False)
         cases = {"dragon": (np.asarray(loaded.vertices), np.asarray(loaded.faces)), **cases}
     size = 128 if arguments.quick else 512
     repeats = 5 if arguments.quick else 30
@@ -44,7 +44,7 @@ def compare(pool, name: str, position: np.ndarray, face: np.ndarray, size: int, 
     zero = jnp.zeros(position.shape, jnp.float32)
     mesh = Mesh(jnp.asarray(position), jnp.asarray(face), zero, zero, jnp.zeros(len(position), jnp.int32))
     camera = facing(position, size)
-    scene = rtcore_scene.EmbreeScene()
+    scene = EmbreeScene()
     TriangleMesh(scene, position, face)
     ray = np.asarray(ray_direction(camera), np.float32).reshape(-1, 3)
     origin = np.broadcast_to(np.asarray(camera.eye, np.float32), ray.shape)
@@ -76,9 +76,9 @@ def facing(position: np.ndarray, size: int) -> Camera:
     center, extent = (low + high) / 2, (high - low)[:2].max()
     angle = 0.7
     away = extent / 2 / np.tan(angle / 2) + (high - low)[2] / 4
-    eye = center + [0, 0, away]
-    vector = [jnp.asarray(x, jnp.float32) for x in (eye, center, (0, 1, 0))]
-    return Camera(*vector, jnp.float32(angle), size, size)
+    eye = center + np.array([0, 0, away])
+    eye, target, up = (jnp.asarray(x, jnp.float32) for x in (eye, center, (0, 1, 0)))
+    return Camera(eye, target, up, jnp.float32(angle), size, size)
 
 
 def torus(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:

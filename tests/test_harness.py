@@ -27,9 +27,9 @@ def test_close_fails_beyond_the_tolerance_of_the_dtype(close, name, relative):
 
 
 def test_close_honors_the_given_tolerance_in_both_directions(close):
-    close(np.float32([1.01]), [1.0], tolerance=0.02)
+    close(np.array([1.01], np.float32), [1.0], tolerance=0.02)
     with pytest.raises(AssertionError, match="relative error"):
-        close(np.float32([1.01]), [1.0], tolerance=0.005)
+        close(np.array([1.01], np.float32), [1.0], tolerance=0.005)
 
 
 def test_close_is_relative_to_the_norm_and_not_to_each_element(close):

@@ -75,7 +75,9 @@ class AshikhminShirley(eqx.Module):
         # (n.h)^e = exp(e log(n.h)); next to the normal log(n.h) = log1p(-slope) / 2, and tilt / slope is guarded.
         near = slope < 0.5
         log_cos = jnp.where(
-            near, jnp.log1p(-jnp.where(near, slope, 0)) / 2, jnp.log(jnp.where(near, 1, jnp.maximum(half[..., 2:], _GRAZING)))
+            near,
+            jnp.log1p(-jnp.where(near, slope, 0)) / 2,
+            jnp.log(jnp.where(near, 1, jnp.maximum(half[..., 2:], _GRAZING))),
         )
         small = slope < _GRAZING**2
         exponent = jnp.where(small, -tilt / 2, tilt / jnp.where(small, 1, slope) * log_cos)

@@ -42,9 +42,7 @@ class BlockStore:
         ValueError: The path holds something else, another format version, or arrays made from something else.
     """
 
-    def __init__(
-        self, path: str | os.PathLike, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int
-    ):
+    def __init__(self, path: str | os.PathLike, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int):
         self.path = Path(path)
         self._layout = dict(layout)
         header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, **header}
@@ -94,9 +92,7 @@ class BlockStore:
         try:
             return np.asarray(self._array(name)[place]).reshape(shape)
         except KeyError as error:
-            raise ValueError(
-                f"{self.path} lacks the array {name}: it is damaged; delete it to start anew"
-            ) from error
+            raise ValueError(f"{self.path} lacks the array {name}: it is damaged; delete it to start anew") from error
 
 
 def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:
@@ -107,9 +103,7 @@ def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout],
     for name, (shape, axis, dtype) in layout.items():
         whole = shape[:axis] + (shape[axis] * blocks,) + shape[axis + 1 :]
         group.create_array(name, shape=whole, chunks=shape, dtype=dtype, compressors=None, fill_value=0)
-    group.create_array(
-        "checksum", shape=(blocks,), chunks=(1,), dtype="uint32", compressors=None, fill_value=0
-    )
+    group.create_array("checksum", shape=(blocks,), chunks=(1,), dtype="uint32", compressors=None, fill_value=0)
     try:
         aside.rename(path)
     except OSError:  # another process was faster; what it made is checked like any other
@@ -121,21 +115,15 @@ def _open(path: Path, header: Mapping[str, Any]) -> zarr.Group:
         group = zarr.open_group(path, mode="r+")
         found = dict(group.attrs)
     except Exception as error:
-        raise ValueError(
-            f"{path} exists but is not a readable store of arrays ({error}); name another path"
-        ) from error
+        raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
     if found.get("format") != _FORMAT:
         raise ValueError(f"{path} exists but is no store of this package; name another path")
     if found.get("version") != VERSION:
-        raise ValueError(
-            f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it"
-        )
+        raise ValueError(f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it")
     differ = [key for key in header if found.get(key) != header[key]]
     if differ:
         told = "; ".join(f"{key}: there {found.get(key)}, now {header[key]}" for key in differ)
-        raise ValueError(
-            f"{path} holds arrays made from something else ({told}); name another path or delete it"
-        )
+        raise ValueError(f"{path} holds arrays made from something else ({told}); name another path or delete it")
     return group
 
 

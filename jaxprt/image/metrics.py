@@ -23,7 +23,9 @@ def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Flo
 
 
 @jax.jit
-def psnr(image: Float[Array, "*b"], reference: Float[Array, "*b"], *, peak: Float[Array, ""] | float = 1.0) -> Float[Array, ""]:
+def psnr(
+    image: Float[Array, "*b"], reference: Float[Array, "*b"], *, peak: Float[Array, ""] | float = 1.0
+) -> Float[Array, ""]:
     """Peak signal-to-noise ratio in decibels; infinite for equal images.
 
     Args:
@@ -50,7 +52,7 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
         import flip_evaluator
     except ImportError as error:
         raise ImportError("flip needs the package flip-evaluator: pip install 'jaxprt[bench]'") from error
-    seen = [np.maximum(np.ascontiguousarray(x, np.float32), 0) for x in (reference, image)]
+    true, seen = (np.maximum(np.ascontiguousarray(x, np.float32), 0) for x in (reference, image))
     # A fresh dict: the package keeps what it adds to the default one, hence the first reference's exposures, for later.
-    _, mean, _ = flip_evaluator.evaluate(*seen, "HDR", inputsRGB=False, applyMagma=False, parameters={})
+    _, mean, _ = flip_evaluator.evaluate(true, seen, "HDR", inputsRGB=False, applyMagma=False, parameters={})
     return float(mean)

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
+FACES = (1 << 24) - 1  # Triangles whose numbers a float32 holds exactly.
 PATCH = 3  # Pixels along the edge of the square patches that triangles are cut into.
-CHUNK = 1 << 13  # Patches drawn at once; CHUNK**2 must fit in an int32.
+CHUNK = 1 << 13  # Patches drawn at once; CHUNK * (CHUNK + 1) must fit in an int32.
 TILE = 8  # Pixels along the edge of the tiles whose farthest depth hides what lies behind.
 
 
@@ -39,26 +40,23 @@ def rasterize(mesh: Mesh, camera: Camera) -> Fragments:
     Both sides of a triangle are drawn, and triangles may reach behind the camera. A center on a shared edge or vertex
     belongs to exactly one of the triangles around it: as if it lay a hair's breadth to the right, and a hair's of that
     further down. Among equal depths the triangle with the lowest number wins. Triangles without area or with vertices
-    that are not finite draw nothing. The result is constant for derivatives.
+    that are not finite draw nothing. The result is constant for derivatives. In
+    float32 depths of triangles a thousand times larger than their distance are good to four digits.
 
     Raises:
-        ValueError: The mesh has no triangle, or the picture no pixel.
+        ValueError: The mesh has no triangle or more than 2^24 - 1, or the picture has no pixel.
 
     Reference: Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates".
     """
-    if mesh.face.shape[0] == 0 or camera.width < 1 or camera.height < 1:
+    if not 0 < mesh.face.shape[0] <= FACES or camera.width < 1 or camera.height < 1:
         raise ValueError(
-            "rasterize needs at least one triangle and one pixel, got "
+            f"rasterize needs 1 to {FACES} triangles and at least one pixel, got "
             f"{mesh.face.shape[0]} triangles and {camera.height} x {camera.width} pixels"
         )
     mesh, camera = jax.lax.stop_gradient((mesh, camera))
     x, y, q = (axis[mesh.face.T] for axis in _project(mesh.position, camera))
     depth, triangle = _nearest(x, y, q, camera.height, camera.width)
-    index = jnp.maximum(triangle, 0)
-    # A map, since XLA would else fuse the gathers into their uses and repeat them for each of the weights.
-    corner = jax.lax.map(lambda axis: tuple(c[index] for c in axis), (x, y, q))
-    barycentric = _weights(*corner, *_centers(camera))
-    return Fragments(triangle, jnp.where((triangle >= 0)[..., None], barycentric, 0), depth)
+    return Fragments(triangle, _barycentric(triangle, x, y, q, camera), depth)
 
 
 @jax.jit
@@ -143,10 +141,9 @@ def _centers(camera: Camera) -> tuple[Float[Array, "1 w"], Float[Array, "h 1"]]:
 def _project(position: Float[Array, "v 3"], camera: Camera) -> tuple[Float[Array, " v"], ...]:
     """Vertices as (x, y, q): homogeneous pixel coordinates scaled to w = +1 or -1, and q = 1 / (w before that).
 
-    Pixels are counted to the right and down from the picture's middle, so that vertices near the horizon keep their digits.
-
-    A vertex whose w is next to nothing is moved off the plane of the eye by a millionth of its distance, the same way
-    for all of its triangles, so that nothing overflows and no edge opens.
+    Pixels are counted to the right and down from the picture's middle, so that vertices near it keep their digits.
+    A vertex whose w is next to nothing is moved off the plane of the eye by a millionth of its distance, the same
+    way for all of its triangles, so that nothing overflows and no edge opens.
     """
     relative = position - camera.eye
     right, up, w = jnp.einsum("vi,ji->jv", relative, view_axes(camera), precision="highest")
@@ -178,12 +175,15 @@ def _determinants(x, y, q, column, row):
     return value, positive
 
 
-def _weights(x, y, q, column, row):
-    """Perspective-correct barycentric weights of pixels that lie in their triangles."""
+def _barycentric(triangle: Int[Array, "h w"], x, y, q, camera: Camera) -> Float[Array, "h w 3"]:
+    """Perspective-correct weights of the triangle that each pixel sees; 0 where it sees none."""
+    index = jnp.maximum(triangle, 0)
+    # A map, since XLA would else fuse the gathers into their uses and repeat them for each of the weights.
+    x, y, q = jax.lax.map(lambda axes: tuple(axis[index] for axis in axes), (x, y, q))
+    column, row = _centers(camera)
     value, _ = _determinants(x, y, q, column, row)
-    weight = [jnp.abs(v) * jnp.abs(q[i]) for i, v in enumerate(value)]
-    total = weight[0] + weight[1] + weight[2]
-    return jnp.stack([w / total for w in weight], axis=-1)
+    weight = jnp.stack([jnp.abs(value[i] * q[i]) for i in range(3)], axis=-1)
+    return jnp.where((triangle >= 0)[..., None], weight / jnp.sum(weight, axis=-1, keepdims=True), 0)
 
 
 def _cover(x, y, q, column, row):
@@ -228,10 +228,10 @@ def _nearest(x, y, q, height: int, width: int) -> tuple[Float[Array, "h w"], Int
     some = (bounds[2] > 0) & (bounds[3] > 0)
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     front = area < 0  # Rows go down, so that counter-clockwise is negative. Where w < 0 the guess does not matter.
-    nothing = jax.lax.complex(jnp.array(jnp.inf, x[0].dtype), jnp.array(-1, x[0].dtype))
-    nearest = _draw(jnp.full(height * width, nothing), some & front, x, y, q, bounds, height, width)
+    nothing = jax.lax.complex(jnp.array(jnp.inf, x.dtype), jnp.array(-1, x.dtype))
+    nearest = _draw(jnp.full(height * width, nothing), some & front, x, y, q, bounds, width)
     hidden = _hidden(nearest.real.reshape(height, width), q, bounds)
-    nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, height, width)
+    nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, width)
     nearest = nearest.reshape(height, width)
     return nearest.real, nearest.imag.astype(jnp.int32)
 
@@ -253,7 +253,7 @@ def _hidden(depth: Float[Array, "h w"], q, bounds) -> Bool[Array, " f"]:
     return ahead & small & (farthest < nearest * (1 - 1e-4))
 
 
-def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, bounds, height: int, width: int):
+def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, bounds, width: int):
     """Draws some of the triangles over what is nearest so far: the complex numbers depth + i number.
 
     The minimum of complex numbers goes by the real part, then by the imaginary one, so that one scatter finds both.
@@ -262,6 +262,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
     """
     faces = q.shape[1]
     chunk = min(CHUNK, -(-faces // 1024) * 1024)
+    height = nearest.shape[0] // width
     column, row, columns, rows = bounds
     rank = _running_sum(drawn)
     number = jnp.zeros(faces + chunk, jnp.int32)
@@ -273,7 +274,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         t = jax.lax.dynamic_slice(number, (start,), (chunk,))
         across = jax.lax.div(columns[t] + (PATCH - 1), PATCH)
         count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (PATCH - 1), PATCH), 0)
-        count = jnp.minimum(count.at[0].add(-done), chunk)
+        count = jnp.minimum(count.at[0].add(-done), chunk + 1)  # One more, to tell that some are left over.
         last = _running_sum(count)
         first = last - count
         begins = jnp.zeros(chunk, jnp.int32).at[jnp.where(count > 0, first, chunk)].set(1, mode="drop")
@@ -284,12 +285,12 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         left, top = column[t] + jax.lax.rem(part, wide) * PATCH, row[t] + jax.lax.div(part, wide) * PATCH
         right, bottom = jnp.where(slot < last[-1], column[t] + columns[t], 0), row[t] + rows[t]
         corner = [[axis[i][t] for i in range(3)] for axis in (x, y, q)]
-
-        identity = t.astype(x[0].dtype)
+        identity = t.astype(x.dtype)
 
         def pixel(nearest, k):
             i, j = top + jax.lax.div(k, PATCH), left + jax.lax.rem(k, PATCH)
-            d = _cover(*corner, j.astype(x[0].dtype) + (1 - width) / 2, i.astype(x[0].dtype) + (1 - height) / 2)
+            at = j.astype(x.dtype) + (1 - width) / 2, i.astype(x.dtype) + (1 - height) / 2
+            d = _cover(corner[0], corner[1], corner[2], *at)
             d = jnp.where((i < bottom) & (j < right), d, jnp.inf)
             place = jnp.minimum(i, height - 1) * width + jnp.minimum(j, width - 1)
             return nearest.at[place].min(jax.lax.complex(d, identity), mode="promise_in_bounds"), None

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import haar, hemisphere
+from jaxprt.sphere import haar
 from jaxprt.transport import sparse
 from jaxprt.transport.sparse import SparseTransport
 
@@ -118,9 +118,7 @@ def light_tuple(
 
 
 @jax.jit
-def view_tuple(
-    transport: SparseTransport, brdf: SeparableBrdf, eye: Float[Array, "3"]
-) -> Float[Array, "v r c"]:
+def view_tuple(transport: SparseTransport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
     """The view side: view maps looked up at each vertex's direction to the eye; zero where it looks away.
 
     Args:
@@ -137,9 +135,7 @@ def view_tuple(
     local = jnp.einsum("vij,vj->vi", transport.frame, offset)
     square = jnp.sum(local**2, -1, keepdims=True)
     wo = local * jax.lax.rsqrt(jnp.where(square > 0, square, 1))
-    maps = jnp.moveaxis(brdf.view_map, 0, 2)
-    value = hemisphere.lookup(maps, hemisphere.disk_coordinates(wo))
-    return jnp.where(wo[:, 2, None, None] > 0, value, 0)
+    return brdf.view(wo)
 
 
 @jax.jit

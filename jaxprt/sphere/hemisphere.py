@@ -72,11 +72,12 @@ def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2
     """Parabolic map d.xy / (1 + d.z), scaled from [-1, 1] to [0, 1].
 
     Args:
-        direction: Unit directions in the local frame, not the one straight down.
+        direction: Unit directions in the local frame; those below the horizon are projected to its plane, so that
+            coordinates and gradients are finite everywhere.
 
     Reference: Heidrich and Seidel 1998; Kautz, Sloan, Snyder 2002, section 3.
     """
-    return (direction[..., :2] / (1 + direction[..., 2:]) + 1) / 2
+    return (direction[..., :2] / (1 + jnp.maximum(direction[..., 2:], 0)) + 1) / 2
 
 
 @jax.jit

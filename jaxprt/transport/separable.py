@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Shaped, UInt8
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
-from jaxprt.sphere import cubemap, directions, haar, hemisphere
+from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport import blocks, sparse, visibility
 from jaxprt.transport.sparse import SparseTransport
 
@@ -29,6 +29,7 @@ def precompute(
     keep: int = 96,
     size: int = 64,
     occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -41,6 +42,7 @@ def precompute(
         keep: Wavelet coefficients kept per vertex and term.
         size: Edge of the light's cubemap faces in texels, a power of two.
         occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
+        vertex: Numbers of the vertices to light, if not all; the rest of the mesh still casts shadows.
         path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
             Process pools must not fork a process in which JAX runs: use the "spawn" context.
@@ -61,17 +63,16 @@ def precompute(
         raise ValueError(f"size must be a power of two, got {size}")
     if not 1 <= keep <= 6 * size * size:
         raise ValueError(f"keep must be at most {6 * size * size} and at least 1, got {keep}")
-    job = _Job.make(mesh, mesh if occluder is None else occluder, np.asarray(brdf.light_map, np.float32), keep, size)
+    vertex = np.arange(len(mesh.position)) if vertex is None else np.asarray(vertex)
+    job = _Job.make(mesh, mesh if occluder is None else occluder, vertex, brdf, keep, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
-    frame = directions.frame(mesh.normal, mesh.tangent)
     rms = sparse.rms(result["index"], result["value"], 6 * size * size)
-    return SparseTransport(jnp.asarray(result["index"]), jnp.asarray(result["value"]), mesh.position, frame, rms)
+    index, value = jnp.asarray(result["index"]), jnp.asarray(result["value"])
+    return SparseTransport(index, value, mesh.position[vertex], jnp.asarray(job.frame), rms)
 
 
 @jax.jit
-def project(
-    seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], light_map: Float[Array, "r n n l"]
-) -> Float[Array, "b d r l"]:
+def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: SeparableBrdf) -> Float[Array, "b d r l"]:
     """Haar coefficients of visibility x cosine x solid angle x light map.
 
     The cosine is integrated exactly over each texel, so that unoccluded Lambert transport of constant light has the
@@ -80,7 +81,7 @@ def project(
     Args:
         seen: Visibility of each cubemap texel in sixteenths.
         frame: Rows are tangent, bitangent, normal.
-        light_map: Light maps of the BRDF on the orthographic disk.
+        brdf: The factored BRDF, of which only the light maps matter.
 
     Returns:
         Coefficients on d = 6 n n, each face by `haar.forward`.
@@ -93,10 +94,9 @@ def project(
     size = haar.face_edge(seen.shape[1])
     direction = cubemap.direction(size=size).reshape(-1, 3)
     area = cubemap.vector_area(size=size).reshape(-1, 3)
-    local = jnp.einsum("bij,dj->bdi", frame[:, :2], direction)
+    local = jnp.einsum("bij,dj->bdi", frame, direction)
     flux = jnp.maximum(jnp.einsum("bj,dj->bd", frame[:, 2], area), 0) * seen.astype(frame.dtype)
-    maps = jnp.moveaxis(light_map, 0, 2)
-    value = hemisphere.lookup(maps, hemisphere.disk_coordinates(local)) * (flux / visibility.LEVELS)[..., None, None]
+    value = brdf.light(local) * (flux / visibility.LEVELS)[..., None, None]
     faces = value.reshape(seen.shape[0] * 6, size, size, -1)
     return haar.forward(faces).reshape(value.shape)
 
@@ -105,12 +105,12 @@ def project(
 def compress(
     seen: UInt8[Array, "b d"],
     frame: Float[Array, "b 3 3"],
-    light_map: Float[Array, "r n n l"],
+    brdf: SeparableBrdf,
     *,
     keep: int,
 ) -> tuple[Shaped[Array, "k b r"], Float[Array, "k b r l"]]:
     """`project`, and of that the largest coefficients: one block of a `SparseTransport`."""
-    return sparse.largest(project(seen, frame, light_map), keep=keep)
+    return sparse.largest(project(seen, frame, brdf), keep=keep)
 
 
 @dataclass(frozen=True)
@@ -118,21 +118,20 @@ class _Job(blocks.Job):
     """Blocks of transport; see `blocks.Job`."""
 
     start: np.ndarray
-    normal: np.ndarray
     frame: np.ndarray
     occluder: Mesh
-    light_map: np.ndarray
+    brdf: SeparableBrdf
     keep: int
     size: int
     mesh_key: str
 
     @classmethod
-    def make(cls, mesh: Mesh, occluder: Mesh, light_map: np.ndarray, keep: int, size: int) -> "_Job":
-        occluder = jax.tree.map(np.asarray, occluder)
-        start = visibility.start_points(mesh, visibility.Occluder(occluder))
-        frame = np.asarray(directions.frame(mesh.normal, mesh.tangent), np.float32)
+    def make(cls, mesh: Mesh, occluder: Mesh, vertex: np.ndarray, brdf: SeparableBrdf, keep: int, size: int) -> "_Job":
+        occluder, brdf = jax.tree.map(np.asarray, (occluder, brdf))
+        start = visibility.start_points(mesh, visibility.Occluder(occluder))[vertex]
+        frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
         key = blocks.fingerprint(start, frame, occluder.position, occluder.face)
-        return cls(start, np.asarray(mesh.normal, np.float32), frame, occluder, light_map, keep, size, key)
+        return cls(start, frame, occluder, brdf, keep, size, key)
 
     @cached_property
     def rays(self) -> visibility.Occluder:
@@ -147,12 +146,12 @@ class _Job(blocks.Job):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        light_map = blocks.fingerprint(self.light_map)
-        return {"system": "separable", "mesh": self.mesh_key, "brdf": light_map, "keep": self.keep, "size": self.size}
+        brdf = f"{self.brdf.coordinates.__name__} {blocks.fingerprint(self.brdf.light_map)}"
+        return {"system": "separable", "mesh": self.mesh_key, "brdf": brdf, "keep": self.keep, "size": self.size}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
-        terms, _, _, colors = self.light_map.shape
+        terms, _, _, colors = self.brdf.light_map.shape
         index = "uint16" if 6 * self.size**2 <= 1 << 16 else "uint32"
         return {
             "index": Layout((self.keep, _BLOCK, terms), 1, index),
@@ -161,6 +160,6 @@ class _Job(blocks.Job):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = np.minimum(np.arange(block * _BLOCK, (block + 1) * _BLOCK), self.vertices - 1)
-        seen, count = visibility.fractional(self.rays, self.start[part], self.normal[part], size=self.size)
-        index, value = compress(seen, self.frame[part], self.light_map, keep=self.keep)
+        seen, count = visibility.fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
+        index, value = compress(seen, self.frame[part], self.brdf, keep=self.keep)
         return {"index": np.asarray(index), "value": np.asarray(value)}, count.rays

@@ -71,9 +71,7 @@ def largest(
 
 
 @jax.jit
-def apply(
-    transport: SparseTransport, coefficient: Float[Array, "b c"]
-) -> Float[Array, "v r c"]:
+def apply(transport: SparseTransport, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
     """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
 
     The kept-coefficient axis comes first, so one step reads contiguous rows of all vertices.

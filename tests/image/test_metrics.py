@@ -1,0 +1,83 @@
+import builtins
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.image import metrics
+
+
+def _pair(seed=0):
+    rng = np.random.default_rng(seed)
+    image = rng.random((32, 40, 3)).astype(np.float32)
+    return jnp.asarray(image), jnp.asarray(image + 0.1 * rng.standard_normal(image.shape).astype(np.float32))
+
+
+def test_relative_l2_is_the_ratio_of_norms():
+    image, reference = _pair()
+    a, b = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    expected = np.linalg.norm(a - b) / np.linalg.norm(b)
+    assert metrics.relative_l2(image, reference) == pytest.approx(expected, rel=1e-5)
+
+
+def test_relative_l2_does_not_change_with_the_scale_of_both():
+    image, reference = _pair()
+    expected = float(metrics.relative_l2(image, reference))
+    for scale in (1e-30, 1e30):
+        assert metrics.relative_l2(scale * image, scale * reference) == pytest.approx(expected, rel=1e-5)
+
+
+def test_relative_l2_of_two_black_images_is_zero_and_of_light_against_black_infinite():
+    black, image = jnp.zeros((3, 4, 3)), jnp.ones((3, 4, 3))
+    assert metrics.relative_l2(black, black) == 0
+    assert metrics.relative_l2(image, image) == 0
+    assert metrics.relative_l2(image, black) == np.inf
+    assert metrics.relative_l2(black, image) == 1
+
+
+def test_the_gradient_of_relative_l2_equals_finite_differences_and_is_zero_at_equality():
+    image, reference = _pair()
+    direction = jnp.asarray(np.random.default_rng(1).standard_normal(image.shape), jnp.float32)
+    slope = jnp.vdot(jax.grad(metrics.relative_l2)(image, reference), direction)
+    high = metrics.relative_l2(image + 1e-3 * direction, reference)
+    low = metrics.relative_l2(image - 1e-3 * direction, reference)
+    assert slope == pytest.approx(float(high - low) / 2e-3, rel=2e-2, abs=1e-4)
+    np.testing.assert_array_equal(jax.grad(metrics.relative_l2)(image, image), 0)
+    np.testing.assert_array_equal(jax.grad(metrics.relative_l2)(0 * image, 0 * image), 0)
+
+
+def test_psnr_of_a_constant_difference_is_known():
+    image, _ = _pair()
+    assert metrics.psnr(image, image + 0.01) == pytest.approx(40, abs=1e-3)
+    assert metrics.psnr(image, image + 0.01, peak=10.0) == pytest.approx(60, abs=1e-3)
+    assert metrics.psnr(image, image) == np.inf
+
+
+def test_flip_is_zero_for_equal_images_and_grows_with_the_difference():
+    pytest.importorskip("flip_evaluator")
+    image, _ = _pair()
+    small, large = (metrics.flip(image * (1 + t), image) for t in (0.02, 0.5))
+    assert metrics.flip(image, image) == 0
+    assert 0 < small < large < 1
+
+
+def test_flip_does_not_remember_the_reference_before():
+    pytest.importorskip("flip_evaluator")
+    image, reference = _pair()
+    first = metrics.flip(image, reference)
+    metrics.flip(1000 * image, 1000 * reference)
+    assert metrics.flip(image, reference) == first
+
+
+def test_flip_without_its_package_names_the_extra(monkeypatch):
+    original = builtins.__import__
+
+    def refuse(name, *arguments, **options):
+        if name == "flip_evaluator":
+            raise ImportError(name)
+        return original(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(ImportError, match=r"jaxprt\[bench\]"):
+        metrics.flip(*_pair())
