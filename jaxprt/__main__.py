@@ -1,6 +1,7 @@
 """Relights a mesh and measures itself: `python -m jaxprt --mesh FILE --environment FILE --output FOLDER`."""
 
 import argparse
+import itertools
 import json
 import platform
 import resource
@@ -199,12 +200,12 @@ def _seen(scene: Scene) -> list[np.ndarray]:
     triangle = np.unique(np.asarray(prt.image.rasterize(scene.mesh, scene.camera).triangle))
     vertex = np.unique(np.asarray(scene.mesh.face)[triangle[triangle >= 0]])
     first = np.cumsum([0, *(len(part.mesh.position) for part in scene.parts)])
-    return [vertex[(vertex >= a) & (vertex < b)] - a for a, b in zip(first[:-1], first[1:], strict=True)]
+    return [vertex[(vertex >= a) & (vertex < b)] - a for a, b in itertools.pairwise(first)]
 
 
 def _compare(scene, name, light, color, exact, seen, output: Path) -> dict[str, Any]:
     """Writes the pictures of one light, and returns their errors."""
-    told = {"vertex_error": {}}
+    told: dict[str, Any] = {"vertex_error": {}}
     full = []
     for part, mine, truth, vertex in zip(scene.parts, color, exact, seen, strict=True):
         told["vertex_error"][part.name] = float(prt.image.relative_l2(mine[vertex], truth))

@@ -97,21 +97,8 @@ def factor(
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
     covariance = light_covariance(direction[inside], degree=_DEGREE)
-    total = jnp.sum((matrix @ covariance) * matrix)
-    # For an error, four times as many terms are tried until they reach it.
-    most = min(_MOST_TERMS, inside.size)
-    count = min(4, most) if terms is None else terms
-    while True:
-        value, vector, _ = eigen.left_singular(matrix, covariance, terms=count)
-        remainder = jnp.sqrt(jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0))
-        if terms is not None or remainder[-1] <= error or count == most:
-            break
-        count = min(4 * count, most)
-    if terms is None:
-        if remainder[-1] > error:
-            raise ValueError(f"error must be at least {remainder[-1]:.3g}, which {count} terms reach; got {error}")
-        terms = int(np.argmax(np.asarray(remainder) <= error)) + 1
-    value, vector = value[:terms], vector[:, :terms]
+    value, vector, remainder = _leading(matrix, covariance, terms, error)
+    terms = value.size
     project = vector.reshape(color, -1, terms) * jnp.sqrt(solid_angle)[:, None]
     light_map = jnp.einsum("cor,coi->ri", project, table)
     # M C M^T u = value u continues the view map to texels of no weight, which bilinear lookup needs at the rim.
@@ -187,6 +174,25 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
     start = (jnp.zeros_like(cosine), jnp.ones_like(cosine), jnp.zeros_like(cosine))
     (_, _, total), _ = jax.lax.scan(step, start, jnp.arange(degree + 1, dtype=cosine.dtype))
     return total
+
+
+def _leading(matrix: Array, covariance: Array, terms: int | None, error: float | None) -> tuple[Array, Array, Array]:
+    """Squared singular values, vectors and remaining errors of `terms` terms, or of as many as the error needs."""
+    total = jnp.sum((matrix @ covariance) * matrix)
+    most = min(_MOST_TERMS, matrix.shape[1])
+    count = min(4, most) if terms is None else terms
+    while True:
+        value, vector, _ = eigen.left_singular(matrix, covariance, terms=count)
+        remainder = jnp.sqrt(jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0))
+        if error is None:
+            return value, vector, remainder
+        reached = np.flatnonzero(np.asarray(remainder) <= error)
+        if reached.size:
+            enough = int(reached[0]) + 1
+            return value[:enough], vector[:, :enough], remainder
+        if count == most:
+            raise ValueError(f"error must be at least {remainder[-1]:.3g}, which {count} terms reach; got {error}")
+        count = min(4 * count, most)
 
 
 def _parabolic_texels(resolution: int) -> tuple[Array, Array]:

@@ -101,7 +101,7 @@ def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout],
     shutil.rmtree(aside, ignore_errors=True)
     group = zarr.create_group(aside, attributes=dict(header))
     for name, (shape, axis, dtype) in layout.items():
-        whole = shape[:axis] + (shape[axis] * blocks,) + shape[axis + 1 :]
+        whole = (*shape[:axis], shape[axis] * blocks, *shape[axis + 1 :])
         group.create_array(name, shape=whole, chunks=shape, dtype=dtype, compressors=None, fill_value=0)
     group.create_array("checksum", shape=(blocks,), chunks=(1,), dtype="uint32", compressors=None, fill_value=0)
     try:

@@ -266,7 +266,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
     column, row, columns, rows = bounds
     rank = _running_sum(drawn)
     number = jnp.zeros(faces + chunk, jnp.int32)
-    number = number.at[jnp.where(drawn, rank - 1, faces + chunk)].set(jnp.arange(faces), mode="drop")
+    number = number.at[jnp.where(drawn, rank - 1, faces + chunk)].set(jnp.arange(faces, dtype=jnp.int32), mode="drop")
     slot = jnp.arange(chunk, dtype=jnp.int32)
 
     def step(state):

@@ -35,8 +35,7 @@ def tangent(normal: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 
     It is the x axis under the shortest turn from +y to the normal: smooth everywhere but at (0, -1, 0), where
     every tangent is a limit. There, and within 4e-10 of it (1e-77 in float64), it is (1, 0, 0) with zero gradient.
-    Elsewhere it is accurate to rounding, however near. The bitangent is minus the paper's t, whose (s, t, n) is
-    left-handed.
+    Elsewhere it is accurate to rounding, however near.
 
     Args:
         normal: Unit normals.

@@ -1,4 +1,4 @@
-"""The block loop: independent blocks of vertices, computed anywhere, stored as they come, resumed where they stopped."""
+"""The block loop: independent blocks, computed anywhere, stored as they come, resumed where they stopped."""
 
 import abc
 import hashlib
@@ -94,7 +94,7 @@ def _run(job, todo, store, executor, result, bar) -> None:
     key = fingerprint(np.frombuffer(repr(sorted(job.header.items())).encode(), np.uint8))
     _jobs[key] = job
     own = None if executor is not None else ThreadPoolExecutor(os.cpu_count())
-    pool = own or executor
+    pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]
     future = {}
     rays = 0
     try:
@@ -164,4 +164,4 @@ def _count(job: Job, block: int) -> int:
 
 
 def _whole(at: Layout, blocks: int) -> tuple[int, ...]:
-    return at.shape[: at.axis] + (at.shape[at.axis] * blocks,) + at.shape[at.axis + 1 :]
+    return (*at.shape[: at.axis], at.shape[at.axis] * blocks, *at.shape[at.axis + 1 :])

@@ -4,12 +4,13 @@ Everything here is NumPy on the host; what comes out is an array, so the rest of
 visibility made by hand.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, UInt8
 
 from jaxprt.scene.mesh import Mesh
@@ -22,7 +23,8 @@ _NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
 _SINK = 0.02  # of the scene's diagonal, how deep a vertex may lie inside a simplified occluder
 
 
-class RayCount(NamedTuple):
+@dataclass(frozen=True)
+class RayCount:
     """What was traced.
 
     Attributes:
@@ -37,7 +39,7 @@ class RayCount(NamedTuple):
 
     def __add__(self, other: "RayCount") -> "RayCount":
         """Sum of two counts."""
-        return RayCount(*(a + b for a, b in zip(self, other, strict=True)))
+        return RayCount(self.rays + other.rays, self.texels + other.texels, self.supersampled + other.supersampled)
 
 
 class Occluder:
@@ -54,7 +56,7 @@ class Occluder:
         self.diagonal = float(np.linalg.norm(high - low)) or 1.0
         # Far from the origin float32 itself is coarser than the share of the diagonal.
         self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
-        self._scene = rtcore_scene.EmbreeScene()
+        self._scene = EmbreeScene()
         TriangleMesh(self._scene, np.ascontiguousarray(self.position), np.ascontiguousarray(self.face))
 
     def blocked(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]) -> np.ndarray:
@@ -202,14 +204,22 @@ def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def _outward(mesh: Mesh) -> np.ndarray:
-    """Unit vectors on the side of all faces around a vertex on which its shading normal is."""
-    face, normal = np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
-    facing = _face_normal(np.asarray(mesh.position), face)
-    total = np.zeros_like(normal)
+    """Unit vectors on the side of all faces around a vertex on which its shading normal is.
+
+    Around means at the same position: where vertices are split along a crease, the faces across it count too, or a
+    start would be pushed into them.
+    """
+    position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
+    facing = _face_normal(position, face)
+    own = np.zeros_like(normal)
     for corner in face.T:
         side = np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)
         for axis in range(3):
-            total[:, axis] += np.bincount(corner, facing[:, axis] * side, len(normal))
+            own[:, axis] += np.bincount(corner, facing[:, axis] * side, len(normal))
+    _, place = np.unique(_rows(position), return_inverse=True)
+    joint = np.stack([np.bincount(place, own[:, axis]) for axis in range(3)], 1)[place]
+    # The two sides of a sheet cancel; each then keeps to its own.
+    total = np.where(np.sum(joint * own, 1, keepdims=True) > 1e-6 * np.sum(own * own, 1, keepdims=True), joint, own)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal).astype(np.float32)
 

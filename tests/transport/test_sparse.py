@@ -1,0 +1,109 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.transport import SparseTransport, sparse
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(0)
+
+
+def make(coefficient, keep):
+    """Transport from dense coefficients [v d r l]."""
+    index, value = sparse.largest(jnp.asarray(coefficient, jnp.float32), keep=keep)
+    vertices, count = coefficient.shape[:2]
+    frame = jnp.broadcast_to(jnp.eye(3), (vertices, 3, 3))
+    return SparseTransport(index, value, jnp.zeros((vertices, 3)), frame, sparse.rms(index, value, count))
+
+
+def dense(transport):
+    """[v d r l] again, by plain loops over what is stored."""
+    index, value = np.asarray(transport.index), np.asarray(transport.value, np.float64)
+    kept, vertices, terms = index.shape
+    result = np.zeros((vertices, transport.rms.shape[0], terms, value.shape[3]))
+    for place in np.ndindex(kept, vertices, terms):
+        _, vertex, term = place
+        result[vertex, index[place], term] += value[place]
+    return result
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+def test_the_largest_are_kept_in_falling_order(random, colors):
+    coefficient = random.normal(size=(5, 24, 2, colors))
+    transport = make(coefficient, 7)
+    size = np.linalg.norm(coefficient, axis=-1)
+    np.testing.assert_array_equal(np.moveaxis(transport.index, 0, 1), np.argsort(-size, axis=1)[:, :7])
+    kept = np.linalg.norm(transport.value, axis=-1)
+    assert np.all(np.diff(kept, axis=0) <= 0)
+    expected = np.where(size < np.sort(size, axis=1)[:, -7, None], 0, 1)[..., None] * coefficient
+    np.testing.assert_allclose(dense(transport), expected, rtol=1e-6)
+
+
+def test_all_coefficients_are_the_rows_themselves(random):
+    coefficient = random.normal(size=(3, 24, 2, 3))
+    np.testing.assert_allclose(dense(make(coefficient, 24)), coefficient, rtol=1e-6)
+
+
+def test_rows_with_few_coefficients_are_padded_with_index_zero_and_value_zero():
+    coefficient = np.zeros((2, 24, 2, 1))
+    coefficient[0, 5, 0], coefficient[1, 23, 1] = 3, -2
+    transport = make(coefficient, 4)
+    index, value = np.asarray(transport.index), np.asarray(transport.value)
+    assert (index[0, 0, 0], value[0, 0, 0, 0]) == (5, 3)
+    assert (index[0, 1, 1], value[0, 1, 1, 0]) == (23, -2)
+    assert np.count_nonzero(index) == np.count_nonzero(value) == 2
+
+
+def test_of_equal_coefficients_the_first_come_first():
+    coefficient = np.ones((4, 24, 1, 1)) * np.where(np.arange(24) % 2, 1, -1)[:, None, None]
+    index, value = sparse.largest(jnp.asarray(coefficient), keep=9)
+    np.testing.assert_array_equal(index[..., 0], np.tile(np.arange(9)[:, None], (1, 4)))
+    np.testing.assert_array_equal(value[:, 0, 0, 0], [-1, 1, -1, 1, -1, 1, -1, 1, -1])
+
+
+def test_indices_are_as_small_as_they_can_be():
+    for count, dtype in ((6, "uint16"), (1 << 16, "uint16"), (6 * 128 * 128, "uint32")):
+        coefficient = jnp.zeros((1, count, 1, 1)).at[0, -1].set(1)
+        index, _ = sparse.largest(coefficient, keep=2)
+        assert index.dtype == dtype
+        assert index[0, 0, 0] == count - 1
+
+
+@pytest.mark.parametrize("keep", [0, 25])
+def test_an_impossible_number_to_keep_is_refused(keep):
+    with pytest.raises(ValueError, match=f"keep must be between 1 and 24, got {keep}"):
+        sparse.largest(jnp.zeros((1, 24, 1, 1)), keep=keep)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("light_colors", [1, 3])
+def test_apply_is_the_dense_product(random, close, colors, light_colors):
+    if colors == 3 and light_colors == 1:
+        pytest.skip("transport in color has no gray light: environments have three colors")
+    transport = make(random.normal(size=(6, 24, 3, colors)), 9)
+    light = random.normal(size=(24, light_colors)).astype(np.float32)
+    expected = np.einsum("vdrc,dc->vrc", np.broadcast_to(dense(transport), (6, 24, 3, light_colors)), light)
+    close(sparse.apply(transport, jnp.asarray(light)), expected)
+
+
+def test_kept_prefixes_are_what_the_smaller_number_would_have_kept(random):
+    coefficient = random.normal(size=(5, 24, 4, 1))
+    fewer, expected = make(coefficient, 20).keep(6, terms=3), make(coefficient[:, :, :3], 6)
+    for field in ("index", "value", "rms", "position", "frame"):
+        np.testing.assert_array_equal(getattr(fewer, field), getattr(expected, field))
+    assert fewer.nbytes == 5 * 6 * 3 * (2 + 4)
+
+
+@pytest.mark.parametrize("count", [0, 21])
+def test_keeping_more_than_there_are_is_refused(random, count):
+    with pytest.raises(ValueError, match=f"count must be between 1 and 20, got {count}"):
+        make(random.normal(size=(2, 24, 1, 1)), 20).keep(count)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+def test_rms_is_that_of_the_dense_rows(random, close, colors):
+    transport = make(random.normal(size=(6, 24, 3, colors)), 9)
+    close(transport.rms, np.sqrt(np.mean(dense(transport) ** 2, (0, 2, 3))))
+    assert np.all(np.asarray(make(np.zeros((2, 24, 1, 1)), 3).rms) == 0)
