@@ -47,9 +47,13 @@ class Occluder:
 
     Args:
         mesh: The triangles; those of zero area cast nothing.
+
+    Raises:
+        ValueError: No triangles, positions that are not finite, or faces that name missing vertices.
     """
 
     def __init__(self, mesh: Mesh):
+        _check(mesh, "occluder")
         self.position = np.asarray(mesh.position, np.float32)
         self.face = np.asarray(mesh.face, np.int32)
         low, high = self.position.min(0), self.position.max(0)
@@ -76,7 +80,11 @@ def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
     shadows its own front, however far the shading normal leans. A vertex that lies inside a simplified occluder
     starts where it leaves it. A vertex that touches another surface starts on the open side of that surface, so that
     light does not leak in from beneath.
+
+    Raises:
+        ValueError: As for `Occluder`, and for normals that are not finite.
     """
+    _check(mesh, "mesh")
     position = np.asarray(mesh.position, np.float32)
     out = _outward(mesh)
     nudge = np.float32(occluder.nudge)
@@ -153,10 +161,26 @@ def _tables(size: int) -> _Tables:
     )
 
 
+def _check(mesh: Mesh, name: str) -> None:
+    """Refuses what Embree would hang or lie on."""
+    if not mesh.face.size:
+        raise ValueError(f"the {name} must have faces, got none")
+    for field in ("position", "normal"):
+        broken = np.flatnonzero(~np.isfinite(np.asarray(getattr(mesh, field))).all(1))
+        if broken.size:
+            value = np.asarray(getattr(mesh, field))[broken[0]]
+            raise ValueError(
+                f"the {name}'s {field}s must be finite, got {broken.size} that are not, first at {broken[0]}: {value}"
+            )
+    low, high = int(mesh.face.min()), int(mesh.face.max())
+    if low < 0 or high >= len(mesh.position):
+        raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")
+
+
 def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables) -> RayCount:
     """Fills `seen` for one part of the points."""
     vertex, texel = np.nonzero(above)
-    clear = ~occluder.blocked(start[vertex], table.center[texel])
+    clear = ~occluder.blocked(start.take(vertex, axis=0), table.center.take(texel, axis=0))
     flat = seen.reshape(-1)
     place = vertex * above.shape[1] + texel
     flat[place] = clear
@@ -185,7 +209,7 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
     for first in range(0, len(vertex), step):
         part = slice(first, first + step)
         origin = np.repeat(start[vertex[part]], LEVELS, axis=0)
-        shadow = occluder.blocked(origin, table.fine[texel[part]].reshape(-1, 3))
+        shadow = occluder.blocked(origin, table.fine.take(texel[part], axis=0).reshape(-1, 3))
         out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)
     return out
 

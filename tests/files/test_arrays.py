@@ -1,0 +1,227 @@
+"""The store: what is read back is what was written, or reported missing."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import zarr
+
+from jaxprt.files import arrays
+from jaxprt.files.arrays import BlockStore, Layout
+
+LAYOUT = {"index": Layout((3, 4), 1, "uint16"), "value": Layout((3, 4, 2), 1, "float32")}
+HEADER = {"system": "test", "keep": 3}
+BLOCKS = 5
+
+
+def block(number):
+    random = np.random.default_rng(number)
+    return {
+        "index": random.integers(1, 1 << 16, size=(3, 4)).astype(np.uint16),
+        "value": random.normal(size=(3, 4, 2)).astype(np.float32),
+    }
+
+
+def open_store(path, **change):
+    return BlockStore(path, HEADER | change.pop("header", {}), change.pop("layout", LAYOUT), BLOCKS, **change)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A finished store."""
+    store = open_store(tmp_path / "a.prt")
+    for number in range(BLOCKS):
+        store.write(number, block(number))
+    return store.path
+
+
+def found(path):
+    """Numbers of the blocks that read back as they were written; others must be reported missing."""
+    store = open_store(path)
+    result = []
+    for number in range(BLOCKS):
+        array = store.read(number)
+        if array is not None:
+            for name, expected in block(number).items():
+                np.testing.assert_array_equal(array[name], expected)
+                assert array[name].dtype == expected.dtype
+            result.append(number)
+    return result
+
+
+def chunk(path, name, number):
+    """The file of one block of one array."""
+    place = {"index": f"0/{number}", "value": f"0/{number}/0", "checksum": f"{number}"}[name]
+    file = path / name / "c" / place
+    assert file.is_file()
+    return file
+
+
+def test_blocks_read_back_as_written_in_any_order(tmp_path):
+    store = open_store(tmp_path / "a.prt")
+    for number in (3, 0, 4):
+        store.write(number, block(number))
+    assert found(store.path) == [0, 3, 4]
+
+
+def test_blocks_of_zeros_count_as_written(tmp_path):
+    store = open_store(tmp_path / "a.prt")
+    zero = {name: np.zeros_like(array) for name, array in block(0).items()}
+    store.write(1, zero)
+    np.testing.assert_array_equal(open_store(store.path).read(1)["value"], zero["value"])
+    assert store.read(0) is None
+
+
+def test_missing_parent_folders_are_made(tmp_path):
+    assert found(open_store(tmp_path / "some" / "where" / "a.prt").path) == []
+
+
+def test_stores_hold_no_pickles_and_leave_nothing_aside(path):
+    kinds = {file.suffix or file.parent.name for file in path.rglob("*") if file.is_file()}
+    assert not kinds & {".pkl", ".pickle", ".npy"}
+    meta = json.loads((path / "index" / "zarr.json").read_text())
+    assert meta["data_type"] == "uint16"
+    assert [codec["name"] for codec in meta["codecs"]] == ["bytes"]
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_any_program_that_knows_zarr_can_read_it(path):
+    group = zarr.open_group(path, mode="r")
+    np.testing.assert_array_equal(group["value"][:, 4:8], block(1)["value"])
+    assert group.attrs["system"] == "test"
+    assert group.attrs["version"] == arrays.VERSION
+
+
+@pytest.mark.parametrize("name", ["index", "value", "checksum"])
+@pytest.mark.parametrize("damage", ["deleted", "truncated", "emptied", "one bit", "zeroed", "longer", "folder"])
+def test_damaged_blocks_are_reported_missing_and_can_be_written_again(path, name, damage):
+    file = chunk(path, name, 2)
+    content = file.read_bytes()
+    if damage == "deleted":
+        file.unlink()
+    elif damage == "folder":
+        file.unlink()
+        file.mkdir()
+    else:
+        file.write_bytes(
+            {
+                "truncated": content[: len(content) // 2],
+                "emptied": b"",
+                "one bit": bytes([content[0] ^ 4]) + content[1:],
+                "zeroed": bytes(len(content)),
+                "longer": content + b"more",
+            }[damage]
+        )
+    assert found(path) in ([0, 1, 3, 4], list(range(BLOCKS)) if damage == "longer" else None)
+    if damage == "folder":
+        file.rmdir()
+    open_store(path).write(2, block(2))
+    assert found(path) == list(range(BLOCKS))
+
+
+def test_blocks_swapped_on_disk_are_reported_missing(path):
+    first, second = chunk(path, "value", 1), chunk(path, "value", 3)
+    one, other = first.read_bytes(), second.read_bytes()
+    first.write_bytes(other)
+    second.write_bytes(one)
+    assert found(path) == [0, 2, 4]
+
+
+@pytest.mark.parametrize("name", ["index", "checksum"])
+def test_a_store_without_one_of_its_arrays_is_refused_by_name(path, name):
+    (path / name / "zarr.json").unlink()
+    with pytest.raises(ValueError, match=r"a\.prt.*" + name):
+        open_store(path).read(0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"header": {"keep": 4}}, r"a\.prt holds arrays made from something else \(keep: there 3, now 4\)"),
+        ({"header": {"system": "other"}}, r"\(system: there test, now other\)"),
+        ({"header": {"more": 1}}, r"\(more: there None, now 1\)"),
+    ],
+)
+def test_stores_of_something_else_are_refused(path, change, message):
+    with pytest.raises(ValueError, match=message):
+        open_store(path, **change)
+    assert found(path) == list(range(BLOCKS))
+
+
+def test_stores_with_another_number_of_blocks_are_refused(path):
+    with pytest.raises(ValueError, match=r"blocks: there 5, now 6"):
+        BlockStore(path, HEADER, LAYOUT, 6)
+
+
+def test_stores_of_another_version_are_refused(path, monkeypatch):
+    monkeypatch.setattr(arrays, "VERSION", arrays.VERSION + 1)
+    with pytest.raises(ValueError, match=r"a\.prt has format version 1, this package writes 2; delete it"):
+        open_store(path)
+
+
+@pytest.mark.parametrize("kind", ["empty folder", "foreign folder", "foreign zarr", "plain file", "broken header"])
+def test_what_is_no_store_is_refused_and_left_alone(tmp_path, kind):
+    path = tmp_path / "a.prt"
+    if kind == "plain file":
+        path.write_text("precious")
+    elif kind == "foreign zarr":
+        zarr.create_group(path, attributes={"mine": 1})
+    elif kind == "broken header":
+        (open_store(path).path / "zarr.json").write_text("{")
+    else:
+        path.mkdir()
+        if kind == "foreign folder":
+            (path / "precious.txt").write_text("precious")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=r"a\.prt exists but is n"):
+        open_store(path)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_two_writers_are_one_too_many(path):
+    first, second = open_store(path), open_store(path)
+    with (
+        first.writing(),
+        pytest.raises(BlockingIOError, match=r"a\.prt is being written by another process"),
+        second.writing(),
+    ):
+        pytest.fail("two writers at once")
+    with second.writing():
+        second.write(0, block(0))
+
+
+def test_a_lock_left_behind_by_a_killed_process_does_not_hold(path):
+    script = (
+        "import os, signal, sys\n"
+        "from jaxprt.files.arrays import BlockStore, Layout\n"
+        f"store = BlockStore({str(path)!r}, {HEADER!r}, {{k: Layout(*v) for k, v in {dict(LAYOUT)!r}.items()}}, 5)\n"
+        "with store.writing():\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    ).replace("Layout(shape=", "dict(shape=").replace("Layout(*v)", "Layout(**v)")
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert done.returncode == -9, done.stderr
+    with open_store(path).writing():
+        pass
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folders_that_cannot_be_written_are_refused(tmp_path):
+    folder = tmp_path / "sealed"
+    folder.mkdir(mode=0o500)
+    with pytest.raises(PermissionError, match="sealed"):
+        open_store(folder / "a.prt")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_finished_stores_can_be_read_where_nothing_can_be_written(path):
+    for each in [path, *path.rglob("*")]:
+        pathlib.Path(each).chmod(0o500 if each.is_dir() else 0o400)
+    try:
+        assert found(path) == list(range(BLOCKS))
+    finally:
+        for each in [path, *path.rglob("*")]:
+            pathlib.Path(each).chmod(0o700 if each.is_dir() else 0o600)

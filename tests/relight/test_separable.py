@@ -1,0 +1,266 @@
+"""Relighting with transport made by hand, and with traced transport under symmetries."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.brdf.separable import factor
+from jaxprt.relight import separable
+from jaxprt.scene import Environment
+from jaxprt.scene.environment import rotate
+from jaxprt.sphere import directions, haar
+from jaxprt.transport import SparseTransport, sparse
+from jaxprt.transport.separable import compress, precompute
+
+SIZE = 8
+EYE = jnp.array([2.0, 3.0, 4.0])
+# The horizon cuts texels of 8 x 8 faces coarsely: measured .7 % at worst.
+HORIZON = 1e-2
+TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
+COLORED = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=[0.2, 0.3, 0.7], nu=20, nv=60)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture(scope="module")
+def factored():
+    return factor(COLORED, terms=3, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def transport(factored):
+    """Of seven vertices with random frames and visibility."""
+    random = np.random.default_rng(4)
+    normal = directions.normalize(jnp.asarray(random.normal(size=(7, 3)), jnp.float32))
+    frame = directions.frame(normal, jnp.zeros((7, 3)))
+    seen = jnp.asarray(random.integers(17, size=(7, 6 * SIZE**2)), jnp.uint8)
+    index, value = compress(seen, frame, factored, keep=40)
+    position = jnp.asarray(random.normal(size=(7, 3)), jnp.float32)
+    return SparseTransport(index, value, position, frame, sparse.rms(index, value, 6 * SIZE**2))
+
+
+def some_light(random, colors=3):
+    return Environment(jnp.asarray(random.uniform(0, 2, size=(6, SIZE, SIZE, colors)), jnp.float32))
+
+
+def relight(transport, factored, light, **options):
+    return separable.radiance(transport, factored, light, **({"eye": EYE} | options))
+
+
+@pytest.mark.parametrize("keep", [6 * SIZE**2, 60])
+def test_white_furnace_leaves_a_convex_white_body_invisible(keep):
+    mesh = prt.scene.builtin.sphere(rings=8, sectors=12)
+    brdf = factor(Lambert(1.0), terms=1, resolution=12)
+    transport = precompute(mesh, brdf, keep=keep, size=SIZE, progress=False)
+    color = relight(transport, brdf, Environment(jnp.ones((6, SIZE, SIZE, 3))))
+    facing = np.sum(np.asarray(mesh.normal * (EYE - mesh.position)), 1) > 1e-4
+    # The six means, all that constant light has, are among the largest coefficients.
+    np.testing.assert_allclose(color[facing], 1, atol=HORIZON)
+    np.testing.assert_array_equal(color[~facing], 0)
+
+
+def test_radiance_is_linear_in_the_light(transport, factored, close, random):
+    first, second = some_light(random), some_light(random)
+    mixed = Environment(2 * first.radiance - 3 * second.radiance)
+    one, other = (relight(transport, factored, light) for light in (first, second))
+    close(relight(transport, factored, mixed), 2 * one - 3 * other)
+
+
+def test_black_light_gives_black(transport, factored):
+    assert not np.asarray(relight(transport, factored, Environment(jnp.zeros((6, SIZE, SIZE, 3))))).any()
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_each_channel_of_the_light_reaches_only_itself(transport, factored, random, channel):
+    light = some_light(random)
+    alone = Environment(light.radiance * (jnp.arange(3) == channel))
+    whole, color = (np.asarray(relight(transport, factored, each)) for each in (light, alone))
+    np.testing.assert_array_equal(color[:, channel], whole[:, channel])
+    assert not np.delete(color, channel, axis=1).any()
+
+
+def test_gray_light_serves_a_brdf_in_color(transport, factored, close, random):
+    gray = some_light(random, colors=1)
+    color = Environment(jnp.repeat(gray.radiance, 3, axis=-1))
+    close(relight(transport, factored, gray), relight(transport, factored, color))
+
+
+def test_eyes_below_the_horizon_see_nothing(transport, factored, random):
+    for vertex in range(7):
+        beneath = transport.position[vertex] - 3 * transport.frame[vertex, 2] + transport.frame[vertex, 0]
+        color = relight(transport, factored, some_light(random), eye=beneath)
+        assert not np.asarray(color[vertex]).any()
+
+
+def test_an_eye_on_a_vertex_gives_finite_radiance(transport, factored, random):
+    color = relight(transport, factored, some_light(random), eye=transport.position[2])
+    assert np.isfinite(np.asarray(color)).all()
+
+
+def test_the_distance_of_the_eye_does_not_matter(transport, factored, close, random):
+    light = some_light(random)
+    one = eqx.tree_at(lambda t: t.position, transport, jnp.zeros((7, 3)))
+    expected = relight(one, factored, light)
+    for distance in (1e-3, 1e3, 1e12):
+        close(relight(one, factored, light, eye=distance * EYE), expected)
+
+
+def test_light_tuple_times_view_tuple_is_radiance(transport, factored, close, random):
+    light = some_light(random)
+    lit, view = separable.light_tuple(transport, light), separable.view_tuple(transport, factored, EYE)
+    assert lit.shape == view.shape == (7, 3, 3)
+    close(separable.combine(lit, view), relight(transport, factored, light))
+    close(jnp.sum(lit * view, 1), relight(transport, factored, light))
+
+
+def test_view_tuples_are_the_view_maps_at_the_direction_to_the_eye(transport, factored, close):
+    offset = np.asarray(EYE - transport.position, np.float64)
+    local = np.einsum("vij,vj->vi", transport.frame, offset / np.linalg.norm(offset, axis=1, keepdims=True))
+    close(separable.view_tuple(transport, factored, EYE), factored.view(jnp.asarray(local, jnp.float32)))
+
+
+def test_projection_keeps_energy_and_transforms_each_face_by_itself(random, close):
+    light = some_light(random)
+    coefficient = separable.project(light)
+    close(jnp.sum(coefficient**2), jnp.sum(light.radiance**2))
+    only = Environment(light.radiance.at[jnp.array([0, 1, 2, 4, 5])].set(0))
+    face = separable.project(only).reshape(6, -1, 3)
+    close(face[3], coefficient.reshape(6, -1, 3)[3])
+    assert not np.asarray(jnp.delete(face, 3, axis=0)).any()
+
+
+def test_the_gradient_in_the_light_is_the_transpose(transport, factored, random):
+    light = some_light(random)
+    weight = jnp.asarray(random.normal(size=(7, 3)), jnp.float32)
+    gradient = jax.grad(lambda e: jnp.sum(weight * relight(transport, factored, e)))(light)
+    for _ in range(3):
+        other = some_light(random)
+        forward = float(jnp.vdot(weight, relight(transport, factored, other)))
+        backward = float(jnp.vdot(gradient.radiance, other.radiance))
+        assert abs(forward - backward) < 1e-5 * float(
+            jnp.linalg.norm(gradient.radiance) * jnp.linalg.norm(other.radiance)
+        )
+
+
+def test_dropped_coefficients_of_the_light_have_no_part_in_the_gradient(transport, factored, random):
+    light = some_light(random)
+    gradient = jax.grad(lambda e: jnp.sum(relight(transport, factored, e, light_keep=9)))(light)
+    coefficient = separable.project(gradient)
+    assert np.count_nonzero(np.abs(coefficient).max(1) > 1e-4 * np.abs(coefficient).max()) <= 9
+
+
+def coefficients(random):
+    value = random.normal(size=(6 * SIZE**2, 3)) * random.uniform(size=(6 * SIZE**2, 1)) ** 4
+    return jnp.asarray(value, jnp.float32)
+
+
+def kept(coefficient, chosen):
+    """Rows that were kept, after a check that they are unchanged and all others are zero."""
+    changed = np.asarray(chosen != coefficient)
+    assert not np.asarray(chosen)[changed].any()
+    return np.flatnonzero(np.asarray(chosen).any(1))
+
+
+@pytest.mark.parametrize("count", [1, 17, 384])
+def test_choosing_by_transport_keeps_the_largest_products_with_its_rms(random, count):
+    coefficient, rms = coefficients(random), jnp.asarray(random.uniform(0.1, 1, size=384), jnp.float32)
+    chosen = separable.choose_by_transport(coefficient, rms, count=count)
+    order = np.argsort(-np.linalg.norm(np.asarray(coefficient, np.float64), axis=1) * np.asarray(rms, np.float64))
+    np.testing.assert_array_equal(kept(coefficient, chosen), np.sort(order[:count]))
+
+
+@pytest.mark.parametrize("count", [1, 17, 384])
+def test_choosing_by_area_keeps_the_largest_products_with_it(random, count):
+    coefficient = coefficients(random)
+    chosen = separable.choose_by_area(coefficient, count=count)
+    # What a basis function covers, from the function itself.
+    impulse = haar.inverse(jnp.eye(SIZE**2).reshape(SIZE**2, SIZE, SIZE, 1)).reshape(SIZE**2, -1)
+    area = np.tile(np.mean(np.abs(np.asarray(impulse)) > 1e-6, axis=1), 6)
+    weight = np.linalg.norm(np.asarray(coefficient, np.float64), axis=1) * area
+    np.testing.assert_array_equal(kept(coefficient, chosen), np.sort(np.argsort(-weight)[:count]))
+
+
+def test_choosing_by_magnitude_drops_each_color_below_the_threshold(random):
+    coefficient = coefficients(random) * jnp.array([1.0, 10.0, 0.0])
+    chosen = np.asarray(separable.choose_by_magnitude(coefficient, threshold=1024))
+    level = np.round(np.abs(np.asarray(coefficient, np.float64)) / np.abs(coefficient).max(0).clip(1e-30) * 32767)
+    np.testing.assert_array_equal(chosen, np.where(level >= 1024, coefficient, 0))
+    assert 1 < np.count_nonzero(chosen[:, 0]) < 384
+    np.testing.assert_array_equal(separable.choose_by_magnitude(coefficient, threshold=0), coefficient)
+    # A threshold is relative: it does not know the light's units.
+    np.testing.assert_array_equal(separable.choose_by_magnitude(coefficient * 1024, threshold=1024), chosen * 1024)
+
+
+def test_choosing_as_many_as_there_are_drops_none(transport, factored, close, random):
+    light = some_light(random)
+    expected = relight(transport, factored, light)
+    np.testing.assert_array_equal(relight(transport, factored, light, light_keep=384), expected)
+    # Nor does it matter to drop what no vertex keeps.
+    used = int(np.count_nonzero(np.asarray(transport.rms)))
+    close(relight(transport, factored, light, light_keep=used), expected)
+
+
+def test_the_error_falls_with_the_number_of_coefficients_of_the_light(transport, factored, random):
+    light = some_light(random)
+    whole = relight(transport, factored, light)
+    error = [
+        float(jnp.linalg.norm(relight(transport, factored, light, light_keep=k) - whole)) for k in (6, 30, 100, 200)
+    ]
+    assert error[0] > error[1] > error[2] > error[3]
+
+
+@pytest.mark.parametrize("count", [0, 385, -1])
+def test_impossible_numbers_to_choose_are_refused(transport, random, count):
+    coefficient = coefficients(random)
+    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
+        separable.choose_by_transport(coefficient, jnp.ones(384), count=count)
+    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
+        separable.choose_by_area(coefficient, count=count)
+    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
+        separable.light_tuple(transport, some_light(random), light_keep=count)
+
+
+def test_lights_of_another_size_are_refused(transport, factored):
+    with pytest.raises(ValueError, match=r"the light must have faces of 8 x 8 texels, got \(6, 4, 4, 3\)"):
+        relight(transport, factored, Environment(jnp.ones((6, 4, 4, 3))))
+
+
+def test_batches_of_lights_are_refused(transport, factored):
+    with pytest.raises(ValueError, match="light"):
+        relight(transport, factored, Environment(jnp.ones((2, 6, SIZE, SIZE, 3))))
+
+
+def test_brdfs_with_another_number_of_terms_are_refused(transport, factored):
+    with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
+        relight(transport, factored.keep(2), Environment(jnp.ones((6, SIZE, SIZE, 3))))
+
+
+@pytest.mark.parametrize("brdf", [Lambert([0.2, 0.5, 0.9]), COLORED], ids=["lambert", "glossy"])
+def test_a_quarter_turn_of_everything_changes_nothing(brdf, random, close):
+    ground = prt.scene.builtin.plane(cells=3)
+    mesh = prt.scene.mesh.join(
+        [prt.scene.builtin.sphere(rings=6, sectors=9), eqx.tree_at(lambda m: m.position, ground, 2 * ground.position)]
+    )
+    mesh = eqx.tree_at(lambda m: m.position, mesh, mesh.position + jnp.array([0.1, 1.2, 0.2]))
+    factored = factor(brdf, terms=1 if isinstance(brdf, Lambert) else 4, resolution=12)
+    light = some_light(random)
+    turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+
+    def of(mesh, light, eye):
+        # All coefficients: wavelets of a turned face are other wavelets, their span is the same.
+        transport = precompute(mesh, factored, keep=6 * SIZE**2, size=SIZE, progress=False)
+        return relight(transport, factored, light, eye=eye)
+
+    turned = eqx.tree_at(
+        lambda m: (m.position, m.normal, m.tangent),
+        mesh,
+        tuple(each @ turn.T for each in (mesh.position, mesh.normal, mesh.tangent)),
+    )
+    close(of(turned, rotate(light, turn), turn @ EYE), of(mesh, light, EYE), tolerance=TURNED)

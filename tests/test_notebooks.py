@@ -1,0 +1,80 @@
+"""The notebooks as committed: readable without running. That they run is tested by nbmake, which collects them."""
+
+import json
+import pathlib
+import re
+
+import pytest
+
+FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LARGEST = 300_000  # bytes
+# A folder of some machine: a home, a temporary or an installed one, on POSIX or Windows.
+MACHINE = re.compile(r"(?<![\w.])/(?:home|root|Users|tmp|var|opt|usr|mnt|work|private)/|site-packages|[A-Z]:\\")
+
+
+def _cells(path: pathlib.Path) -> list[dict]:
+    return json.loads(path.read_text())["cells"]
+
+
+def _code(path: pathlib.Path) -> list[dict]:
+    return [cell for cell in _cells(path) if cell["cell_type"] == "code"]
+
+
+def _texts(value: object) -> list[str]:
+    """All strings in a JSON value, keys and pictures excepted; lists of lines are joined."""
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, list) and all(isinstance(each, str) for each in value):
+        return ["".join(value)]
+    if isinstance(value, dict):
+        return [text for key, each in value.items() if not key.startswith("image/") for text in _texts(each)]
+    return [text for each in value for text in _texts(each)] if isinstance(value, list) else []
+
+
+def test_there_are_notebooks_and_nbmake_runs_them(pytestconfig):
+    assert NOTEBOOKS
+    assert pytestconfig.getoption("nbmake")
+    assert "notebooks" in pytestconfig.getini("testpaths")
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_a_notebook_is_small(path):
+    assert path.stat().st_size <= LARGEST
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_outputs_are_of_one_run_from_the_top(path):
+    code = _code(path)
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    pictures = [output for cell in code for output in cell["outputs"] if "image/jpeg" in output.get("data", {})]
+    assert pictures
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_outputs_hold_neither_errors_nor_warnings(path):
+    outputs = [output for cell in _code(path) for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_a_notebook_names_no_folder_of_a_machine(path):
+    found = [match.group() for text in _texts(json.loads(path.read_text())) for match in MACHINE.finditer(text)]
+    assert not found
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_a_notebook_runs_on_the_kernel_that_every_machine_has(path):
+    assert json.loads(path.read_text())["metadata"]["kernelspec"]["name"] == "python3"
+
+
+@pytest.mark.parametrize(
+    "text", ["/home/a/b.py", "at /tmp/x", "File /root/.pyenv/lib", r"C:\\Users", "x/site-packages/y"]
+)
+def test_folders_of_a_machine_are_recognized(text):
+    assert MACHINE.search(text)
+
+
+@pytest.mark.parametrize("text", ["output/demo", "5 / 6", "notebooks/01.ipynb", "https://example.org/home/page"])
+def test_other_paths_are_not(text):
+    assert not MACHINE.search(text)
