@@ -1,0 +1,216 @@
+"""The command `python -m jaxprt`, on a mesh and a sky of a few triangles and pixels."""
+
+import functools
+import json
+import math
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.__main__ import main
+
+OBJ = """
+v 0 1 0
+v -1 -0.5 1
+v 1 -0.5 1
+v 0 -0.5 -1
+f 1 2 3
+f 1 3 4
+f 1 4 2
+f 2 4 3
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a tetrahedron, a sky, a sky with negative pixels, and files that are neither."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "mesh.obj").write_text(OBJ)
+    sky = np.random.default_rng(0).uniform(0.1, 2, size=(4, 8, 3)).astype(np.float32)
+    prt.files.write_exr(folder / "sky.exr", sky)
+    prt.files.write_exr(folder / "dusk.exr", sky[::-1] / 3)
+    prt.files.write_exr(folder / "negative.exr", sky - 0.3)
+    prt.files.write_exr(folder / "square.exr", sky[:, :5])
+    prt.files.write_exr(folder / "nan.exr", np.where(sky > 1.9, np.nan, sky).astype(np.float32))
+    (folder / "text.exr").write_text("not a picture")
+    (folder / "empty.obj").write_text("# nothing\n")
+    return folder
+
+
+def run(place, *more, mesh="mesh.obj", sky=("sky.exr",), output=None):
+    """Exit status of the command on small pictures, in a folder of its own."""
+    output = output or place / "out"
+    files = ["--mesh", str(place / mesh), "--environment", *[str(place / name) for name in sky]]
+    options = ["--size", "32", "--brdf", "lambert", "--keep", "8", "--output", str(output)]
+    return main([*files, *options, *more])
+
+
+def numbers(tree):
+    """All numbers in a JSON value."""
+    if isinstance(tree, dict):
+        tree = list(tree.values())
+    if isinstance(tree, list):
+        return [number for each in tree for number in numbers(each)]
+    return [tree] if isinstance(tree, int | float) else []
+
+
+def report(output):
+    """The report, which must be JSON as other programs read it: without NaN and infinity."""
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    found = json.loads((output / "report.json").read_text(), parse_constant=refuse)
+    assert all(map(math.isfinite, numbers(found)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def output(place):
+    """What one whole run leaves: two lights and a coarse ground."""
+    folder = place / "deep" / "whole"
+    coarse = functools.partial(prt.scene.mesh.ground_plane, vertices=49)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prt.scene.mesh, "ground_plane", coarse)
+        assert run(place, "--ground", "--azimuth", "-30", sky=("sky.exr", "dusk.exr"), output=folder) == 0
+    return folder
+
+
+def test_pictures_and_report_are_written(output):
+    expected = {
+        f"{light}_{kind}.{suffix}"
+        for light in ("sky", "dusk")
+        for kind in ("image", "reference", "difference")
+        for suffix in ("exr", "png")
+    }
+    found = {path.name for path in output.iterdir()}
+    assert found == expected | {"report.json", "object.prt", "ground.prt"}
+    for name in expected:
+        assert (output / name).stat().st_size > 50
+    picture, _ = prt.files.read_image(output / "sky_image.exr")
+    assert picture.shape == (32, 32, 3)
+    assert np.isfinite(picture).all()
+
+
+def test_the_report_is_json_of_finite_numbers(output):
+    told = report(output)
+    assert told["vertices"] == {"object": 4, "ground": 49}
+    assert set(told["lights"]) == {"sky", "dusk"}
+    for light in told["lights"].values():
+        assert 0 < light["image_error"] < 0.5
+        assert set(light["vertex_error"]) == {"object", "ground"}
+    assert told["precompute"]["object"]["keep"] == 8
+    assert min(told["times"].values()) > 0
+    assert told["peak_bytes"] > 1e7
+
+
+def test_the_pictures_differ_by_what_the_report_says(output):
+    image, reference, difference = (
+        prt.files.read_image(output / f"sky_{kind}.exr")[0] for kind in ("image", "reference", "difference")
+    )
+    np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
+
+
+def test_a_second_run_takes_the_transport_from_the_first(place, tmp_path, capsys):
+    for _ in range(2):
+        assert run(place, output=tmp_path) == 0
+    told = capsys.readouterr()
+    assert "pictures and report.json are in" in told.out
+    assert "error" not in told.err.lower()
+    assert report(tmp_path)["lights"]["sky"]["image_error"] < 0.5
+
+
+def test_glossy_brdfs_and_the_error_table(place, tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxprt.__main__._TABLE_TERMS", (1, 4))
+    monkeypatch.setattr("jaxprt.__main__._TABLE_KEEP", (32, 96))
+    options = ["--table", "3", "--terms", "2", "--diffuse", "0.2", "0.3", "0.4", "--specular", "0.1", "--nu", "10"]
+    assert run(place, *options, "--brdf", "ashikhmin-shirley", output=tmp_path) == 0
+    table = report(tmp_path)["table"]
+    assert {(row["terms"], row["keep"]) for row in table} == {(t, k) for t in (1, 4) for k in (32, 96)}
+    assert table[-1]["error sky"] < table[0]["error sky"]
+
+
+# The command prints warnings itself; here they would be errors before they reach it.
+@pytest.mark.filterwarnings("default:.* pixels are negative:UserWarning")
+def test_negative_pixels_are_told_on_stderr(place, tmp_path, capsys):
+    assert run(place, sky=("negative.exr",), output=tmp_path) == 0
+    assert "jaxprt: " in (told := capsys.readouterr().err)
+    assert "pixels are negative" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mesh": "absent.obj"}, "there is no mesh file .*absent.obj"),
+        ({"mesh": "sky.exr"}, "sky.exr must end in one of .ply"),
+        ({"mesh": "empty.obj"}, "empty.obj must hold vertices and faces"),
+        ({"sky": ("absent.exr",)}, "absent.exr"),
+        ({"sky": ("text.exr",)}, "text.exr"),
+        ({"sky": ("square.exr",)}, "square.exr must be 2 : 1"),
+        ({"sky": ("nan.exr",)}, "nan.exr must hold finite radiance"),
+        ({"sky": ("sky.exr", "mesh.obj")}, "mesh.obj"),
+    ],
+)
+def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
+    assert run(place, output=tmp_path / "none", **options) == 2
+    assert_told(capsys, message)
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--size", "0"], "--size must be at least 1, got 0"),
+        (["--keep", "0"], "keep must be .* at least 1, got 0"),
+        (["--keep", "30000"], "keep must be at most 24576 .* got 30000"),
+        (["--brdf", "ashikhmin-shirley", "--terms", "0"], "terms must be between 1 and .* got 0"),
+        (["--diffuse", "0.1", "0.2"], "--diffuse must be one number or three, got 2"),
+        (["--specular", "1", "2", "3", "4"], "--specular must be one number or three, got 4"),
+        (["--diffuse", "nan"], "finite"),
+        (["--brdf", "ashikhmin-shirley", "--nu", "-5"], "nu|finite"),
+        (["--elevation", "100"], "elevation must be from"),
+        (["--azimuth", "nan"], "azimuth must be finite"),
+        (["--table", "-3"], "table must be"),
+    ],
+)
+def test_bad_numbers_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
+    assert run(place, *options, output=tmp_path) == 2
+    assert_told(capsys, message)
+
+
+def assert_told(capsys, message):
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    assert [line for line in err.splitlines() if line.startswith("jaxprt: error: ")], err
+    assert re.search(message, err), err
+
+
+@pytest.mark.parametrize("options", [["--size", "many"], ["--brdf", "velvet"], ["--unknown"], ["--diffuse"]])
+def test_options_that_cannot_be_read_end_with_status_2_and_usage(capsys, options):
+    with pytest.raises(SystemExit) as end:
+        main(options)
+    assert end.value.code == 2
+    assert "usage: python -m jaxprt" in capsys.readouterr().err
+
+
+def test_an_output_that_is_a_file_is_refused(place, tmp_path, capsys):
+    (tmp_path / "file").write_text("precious")
+    assert run(place, output=tmp_path / "file") == 2
+    assert_told(capsys, "file")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_another_meshs_store_in_the_output_is_refused(place, tmp_path, capsys):
+    assert run(place, output=tmp_path) == 0
+    assert run(place, "--keep", "9", output=tmp_path) == 2
+    assert_told(capsys, "object.prt holds arrays made from something else .*keep: there 8, now 9")
+
+
+def test_the_module_runs_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "jaxprt", "--help"], check=True, capture_output=True, text=True)
+    assert "usage: python -m jaxprt" in done.stdout
+    assert not done.stderr
