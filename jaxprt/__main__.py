@@ -24,6 +24,12 @@ from jaxprt.transport import SparseTransport
 
 _TABLE_TERMS = (1, 4, 16, 64)
 _TABLE_KEEP = (32, 96, 256)
+# Turns that bring an axis of the file to +y.
+_UPRIGHT = {
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+}
 _AMPLIFY = 4.0  # brightness of the difference picture beside the others
 
 
@@ -64,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m jaxprt", description=__doc__)
     parser.add_argument("--mesh", type=Path, help="PLY, OBJ, STL, OFF or GLB; an embedded scene if not given")
+    parser.add_argument("--up", choices=list(_UPRIGHT), default="y", help="axis of the file that points up (default y)")
     parser.add_argument("--environment", type=Path, nargs="+", metavar="FILE", help="EXR or HDR; embedded if not given")
     parser.add_argument("--brdf", choices=["ashikhmin-shirley", "lambert"], default="ashikhmin-shirley")
     parser.add_argument("--diffuse", type=float, nargs="+", default=[0.5], help="gray or three colors (default 0.5)")
@@ -105,6 +112,7 @@ def _run(options: argparse.Namespace) -> None:
         for part, vertex in zip(scene.parts, seen, strict=True)
     ]  # fmt: skip
     report["reference_seconds"] = time.perf_counter() - start
+    report["difference_png_gain"] = _AMPLIFY
     report["lights"] = {}
     for number, (name, light) in enumerate(scene.lights.items()):
         values = [each[number] for each in exact]
@@ -112,7 +120,8 @@ def _run(options: argparse.Namespace) -> None:
     report["times"] = _times(transport, factored, next(iter(scene.lights.values())), scene)
     if options.table:
         report["table"] = _table(scene, options.table)
-    report["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    report["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
     path = options.output / "report.json"
     path.write_text(json.dumps(report, indent=2) + "\n")
     _tell(report, path)
@@ -124,7 +133,7 @@ def _scene(options: argparse.Namespace) -> Scene:
     if options.mesh is None:
         parts = _chess(_brdf(options), options.terms)
     else:
-        mesh = prt.scene.load_mesh(options.mesh)
+        mesh = prt.scene.mesh.turn(prt.scene.load_mesh(options.mesh), np.array(_UPRIGHT[options.up]))
         parts = [Part("object", mesh, _brdf(options), 1 if options.brdf == "lambert" else options.terms)]
         if options.ground:
             parts.append(Part("ground", prt.scene.mesh.ground_plane(mesh), prt.brdf.Lambert(0.5), 1))

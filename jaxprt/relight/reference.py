@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tqdm.auto
+import tqdm
 from jaxtyping import Array, Float, UInt8
 
 from jaxprt.scene.environment import Environment
@@ -47,7 +47,7 @@ def radiance(
     frame = directions.frame(mesh.normal, mesh.tangent)
     size = light.radiance.shape[-2]
     result = []
-    for first in tqdm.auto.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
+    for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
         seen, _ = visibility.fractional(rays, start[part], normal[part], size=size)
         block = integrate(seen, mesh.position[part], frame[part], brdf, light, eye)

@@ -164,6 +164,12 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
+def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
+    """The mesh turned by a rotation about the origin, frames and all."""
+    place, normal, tangent = (v @ jnp.asarray(rotation, v.dtype).T for v in (mesh.position, mesh.normal, mesh.tangent))
+    return Mesh(place, mesh.face, normal, tangent, mesh.region)
+
+
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
     """A square grid of ground for a mesh to stand on, centered under it.
 

@@ -8,7 +8,7 @@ from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor, as_
 from typing import Any
 
 import numpy as np
-import tqdm.auto
+import tqdm
 
 from jaxprt.files.arrays import BlockStore, Layout
 
@@ -65,7 +65,7 @@ def compute(
     blocks = -(-job.vertices // size)
     store = None if path is None else BlockStore(path, job.header, job.layout, blocks)
     result = {name: np.zeros(_whole(at, blocks), at.dtype) for name, at in job.layout.items()}
-    with tqdm.auto.tqdm(total=job.vertices, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
+    with tqdm.tqdm(total=job.vertices, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
         todo = [block for block in range(blocks) if not _load(store, block, result, job)]
         bar.update(job.vertices - sum(_count(job, block) for block in todo))
         if todo and store is not None:

@@ -196,12 +196,17 @@ def test_two_writers_are_one_too_many(path):
 
 def test_a_lock_left_behind_by_a_killed_process_does_not_hold(path):
     script = (
-        "import os, signal, sys\n"
-        "from jaxprt.files.arrays import BlockStore, Layout\n"
-        f"store = BlockStore({str(path)!r}, {HEADER!r}, {{k: Layout(*v) for k, v in {dict(LAYOUT)!r}.items()}}, 5)\n"
-        "with store.writing():\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)\n"
-    ).replace("Layout(shape=", "dict(shape=").replace("Layout(*v)", "Layout(**v)")
+        (
+            "import os, signal, sys\n"
+            "from jaxprt.files.arrays import BlockStore, Layout\n"
+            f"layout = {{k: Layout(*v) for k, v in {dict(LAYOUT)!r}.items()}}\n"
+            f"store = BlockStore({str(path)!r}, {HEADER!r}, layout, 5)\n"
+            "with store.writing():\n"
+            "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        )
+        .replace("Layout(shape=", "dict(shape=")
+        .replace("Layout(*v)", "Layout(**v)")
+    )
     done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert done.returncode == -9, done.stderr
     with open_store(path).writing():

@@ -21,7 +21,7 @@ def test_planted_eigenvalues_of_either_sign_come_by_magnitude():
 
 
 def test_nearly_equal_pairs_of_opposite_sign_are_separated():
-    matrix, basis = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
+    matrix, _ = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
     value, vector, _ = eigen.symmetric(matrix, terms=4)
     np.testing.assert_allclose(value, [242, -241.99, 240, -239.8], rtol=1e-5)
     np.testing.assert_allclose(jnp.linalg.norm(matrix @ vector - vector * value), 0, atol=2e-2)

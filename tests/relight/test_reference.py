@@ -154,9 +154,7 @@ def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close)
     light = some_light(random)
     turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     fields = (mesh.position, mesh.normal, mesh.tangent)
-    turned = eqx.tree_at(
-        lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields)
-    )
+    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields))
     vertex = np.arange(0, 121, 2)
     close(
         reference.radiance(turned, brdf, rotate(light, turn), eye=turn @ EYE, vertex=vertex),

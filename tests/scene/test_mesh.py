@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import Mesh, ground_plane, join, load_mesh, make_mesh, split
+from jaxprt.scene.mesh import Mesh, ground_plane, join, load_mesh, make_mesh, split, turn
 from jaxprt.sphere import directions
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -260,3 +260,12 @@ def test_the_ground_under_a_mesh_without_extent_is_a_square_all_the_same():
         ground_plane(builtin.plane(), vertices=3)
     with pytest.raises(ValueError, match="extent must be positive, got 0"):
         ground_plane(builtin.plane(), extent=0.0)
+
+
+def test_turned_mesh_keeps_its_shape_and_frames():
+    mesh = builtin.sphere(rings=4, sectors=6)
+    turned = turn(mesh, [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    np.testing.assert_allclose(turned.position[:, 1], mesh.position[:, 2], atol=1e-6)
+    assert_frames(turned)
+    np.testing.assert_allclose(turned.normal, turned.position, atol=1e-6)
+    np.testing.assert_array_equal(turned.face, mesh.face)

@@ -214,7 +214,7 @@ def test_moving_a_thousand_sizes_away_leaves_visibility_nearly_as_it_is(make):
 def test_what_stands_on_the_ground_does_not_see_the_sky_from_beneath(name):
     if name == "box":
         box = trimesh.creation.box()
-        body = make_mesh(np.array(box.vertices) + [0.03, 0.5, -0.02], np.array(box.faces))
+        body = make_mesh(np.array(box.vertices) + np.array([0.03, 0.5, -0.02]), np.array(box.faces))
     else:
         body = moved(builtin.sphere(rings=8, sectors=12), shift=[0, 1, 0])
     mesh = join([body, moved(builtin.plane(cells=51), scale=51.0)])
