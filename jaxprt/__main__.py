@@ -130,6 +130,8 @@ def _run(options: argparse.Namespace) -> None:
 def _scene(options: argparse.Namespace) -> Scene:
     if options.size < 1:
         raise ValueError(f"--size must be at least 1, got {options.size}")
+    if options.table is not None and options.table < 1:
+        raise ValueError(f"--table must be at least 1, got {options.table}")
     if options.mesh is None:
         parts = _chess(_brdf(options), options.terms)
     else:

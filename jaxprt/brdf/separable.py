@@ -1,5 +1,6 @@
 """BRDFs as sums of products of a light map and a view map: f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
 
+import importlib
 from collections.abc import Callable
 
 import equinox as eqx
@@ -36,6 +37,11 @@ class SeparableBrdf(eqx.Module):
         """Number of terms r."""
         return self.light_map.shape[0]
 
+    def __reduce__(self):
+        """Pickles the map by name, since jitted functions cannot be pickled; workers get their BRDF so."""
+        name = (self.coordinates.__module__, self.coordinates.__qualname__)
+        return _unpickle, (self.light_map, self.view_map, self.error, *name)
+
     def keep(self, terms: int) -> "SeparableBrdf":
         """The first `terms` terms; their error is no longer known and reads NaN where terms were dropped."""
         if not 1 <= terms <= self.terms:
@@ -55,6 +61,10 @@ class SeparableBrdf(eqx.Module):
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the factored BRDF in 1/sr, by bilinear lookup; zero below the horizon."""
         return jnp.where(wi[..., 2:] > 0, jnp.sum(self.light(wi) * self.view(wo), -2), 0)
+
+
+def _unpickle(light_map, view_map, error, module: str, name: str) -> SeparableBrdf:
+    return SeparableBrdf(light_map, view_map, error, getattr(importlib.import_module(module), name))
 
 
 def factor(

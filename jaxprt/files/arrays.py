@@ -49,6 +49,9 @@ class BlockStore:
         if not self.path.exists():
             _create(self.path, header, self._layout, blocks)
         self._group = _open(self.path, header)
+        lost = [name for name in (*self._layout, "checksum") if name not in self._group]
+        if lost:
+            raise ValueError(f"{self.path} lacks the array {lost[0]}: it is damaged; delete it to start anew")
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -74,10 +77,10 @@ class BlockStore:
 
     def read(self, block: int) -> dict[str, np.ndarray] | None:
         """One block of every array, or None where it was not written or is not what was written."""
-        expected = int(self._read("checksum", block, ()))
-        if not expected:
-            return None
         try:
+            expected = int(self._read("checksum", block, ()))
+            if not expected:
+                return None
             array = {name: self._read(name, _place(at, block), at.shape) for name, at in self._layout.items()}
         except (ValueError, OSError, RuntimeError):
             return None
@@ -89,10 +92,7 @@ class BlockStore:
         return found
 
     def _read(self, name: str, place: Any, shape: tuple[int, ...]) -> np.ndarray:
-        try:
-            return np.asarray(self._array(name)[place]).reshape(shape)
-        except KeyError as error:
-            raise ValueError(f"{self.path} lacks the array {name}: it is damaged; delete it to start anew") from error
+        return np.asarray(self._array(name)[place]).reshape(shape)
 
 
 def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:

@@ -46,6 +46,8 @@ def radiance(
     normal = np.asarray(mesh.normal, np.float32)
     frame = directions.frame(mesh.normal, mesh.tangent)
     size = light.radiance.shape[-2]
+    if not vertex.size:
+        return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)

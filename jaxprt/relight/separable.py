@@ -107,6 +107,8 @@ def light_tuple(
     Raises:
         ValueError: The light's cubemap differs in size from the transport's.
     """
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6 n n c], got {light.radiance.shape}")
     texels = light.radiance.shape[-2] ** 2 * 6
     if texels != transport.rms.shape[0]:
         size = haar.face_edge(transport.rms.shape[0])

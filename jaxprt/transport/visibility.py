@@ -56,7 +56,8 @@ class Occluder:
         _check(mesh, "occluder")
         self.position = np.asarray(mesh.position, np.float32)
         self.face = np.asarray(mesh.face, np.int32)
-        low, high = self.position.min(0), self.position.max(0)
+        used = self.position[self.face.ravel()]
+        low, high = used.min(0), used.max(0)
         self.diagonal = float(np.linalg.norm(high - low)) or 1.0
         # Far from the origin float32 itself is coarser than the share of the diagonal.
         self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
