@@ -64,7 +64,8 @@ class SeparableBrdf(eqx.Module):
 
 
 def _unpickle(light_map, view_map, error, module: str, name: str) -> SeparableBrdf:
-    return SeparableBrdf(light_map, view_map, error, getattr(importlib.import_module(module), name))
+    coordinates = getattr(importlib.import_module(module), name)
+    return SeparableBrdf(jnp.asarray(light_map), jnp.asarray(view_map), jnp.asarray(error), coordinates)
 
 
 def factor(

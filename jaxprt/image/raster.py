@@ -272,8 +272,8 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
     def step(state):
         start, done, nearest = state
         t = jax.lax.dynamic_slice(number, (start,), (chunk,))
-        across = jax.lax.div(columns[t] + (PATCH - 1), PATCH)
-        count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (PATCH - 1), PATCH), 0)
+        across = jax.lax.div(columns[t] + (PATCH - 1), jnp.int32(PATCH))
+        count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (PATCH - 1), jnp.int32(PATCH)), 0)
         count = jnp.minimum(count.at[0].add(-done), chunk + 1)  # One more, to tell that some are left over.
         last = _running_sum(count)
         first = last - count
@@ -288,7 +288,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         identity = t.astype(x.dtype)
 
         def pixel(nearest, k):
-            i, j = top + jax.lax.div(k, PATCH), left + jax.lax.rem(k, PATCH)
+            i, j = top + jax.lax.div(k, jnp.int32(PATCH)), left + jax.lax.rem(k, jnp.int32(PATCH))
             at = j.astype(x.dtype) + (1 - width) / 2, i.astype(x.dtype) + (1 - height) / 2
             d = _cover(corner[0], corner[1], corner[2], *at)
             d = jnp.where((i < bottom) & (j < right), d, jnp.inf)

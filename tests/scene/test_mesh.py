@@ -264,7 +264,7 @@ def test_the_ground_under_a_mesh_without_extent_is_a_square_all_the_same():
 
 def test_turned_mesh_keeps_its_shape_and_frames():
     mesh = builtin.sphere(rings=4, sectors=6)
-    turned = turn(mesh, [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    turned = turn(mesh, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
     np.testing.assert_allclose(turned.position[:, 1], mesh.position[:, 2], atol=1e-6)
     assert_frames(turned)
     np.testing.assert_allclose(turned.normal, turned.position, atol=1e-6)
