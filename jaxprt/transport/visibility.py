@@ -18,7 +18,7 @@ from jaxprt.sphere import cubemap
 
 LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
 _SIDE = 4
-_RAYS = 1 << 21  # rays in one call: bounds memory
+_RAYS = 1 << 17  # rays in one call: what a core's cache holds
 _NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
 _SINK = 0.02  # of the scene's diagonal, how deep a vertex may lie inside a simplified occluder
 
