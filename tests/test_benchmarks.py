@@ -1,0 +1,30 @@
+"""Every benchmark runs to its end on its small case, and says what a measurement must say."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+BENCHMARKS = sorted(
+    path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem not in ("__init__", "harness")
+)
+# Small cases bound the error too: rounding, or thin features of coarse meshes.
+MOST_ERROR = {"precompute_separable": 3e-3, "rasterize": 1e-3, "relight_separable": 1e-5}
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_quick_case_reports_each_measurement_with_its_error_and_peer(name, tmp_path):
+    output = tmp_path / "lines.jsonl"
+    command = [sys.executable, "-m", f"benchmarks.{name}", "--quick", "--output", str(output)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=300)
+    lines = [json.loads(line) for line in output.read_text().splitlines()]
+    assert lines
+    for line in lines:
+        assert line["benchmark"] == name
+        assert line["seconds"] > 0
+        assert line["bytes"] > 0
+        assert line["error"] <= MOST_ERROR[name]
+        assert line["ratio"] == pytest.approx(line["peer_seconds"] / line["seconds"])
