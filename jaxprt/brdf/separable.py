@@ -18,7 +18,7 @@ _RECIPROCAL = 1e-3  # asymmetry beyond which the eigenvectors of M are not its s
 
 
 class SeparableBrdf(eqx.Module):
-    """A factored BRDF on orthographic disk maps.
+    """A factored BRDF on maps of the hemisphere.
 
     Attributes:
         light_map: g_r on the incident direction; the last axis is 1 (shared by all colors) or one per color.
@@ -194,7 +194,8 @@ def _leading(matrix: Array, covariance: Array, terms: int | None, error: float |
     count = min(4, most) if terms is None else terms
     while True:
         value, vector, _ = eigen.left_singular(matrix, covariance, terms=count)
-        remainder = jnp.sqrt(jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0))
+        lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)
+        remainder = jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF is met exactly
         if error is None:
             return value, vector, remainder
         reached = np.flatnonzero(np.asarray(remainder) <= error)

@@ -19,7 +19,7 @@ from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport import blocks, sparse, visibility
 from jaxprt.transport.sparse import SparseTransport
 
-_BLOCK = 64  # vertices; at 6 x 64 x 64 and 4 terms some 100 MB of intermediate values on each core
+_BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
 
 
 def precompute(
