@@ -3,8 +3,8 @@
 import os
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,8 +18,6 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport import blocks, sparse, visibility
 from jaxprt.transport.sparse import SparseTransport
-
-_BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
 
 
 def precompute(
@@ -63,12 +61,11 @@ def precompute(
         raise ValueError(f"size must be a power of two, got {size}")
     if not 1 <= keep <= 6 * size * size:
         raise ValueError(f"keep must be at most {6 * size * size} and at least 1, got {keep}")
-    vertex = np.arange(len(mesh.position)) if vertex is None else np.asarray(vertex)
-    job = _Job.make(mesh, mesh if occluder is None else occluder, vertex, brdf, keep, size)
+    job = _Job.make(mesh, occluder, vertex, size, brdf=jax.tree.map(np.asarray, brdf), keep=keep)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
     rms = sparse.rms(result["index"], result["value"], 6 * size * size)
     index, value = jnp.asarray(result["index"]), jnp.asarray(result["value"])
-    return SparseTransport(index, value, mesh.position[vertex], jnp.asarray(job.frame), rms)
+    return SparseTransport(index, value, mesh.position[visibility.chosen(mesh, vertex)], jnp.asarray(job.frame), rms)
 
 
 @jax.jit
@@ -94,9 +91,8 @@ def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: Separ
     size = haar.face_edge(seen.shape[1])
     direction = cubemap.direction(size=size).reshape(-1, 3)
     area = cubemap.vector_area(size=size).reshape(-1, 3)
-    local = jnp.einsum("bij,dj->bdi", frame, direction)
-    flux = jnp.maximum(jnp.einsum("bj,dj->bd", frame[:, 2], area), 0) * seen.astype(frame.dtype)
-    value = brdf.light(local) * (flux / visibility.LEVELS)[..., None, None]
+    flux = jnp.maximum(directions.to_local(frame, area)[..., 2], 0) * seen.astype(frame.dtype)
+    value = brdf.light(directions.to_local(frame, direction)) * (flux / visibility.LEVELS)[..., None, None]
     faces = value.reshape(seen.shape[0] * 6, size, size, -1)
     return haar.forward(faces).reshape(value.shape)
 
@@ -125,35 +121,11 @@ def compress(
 
 
 @dataclass(frozen=True)
-class _Job(blocks.Job):
+class _Job(visibility.VisibilityJob):
     """Blocks of transport; see `blocks.Job`."""
 
-    start: np.ndarray
-    frame: np.ndarray
-    occluder: Mesh
     brdf: SeparableBrdf
     keep: int
-    size: int
-    mesh_key: str
-
-    @classmethod
-    def make(cls, mesh: Mesh, occluder: Mesh, vertex: np.ndarray, brdf: SeparableBrdf, keep: int, size: int) -> "_Job":
-        occluder, brdf = jax.tree.map(np.asarray, (occluder, brdf))
-        start = visibility.start_points(mesh, visibility.Occluder(occluder))[vertex]
-        frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
-        key = blocks.fingerprint(start, frame, occluder.position, occluder.face)
-        return cls(start, frame, occluder, brdf, keep, size, key)
-
-    @cached_property
-    def rays(self) -> visibility.Occluder:
-        return visibility.Occluder(self.occluder)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @property
-    def vertices(self) -> int:
-        return len(self.start)
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -165,12 +137,11 @@ class _Job(blocks.Job):
         terms, _, _, colors = self.brdf.light_map.shape
         index = "uint16" if 6 * self.size**2 <= 1 << 16 else "uint32"
         return {
-            "index": Layout((self.keep, _BLOCK, terms), 1, index),
-            "value": Layout((self.keep, _BLOCK, terms, colors), 1, "float32"),
+            "index": Layout((self.keep, visibility.BLOCK, terms), 1, index),
+            "value": Layout((self.keep, visibility.BLOCK, terms, colors), 1, "float32"),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
-        part = np.minimum(np.arange(block * _BLOCK, (block + 1) * _BLOCK), self.vertices - 1)
-        seen, count = visibility.fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
-        index, value = compress(seen, self.frame[part], self.brdf, keep=self.keep)
+        seen, count = self.seen(block)
+        index, value = compress(seen, self.frame[self.part(block)], self.brdf, keep=self.keep)
         return {"index": np.asarray(index), "value": np.asarray(value)}, count.rays

@@ -4,18 +4,21 @@ Everything here is NumPy on the host; what comes out is an array, so the rest of
 visibility made by hand.
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, UInt8
 
 from jaxprt.scene.mesh import Mesh
-from jaxprt.sphere import cubemap
+from jaxprt.sphere import cubemap, directions
+from jaxprt.transport import blocks
 
+BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
 LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
 _SIDE = 4
 _RAYS = 1 << 17  # rays in one call: what a core's cache holds
@@ -69,9 +72,10 @@ class Occluder:
         return self._scene.run(origin, direction, query="OCCLUDED") == 0
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
-        """First triangle on each ray, -1 for none, and the distance to it."""
+        """First triangle on each ray, -1 for none, the distance to it, and the weights of its three vertices."""
         found = self._scene.run(origin, direction, query="INTERSECT", output=True)
-        return found["primID"].astype(np.int64), found["tfar"]
+        u, v = found["u"], found["v"]
+        return found["primID"].astype(np.int64), found["tfar"], np.stack([1 - u - v, u, v], -1)
 
 
 def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
@@ -141,6 +145,79 @@ def exhaustive(
         texel = np.flatnonzero(above[vertex])
         seen[vertex, texel] = _supersample(occluder, start, np.full(texel.size, vertex), texel, table)
     return seen
+
+
+def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
+    """Numbers of the vertices to light: all of them for None, those that a mask marks, or those that are named.
+
+    Raises:
+        ValueError: Neither a mask with one entry for each vertex nor numbers of vertices.
+    """
+    count = len(mesh.position)
+    number = np.arange(count)
+    if vertex is None:
+        return number
+    vertex = np.asarray(vertex)
+    mask = vertex.dtype == bool and vertex.shape == (count,)
+    named = vertex.ndim == 1 and vertex.dtype.kind in "iu" and np.all((vertex >= -count) & (vertex < count))
+    if not mask and not named:
+        raise ValueError(
+            f"vertex must be a mask [{count}] or whole numbers below {count} in one row, got {vertex.dtype} "
+            f"{vertex.shape}: {np.array2string(vertex, threshold=4)}"
+        )
+    return number[vertex]
+
+
+@dataclass(frozen=True)
+class VisibilityJob(blocks.Job):
+    """Blocks of vertices whose visibility becomes transport; systems say what is made of it. See `blocks.Job`.
+
+    Attributes:
+        start: Points where rays start.
+        frame: Rows are tangent, bitangent, normal.
+        occluder: What casts shadows, in NumPy arrays.
+        size: Edge of the cubemap's faces in texels.
+        mesh_key: Fingerprint of all that the visibility depends on.
+    """
+
+    start: np.ndarray
+    frame: np.ndarray
+    occluder: Mesh
+    size: int
+    mesh_key: str
+
+    @classmethod
+    def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
+        """A job for some vertices of a mesh, all of them if None, which shadows itself if no occluder is named."""
+        occluder = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
+        vertex = chosen(mesh, vertex)
+        start = start_points(mesh, Occluder(occluder))[vertex]
+        frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
+        key = blocks.fingerprint(start, frame, occluder.position, occluder.face)
+        return cls(start=start, frame=frame, occluder=occluder, size=size, mesh_key=key, **more)
+
+    @cached_property
+    def rays(self) -> Occluder:
+        """The occluder in Embree's form, built once in each worker."""
+        return Occluder(self.occluder)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields: Embree's form does not travel."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.start)
+
+    def part(self, block: int) -> np.ndarray:
+        """Vertices of a block; the last one repeats its last vertex."""
+        return np.minimum(np.arange(block * BLOCK, (block + 1) * BLOCK), self.vertices - 1)
+
+    def seen(self, block: int) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
+        """Visibility of a block by `fractional`."""
+        part = self.part(block)
+        return fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
 
 
 class _Tables(NamedTuple):
@@ -251,7 +328,7 @@ def _outward(mesh: Mesh) -> np.ndarray:
 
 def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Starts for vertices of a mesh that the occluder only approximates."""
-    triangle, distance = occluder.hit(position - np.float32(occluder.nudge) * out, out)
+    triangle, distance, _ = occluder.hit(position - np.float32(occluder.nudge) * out, out)
     facing = _face_normal(occluder.position, occluder.face)[triangle]
     leaving = (triangle >= 0) & (distance < _SINK * occluder.diagonal) & (np.sum(facing * out, 1) > 0)
     depth = np.where(leaving, distance, 0) + occluder.nudge
@@ -272,7 +349,7 @@ def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, ou
     open_start = np.ones(len(start), bool)
     for offset in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
         probe = start + nudge / 2 * offset
-        triangle, distance = occluder.hit(probe, -out)
+        triangle, distance, _ = occluder.hit(probe, -out)
         found = np.flatnonzero(open_start & (triangle >= 0) & (distance < 1.01 * nudge))
         if not found.size:
             continue
