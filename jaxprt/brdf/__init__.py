@@ -1,6 +1,41 @@
 """BRDFs: analytic models, and the form that each system gives them."""
 
-from jaxprt.brdf import models, separable
-from jaxprt.brdf.models import AshikhminShirley, Lambert
+from jaxprt.brdf import cylinders, harmonic, measured, models, scattered, separable
+from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
+from jaxprt.brdf.harmonic import HarmonicBrdf
+from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
+from jaxprt.brdf.models import (
+    AshikhminShirley,
+    BlinnPhong,
+    CookTorrance,
+    Lafortune,
+    Lambert,
+    Phong,
+    Ward,
+    WardDuer,
+)
+from jaxprt.brdf.scattered import load_scattered
 
-__all__ = ["AshikhminShirley", "Lambert", "models", "separable"]
+__all__ = [
+    "AshikhminShirley",
+    "BlinnPhong",
+    "CookTorrance",
+    "HarmonicBrdf",
+    "Lafortune",
+    "Lambert",
+    "Phong",
+    "PoulinFournier",
+    "PoulinFournierGrooves",
+    "Ward",
+    "WardDuer",
+    "cylinders",
+    "harmonic",
+    "load_lafortune",
+    "load_merl",
+    "load_npf",
+    "load_scattered",
+    "measured",
+    "models",
+    "scattered",
+    "separable",
+]

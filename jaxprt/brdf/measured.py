@@ -1,0 +1,356 @@
+"""BRDFs tabulated from measurements: MERL files, and the factors and coefficients that others fitted.
+
+Loaders run on the host and check what they read. What they return is a BRDF like any other, differentiable in its
+directions and its table. ``HalfDifferenceTable`` and ``MicrofacetTable`` are tabulated over angles of the half
+vector: theta_h from the normal, theta_d from the directions, and the turn phi_d of the directions about the half
+vector (Rusinkiewicz 1998). Values and gradients are finite where these angles are undefined.
+"""
+
+import difflib
+import json
+import pathlib
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64
+from scipy import ndimage
+
+from jaxprt.brdf import models
+
+_MERL_SHAPE = (90, 90, 180)
+_MERL_SCALE = np.array([1.0, 1.15, 1.66]) / 1500
+_BINS = 90  # Of each factor of the microfacet table.
+_ROWS, _COLUMNS = 256, 512
+_TINY = 1e-12
+
+
+def _norm(vector: Array) -> Array:
+    """Length, whose gradient at zero is zero."""
+    square = jnp.sum(vector**2, -1)
+    return jnp.where(square < _TINY, 0, jnp.sqrt(jnp.where(square < _TINY, 1, square)))
+
+
+def _lit(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
+    """Whether both directions are above the horizon, and directions that are, in place of those that are not."""
+    lit = (wi[..., 2:] > 0) & (wo[..., 2:] > 0)
+    normal = jnp.array([0, 0, 1], jnp.result_type(wi, wo))
+    return lit, jnp.where(lit, wi, normal), jnp.where(lit, wo, normal)
+
+
+def _polar_angles(wi: Array, wo: Array) -> tuple[Array, Array]:
+    """theta_h and theta_d; |wi + wo| = 2 cos(theta_d) and |wi - wo| = 2 sin(theta_d), so both are exact near zero."""
+    total = wi + wo
+    return jnp.arctan2(_norm(total[..., :2]), total[..., 2]), jnp.arctan2(_norm(wi - wo), _norm(total))
+
+
+def _turn(wi: Array, wo: Array) -> Array:
+    """phi_d; exchanging the directions adds pi. Zero, with zero gradient, where the half vector is at either end.
+
+    In the frame that is turned with the half vector, wi - wo is along
+    (-(wi - wo).n, n.(wi x wo) (-2) / |wi + wo|) up to a positive factor.
+    """
+    x = wo[..., 2] - wi[..., 2]
+    y = 2 * (wi[..., 1] * wo[..., 0] - wi[..., 0] * wo[..., 1]) / jnp.maximum(_norm(wi + wo), 1e-6)
+    pole = x**2 + y**2 < _TINY
+    return jnp.arctan2(jnp.where(pole, 0, y), jnp.where(pole, 1, x))
+
+
+def _root_place(theta: Array, count: int) -> Array:
+    """Place of theta_h among the centers of ``count`` cells that are uniform in its square root."""
+    first = np.pi / 2 * (0.5 / count) ** 2
+    return count * jnp.sqrt(jnp.maximum(theta, first) * (2 / jnp.pi)) - 0.5
+
+
+def _neighbors(place: Array, count: int) -> tuple[Array, Array, Array]:
+    """The two cells whose centers enclose a place, and the weight of the second; constant beyond the outer ones."""
+    place = jnp.clip(place, 0, count - 1)
+    low = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
+    index = low.astype(jnp.int32)
+    return index, jnp.minimum(index + 1, count - 1), place - low
+
+
+class HalfDifferenceTable(eqx.Module):
+    """An isotropic BRDF tabulated over half-vector angles: the cube of values linear between the centers of cells.
+
+    Cells are uniform in sqrt(theta_h), theta_d (to a quarter turn each) and phi_d (to half a turn, where it repeats
+    by reciprocity); beyond the outermost centers the value stays. Never negative for a root that is not, and
+    reciprocal. Cube roots are what is interpolated since highlights fall over decades from cell to cell: on the
+    MERL grid a Cook-Torrance lobe of roughness 0.1 then comes out three times as precise.
+
+    Gradients are those of the interpolant, and zero across the angles that are undefined (theta_h or theta_d zero),
+    next to which ``tabulate`` makes the table the same for all phi_d.
+
+    Attributes:
+        root: Cube root of the BRDF at the cells' centers, ``cell_angles``; the BRDF is in 1/sr.
+        filled: Share of the cells above the horizon whose value is that of the nearest measured cell.
+
+    Reference: Rusinkiewicz 1998 for the angles; Matusik et al. 2003 for the spacing.
+    """
+
+    root: Float[Array, "h d p c"] = eqx.field(converter=jnp.asarray)
+    filled: Float[Array, ""] = eqx.field(converter=lambda share: jnp.asarray(share, jnp.result_type(float)), default=0)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        lit, wi, wo = _lit(wi, wo)
+        theta_h, theta_d = _polar_angles(wi, wo)
+        rows, columns, turns, channels = self.root.shape
+        h = _neighbors(_root_place(theta_h, rows), rows)
+        d = _neighbors(theta_d * (2 * columns / jnp.pi) - 0.5, columns)
+        place = _turn(wi, wo) * (turns / jnp.pi) - 0.5
+        low = jnp.floor(place)
+        p = (low.astype(jnp.int32) % turns, (low.astype(jnp.int32) + 1) % turns, place - low)
+        table = self.root.reshape(-1, channels)
+
+        def between(h_index, d_index):
+            start = (h_index * columns + d_index) * turns
+            return _mix(table[start + p[0]], table[start + p[1]], p[2])
+
+        near = _mix(between(h[0], d[0]), between(h[0], d[1]), d[2])
+        far = _mix(between(h[1], d[0]), between(h[1], d[1]), d[2])
+        return jnp.where(lit, _mix(near, far, h[2]) ** 3, 0)
+
+
+def _mix(first: Array, second: Array, weight: Array) -> Array:
+    return first * (1 - weight[..., None]) + second * weight[..., None]
+
+
+class MicrofacetTable(eqx.Module):
+    """A microfacet BRDF with tabulated factors, interpolated linearly between the centers of their bins.
+
+    pi f = diffuse + specular D(theta_h) F(theta_d) G(theta_i) G(theta_o) / (cos_i cos_o), per color.
+    D is uniform in sqrt(theta_h), F and G in their angle, all to a quarter turn. Published renderings read
+    D and F without interpolation, which shows as rings. Beyond the outermost centers factors stay, and so does
+    G / cos: the value is bounded at grazing angles.
+
+    Attributes:
+        diffuse: Reflectance of the diffuse part.
+        specular: Scale of the specular part.
+        distribution: D, normalized to a maximum of 1.
+        fresnel: F, likewise.
+        masking: G, likewise.
+
+    Reference: Bagher, Snyder, Nowrouzezahrai 2016.
+    """
+
+    diffuse: Float[Array, " c"] = eqx.field(converter=jnp.asarray)
+    specular: Float[Array, " c"] = eqx.field(converter=jnp.asarray)
+    distribution: Float[Array, "h c"] = eqx.field(converter=jnp.asarray)
+    fresnel: Float[Array, "d c"] = eqx.field(converter=jnp.asarray)
+    masking: Float[Array, "t c"] = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        lit, wi, wo = _lit(wi, wo)
+        theta_h, theta_d = _polar_angles(wi, wo)
+        lobe = _between(self.distribution, _root_place(theta_h, self.distribution.shape[0]))
+        lobe = lobe * _between(self.fresnel, theta_d * (2 * self.fresnel.shape[0] / jnp.pi) - 0.5)
+        lobe = lobe * self._masking_per_cosine(wi) * self._masking_per_cosine(wo)
+        return jnp.where(lit, (self.diffuse + self.specular * lobe) / jnp.pi, 0)
+
+    def _masking_per_cosine(self, direction: Array) -> Array:
+        count = self.masking.shape[0]
+        theta = jnp.arctan2(_norm(direction[..., :2]), direction[..., 2])
+        last = np.pi / 2 * (1 - 0.5 / count)
+        cosine = jnp.maximum(direction[..., 2:], np.cos(last))
+        return _between(self.masking, theta * (2 * count / jnp.pi) - 0.5) / cosine
+
+
+def _between(table: Array, place: Array) -> Array:
+    low, high, weight = _neighbors(place, table.shape[0])
+    return _mix(table[low], table[high], weight)
+
+
+def cell_angles(
+    resolution: tuple[int, int, int],
+) -> tuple[Float64[np.ndarray, "h 1 1"], Float64[np.ndarray, "1 d 1"], Float64[np.ndarray, "1 1 p"]]:
+    """theta_h, theta_d and phi_d of the centers of cells of a ``HalfDifferenceTable``, along an axis each."""
+    h, d, p = (
+        ((np.arange(n) + 0.5) / n).reshape([-1 if i == j else 1 for j in range(3)]) for i, n in enumerate(resolution)
+    )
+    return np.pi / 2 * h**2, np.pi / 2 * d, np.pi * p
+
+
+def lower_cosine(resolution: tuple[int, int, int]) -> Float64[np.ndarray, "h d p"]:
+    """The smaller of cos_i and cos_o at the centers of cells; negative where a direction is below the horizon."""
+    theta_h, theta_d, phi_d = cell_angles(resolution)
+    return np.cos(theta_h) * np.cos(theta_d) - np.abs(np.sin(theta_h) * np.sin(theta_d) * np.cos(phi_d))
+
+
+def tabulate(
+    value: Float64[np.ndarray, "h d p c"], valid: Bool[np.ndarray, "h d p"] | np.ndarray
+) -> HalfDifferenceTable:
+    """Makes a BRDF of its values at the centers of cells, some of which may be missing.
+
+    Each missing cell takes the value of the nearest valid one, in cells. Those below the horizon are filled too,
+    since directions just above it are interpolated with them. The first cells in theta_h and in theta_d take their
+    mean over phi_d, which is undefined there.
+
+    Args:
+        value: The BRDF in 1/sr at ``cell_angles``; not negative where valid.
+        valid: Which cells hold a value.
+
+    Returns:
+        The BRDF; its ``filled`` is the share of missing cells among those above the horizon.
+
+    Raises:
+        ValueError: No cell is valid.
+    """
+    if not valid.any():
+        raise ValueError(f"there must be a valid cell, got none of {valid.size}")
+    half = value.shape[2] // 2
+    around = np.pad(valid, ((0, 0), (0, 0), (half, half)), mode="wrap")  # Half a turn on, the table repeats.
+    nearest = np.asarray(ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True))
+    row, column, turn = nearest[..., half : half + value.shape[2]]
+    value = value[row, column, (turn - half) % value.shape[2]]
+    value[0] = value[0].mean(1, keepdims=True)
+    value[:, 0] = value[:, 0].mean(1, keepdims=True)
+    above = lower_cosine(value.shape[:3]) > 0
+    return HalfDifferenceTable(np.cbrt(value).astype(jnp.result_type(float)), 1 - np.sum(valid & above) / np.sum(above))
+
+
+def load_merl(path: str | pathlib.Path) -> HalfDifferenceTable:
+    """Loads a BRDF in the binary format of the MERL database.
+
+    Three int32, (90, 90, 180), then that many float64 for red, green, and blue, to be multiplied by
+    (1, 1.15, 1.66) / 1500. Cells with a negative value in any color are invalid, most of them because a direction
+    would be below the horizon; see ``tabulate``.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The BRDF in linear RGB; its ``filled`` counts invalid cells above the horizon.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file has other dimensions or another length, holds NaN or infinity, or no valid cell.
+
+    Reference: Matusik, Pfister, Brand, McMillan 2003.
+    """
+    content = pathlib.Path(path).read_bytes()
+    if len(content) < 12:
+        raise ValueError(f"{path}: must begin with three int32 {_MERL_SHAPE}, got {len(content)} bytes")
+    shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
+    if shape != _MERL_SHAPE:
+        raise ValueError(f"{path}: the dimensions must be {_MERL_SHAPE}, got {shape}")
+    size = 12 + 3 * 8 * int(np.prod(_MERL_SHAPE))
+    if len(content) != size:
+        raise ValueError(f"{path}: must have {size} bytes, got {len(content)}")
+    plane = np.frombuffer(content, "<f8", offset=12).reshape(3, *_MERL_SHAPE)
+    require(path, plane, np.isfinite(plane), "finite", "value at color, theta_h, theta_d, phi_d")
+    valid = np.all(plane >= 0, 0)
+    if not valid.any():
+        raise ValueError(f"{path}: must hold a cell with no negative value, got none of {valid.size}")
+    return tabulate(np.moveaxis(plane, 0, -1) * _MERL_SCALE, valid)
+
+
+def load_npf(path: str | pathlib.Path, material: str, *, names: str | pathlib.Path | None = None) -> MicrofacetTable:
+    """Loads one material from the table of non-parametric factors of the 100 MERL materials.
+
+    The file is 256 rows of 512 columns of three little-endian float32; a row holds the diffuse and specular
+    reflectance, D, G and F of one material, with 90 bins each, and zeros. First bins of G and F were not fitted and
+    are zero: they take the value of the second.
+
+    Args:
+        path: The table.
+        material: Name of the material, such as "gold-metallic-paint".
+        names: Text with a name per row of the table; None for ``merl_npf_materials.txt`` beside it.
+
+    Returns:
+        The BRDF in linear RGB.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The material is unknown, the table has another size, or the row holds values that are negative
+            or not finite.
+
+    Reference: Bagher, Snyder, Nowrouzezahrai 2016.
+    """
+    path = pathlib.Path(path)
+    names = pathlib.Path(names or path.with_name("merl_npf_materials.txt"))
+    known = names.read_text(encoding="utf-8").split()
+    if len(known) > _ROWS:
+        raise ValueError(f"{names}: must hold at most {_ROWS} names, got {len(known)}")
+    index = known.index(_known(material, known, names))
+    size, required = path.stat().st_size, _ROWS * _COLUMNS * 3 * 4
+    if size != required:
+        raise ValueError(f"{path}: must have {required} bytes, got {size}")
+    row = np.fromfile(path, "<f4").reshape(_ROWS, _COLUMNS, 3)[index].astype(float)
+    good = np.isfinite(row) & (row >= 0)
+    require(path, row, good, "finite and non-negative", f"value of {material} at column, color")
+    distribution, masking, fresnel = row[2 : 2 + 3 * _BINS].reshape(3, _BINS, 3)
+    for factor in (masking, fresnel):
+        factor[0] = np.where(factor[0] > 0, factor[0], factor[1])
+    factors = (row[0], row[1], distribution, fresnel, masking)
+    return MicrofacetTable(*(jnp.asarray(factor, jnp.result_type(float)) for factor in factors))
+
+
+def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
+    """Loads one material from a JSON file of coefficients of Lafortune's model.
+
+    The file holds ``materials``, by name, each with ``diffuse`` and ``lobes`` of ``Cxy``, ``Cz`` and ``n``, all of
+    three colors. Base and lobes are as in ``jaxprt.brdf.Lafortune``.
+
+    Args:
+        path: The file.
+        material: Name of the material, such as "clay".
+
+    Returns:
+        The BRDF in linear RGB.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is of another form, the material is unknown, a number is not finite, a diffuse
+            reflectance is negative, or an exponent is not positive.
+
+    Reference: Lafortune, Foo, Torrance, Greenberg 1997.
+    """
+    form = f"{path}: must be JSON with materials, each of diffuse and lobes of Cxy, Cz, n in three colors"
+    try:
+        known = {str(name): entry for name, entry in json.loads(pathlib.Path(path).read_text())["materials"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{form}: {error!r}") from error
+    entry = known[_known(material, list(known), path)]
+    try:
+        diffuse = np.array(entry["diffuse"], float).reshape(3)
+        cxy, cz, exponent = (
+            np.array([lobe[key] for lobe in entry["lobes"]], float).reshape(-1, 3) for key in ("Cxy", "Cz", "n")
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{form}, but {material} is not: {error!r}") from error
+    if not len(cxy) == len(cz) == len(exponent):
+        raise ValueError(f"{form}, but {material} has {len(cxy)}, {len(cz)} and {len(exponent)} of them")
+    require(path, diffuse, np.isfinite(diffuse) & (diffuse >= 0), "finite and non-negative", "diffuse at color")
+    for value, name in ((cxy, "Cxy"), (cz, "Cz"), (exponent, "n")):
+        good = np.isfinite(value) & ((value > 0) | (name != "n"))
+        require(path, value, good, "positive" if name == "n" else "finite", f"{name} at lobe, color")
+    return models.Lafortune(diffuse=diffuse, cx=cxy, cy=cxy, cz=cz, exponent=exponent)
+
+
+def _known(material: str, known: list[str], path: str | pathlib.Path) -> str:
+    if material not in known:
+        near = difflib.get_close_matches(material, known, 5, 0.4) or known[:5]
+        raise ValueError(
+            f"{path}: material must be one of {len(known)} names such as {', '.join(near)}, got {material!r}"
+        )
+    return material
+
+
+def require(path: str | pathlib.Path, value: np.ndarray, good: np.ndarray, required: str, what: str) -> None:
+    """Raises ValueError, with the count and the first offender, unless all values are good.
+
+    Args:
+        path: The file that they come from.
+        value: Values of any shape.
+        good: Whether each is, of the same shape.
+        required: What they must be.
+        what: What they are, a word and the names of the axes.
+    """
+    if not good.all():
+        place = np.unravel_index(np.argmin(good), good.shape)
+        raise ValueError(
+            f"{path}: every {what.split()[0]} must be {required}, got {np.sum(~good)} that are not, "
+            f"the first {what} {tuple(map(int, place))}: {value[place]}"
+        )

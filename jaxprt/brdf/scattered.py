@@ -1,0 +1,241 @@
+"""Scattered spectral measurements of isotropic materials, made smooth BRDFs by radial basis functions.
+
+Runs on the host, once, where data enters; the result is a ``jaxprt.brdf.measured.HalfDifferenceTable``.
+"""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import interpolate
+
+from jaxprt.brdf import measured
+from jaxprt.brdf.measured import HalfDifferenceTable
+
+_GLOSS = 0.01  # Sine of theta_h at which the coordinates of the radial basis functions turn logarithmic.
+_HIGHLIGHT = 2.0  # First coordinate up to which samples make the highlight: theta_h of 1.5 degrees.
+_FEWEST = 10  # Samples; a plane in three coordinates needs four, that do not lie on it.
+_RESOLUTION = (90, 48, 24)
+# Wyman, Sloan, Shirley 2013: channel, height, center in nm, inverse widths below and above it.
+_LOBES = (
+    (0, 0.362, 442.0, 0.0624, 0.0374),
+    (0, 1.056, 599.8, 0.0264, 0.0323),
+    (0, -0.065, 501.1, 0.0490, 0.0382),
+    (1, 0.821, 568.8, 0.0213, 0.0247),
+    (1, 0.286, 530.9, 0.0613, 0.0322),
+    (2, 1.217, 437.0, 0.0845, 0.0278),
+    (2, 0.681, 459.0, 0.0385, 0.0725),
+)
+# CIE standard illuminant D65 from 400 to 700 nm in steps of 10 nm.
+_D65 = np.array(
+    [82.7549, 91.486, 93.4318, 86.6823, 104.865, 117.008, 117.812, 114.861, 115.923, 108.811, 109.354]
+    + [107.802, 104.79, 107.689, 104.405, 104.046, 100.0, 96.3342, 95.788, 88.6856, 90.0062, 89.5991]
+    + [87.6987, 83.2886, 83.6992, 80.0268, 80.2146, 82.2778, 78.2842, 69.7213, 71.6091]
+)
+# ITU-R BT.709: chromaticities of red, green, blue and the white D65, as XYZ with Y = 1.
+_PRIMARY = np.array([[0.64, 0.33, 0.03], [0.3, 0.6, 0.1], [0.15, 0.06, 0.79]]).T
+_WHITE = np.array([0.3127, 0.3290, 0.3583]) / 0.3290
+_XYZ_TO_RGB = np.linalg.inv(_PRIMARY * np.linalg.solve(_PRIMARY, _WHITE))
+
+
+def load_scattered(
+    path: str | pathlib.Path, *, smoothing: float = 1.0, resolution: tuple[int, int, int] = _RESOLUTION
+) -> HalfDifferenceTable:
+    """Loads scattered measurements of an isotropic material and makes them a smooth BRDF.
+
+    See ``read_scattered`` for the file and the colors, and ``interpolate_scattered`` for the rest.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: As the two functions raise it.
+    """
+    wi, wo, color = read_scattered(path)
+    try:
+        return interpolate_scattered(wi, wo, color, smoothing=smoothing, resolution=resolution)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_scattered(
+    path: str | pathlib.Path,
+) -> tuple[Float64[np.ndarray, "b 3"], Float64[np.ndarray, "b 3"], Float64[np.ndarray, "b 3"]]:
+    """Reads scattered spectral measurements of an isotropic material.
+
+    The text holds the number of wavelengths, the wavelengths in nm, and samples: theta_i, phi_i, theta_o, phi_o in
+    radians and the BRDF at each wavelength in 1/sr. What follows a # in a line is a comment.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Directions to the light, to the viewer, and the BRDF in linear RGB, of each sample; see ``spectrum_to_rgb``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not of this form, or holds no samples, values that are negative or not finite, or
+            directions below the horizon.
+    """
+    number = _numbers(path)
+    count = int(number[0]) if number.size and number[0] == np.floor(number[0]) and 0 < number[0] < 1e6 else 0
+    if count < 2:
+        came = number[0] if number.size else "an empty file"
+        raise ValueError(f"{path}: must begin with the number of wavelengths, at least 2, got {came}")
+    wavelength, sample = number[1 : 1 + count], number[1 + count :]
+    if len(wavelength) < count or not np.all(np.diff(wavelength) > 0) or not 300 <= wavelength[0] < 900:
+        raise ValueError(f"{path}: must hold {count} increasing wavelengths in nm, got {wavelength[:40].tolist()}")
+    if sample.size == 0 or sample.size % (4 + count):
+        whole, rest = divmod(sample.size, 4 + count)
+        raise ValueError(
+            f"{path}: each sample must have 4 angles and {count} values, got {whole} samples and {rest} further numbers"
+        )
+    sample = sample.reshape(-1, 4 + count)
+    measured.require(path, sample, np.isfinite(sample), "finite", "number at sample, column")
+    measured.require(path, sample[:, 4:], sample[:, 4:] >= 0, "non-negative", "value at sample, wavelength")
+    polar = sample[:, [0, 2]]
+    measured.require(
+        path, polar, (polar >= 0) & (polar < np.pi / 2), "theta in [0, pi/2)", "angle at sample, direction"
+    )
+    theta, phi = sample[:, :4:2], sample[:, 1:4:2]
+    direction = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    try:
+        return direction[:, 0], direction[:, 1], spectrum_to_rgb(sample[:, 4:], wavelength)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _numbers(path: str | pathlib.Path) -> Float64[np.ndarray, " n"]:
+    result: list[float] = []
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for index, line in enumerate(file, 1):
+            for word in line.partition("#")[0].split():
+                try:
+                    result.append(float(word))
+                except ValueError:
+                    raise ValueError(f"{path}: line {index} must hold numbers, got {word[:40]!r}") from None
+    return np.array(result)
+
+
+def interpolate_scattered(
+    wi: Float64[np.ndarray, "b 3"],
+    wo: Float64[np.ndarray, "b 3"],
+    value: Float64[np.ndarray, "b c"],
+    *,
+    smoothing: float = 1.0,
+    resolution: tuple[int, int, int] = _RESOLUTION,
+) -> HalfDifferenceTable:
+    """Makes a smooth isotropic BRDF of scattered samples by radial basis functions, and tabulates it.
+
+    The coordinates are log(1 + sin(theta_h)^2 / 0.01^2), 4 sin(theta_d)^2 and 4 (cos_i - cos_o)^2: analytic in the
+    directions, so there is no seam where the angles are undefined; the same for exchanged and for mirrored
+    directions; and fine enough at the half vector's pole for gloss. Thin-plate splines of log(1 + f / s), with s a
+    tenth of the median, are never negative when turned back, which is made sure of where they are below zero.
+
+    Cells with a direction further from the normal than any measured one take the value of the nearest other cell;
+    elsewhere the value is held below the largest sample, and coordinates at the outermost ones. So the BRDF stays
+    bounded at grazing angles, where extrapolated splines would not.
+
+    Args:
+        wi: Unit directions to the light above the horizon.
+        wo: Unit directions to the viewer above the horizon.
+        value: The BRDF in 1/sr; negative values count as zero.
+        smoothing: How far the surface may miss samples for smoothness, see ``scipy.interpolate.RBFInterpolator``.
+            With 0.01, surfaces of measured lacquers swing between the angles of incidence to 16 to 24 times the largest
+            sample around; with 1, to less than twice, and samples left out are predicted as well. In the highlight
+            (theta_h below 1.5 degrees) a thousandth of it is used: its few samples would be smoothed away.
+        resolution: Cells in theta_h, theta_d and, an even number, phi_d.
+
+    Returns:
+        The BRDF; see ``jaxprt.brdf.measured.tabulate`` for what its ``filled`` counts.
+
+    Raises:
+        ValueError: There are fewer than ten different samples, all on one plane, or an option is out of range.
+
+    Reference: Kautz, Sloan, Snyder 2002, "Calculating BRDF Coefficients", for radial basis functions; the
+    coordinates are ours.
+    """
+    if len(resolution) != 3 or min(resolution) < 2 or resolution[2] % 2:
+        raise ValueError(f"resolution must be three numbers of at least 2, the last even, got {resolution}")
+    if not smoothing >= 0:
+        raise ValueError(f"smoothing must be at least 0, got {smoothing}")
+    half = np.sum((wi + wo)[:, :2] ** 2, 1) / np.sum((wi + wo) ** 2, 1)
+    place = _spline_coordinates(half, np.sum((wi - wo) ** 2, 1) / 4, (wi - wo)[:, 2] ** 2)
+    # Exchanged and mirrored samples share a place, and smoothing may be zero: take their mean.
+    place, inverse, count = np.unique(place.round(9), axis=0, return_inverse=True, return_counts=True)
+    if len(place) < _FEWEST:
+        raise ValueError(f"there must be at least {_FEWEST} different samples, got {len(place)}")
+    mean = np.zeros((len(place), value.shape[1]))
+    np.add.at(mean, inverse, np.maximum(value, 0))
+    mean /= count[:, None]
+    scale = np.median(mean[mean > 0]) / 10 if np.any(mean > 0) else 1.0
+    height = np.log1p(mean / scale)
+    stiffness: Any = np.where(place[:, 0] < _HIGHLIGHT, smoothing / 1000, smoothing)  # One per sample; typed float.
+    try:
+        spline = interpolate.RBFInterpolator(place, height, smoothing=stiffness, kernel="thin_plate_spline")
+    except np.linalg.LinAlgError as error:
+        raise ValueError("samples must not all lie on one plane of half-vector angles") from error
+    theta_h, theta_d, phi_d = measured.cell_angles(resolution)
+    half, square = np.sin(theta_h) ** 2, np.sin(theta_d) ** 2
+    query = _spline_coordinates(*np.broadcast_arrays(half, square, 4 * half * square * np.cos(phi_d) ** 2))
+    known = measured.lower_cosine(resolution) >= min(wi[:, 2].min(), wo[:, 2].min())
+    # cos(phi_d)^2 is symmetric about the middle: half of the cells are enough.
+    mine = known & (np.arange(resolution[2]) < resolution[2] // 2)
+    table = np.zeros((*resolution, value.shape[1]))
+    if mine.any():
+        table[mine] = spline(np.clip(query[mine], place.min(0), place.max(0)))
+    table += table[:, :, ::-1]
+    result = measured.tabulate(scale * np.expm1(np.clip(table, 0, height.max(0))), known)
+    # Where two measured cells are equally near, filling chose one: mirror images agree again in their mean.
+    return HalfDifferenceTable((result.root + result.root[:, :, ::-1]) / 2, result.filled)
+
+
+def _spline_coordinates(half: np.ndarray, difference: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    """From sin(theta_h)^2, sin(theta_d)^2 and (cos_i - cos_o)^2; scaled for small errors at left-out samples."""
+    return np.stack([np.log1p(half / _GLOSS**2), 4 * difference, 4 * tilt], -1)
+
+
+def spectrum_to_rgb(
+    reflectance: Float64[np.ndarray, "*b w"], wavelength: Float64[np.ndarray, " w"]
+) -> Float64[np.ndarray, "*b 3"]:
+    """Color of a spectral reflectance, or BRDF, in linear Rec. 709, as seen under daylight D65.
+
+    D65 is the white of Rec. 709, and what reflects all wavelengths alike is (1, 1, 1) times that: each channel is
+    divided by that of a reflectance of 1, which corrects a percent or so for the ends of the spectrum and the
+    approximated matching functions. Colors more saturated than Rec. 709 are clipped at zero.
+
+    Args:
+        reflectance: Values at the wavelengths.
+        wavelength: Increasing wavelengths in nm; the integral over them is by trapezoids, and ends with them.
+
+    Returns:
+        Color in the units of the values.
+
+    Raises:
+        ValueError: The wavelengths do not reach from 430 to 650 nm, or lie over 40 nm apart.
+
+    Reference: Wyman, Sloan, Shirley 2013, "Simple Analytic Approximations to the CIE XYZ Color Matching Functions",
+    the multi-lobe fit of the 2-degree observer of 1931; CIE 15 for D65; ITU-R BT.709 for the primaries.
+    """
+    if (
+        wavelength[0] > 430
+        or wavelength[-1] < 650
+        or not 0 < np.diff(wavelength).min() <= np.diff(wavelength).max() <= 40
+    ):
+        raise ValueError(
+            "wavelengths must increase by at most 40 nm and reach from 430 to 650 nm or further, got "
+            f"{len(wavelength)} from {wavelength[0]} to {wavelength[-1]}"
+        )
+    width = np.gradient(wavelength)
+    width[[0, -1]] /= 2
+    illuminant = np.interp(wavelength, 400 + 10.0 * np.arange(len(_D65)), _D65)
+    weight = (width * illuminant)[:, None] * _matching(wavelength) @ _XYZ_TO_RGB.T
+    return np.maximum(reflectance @ (weight / weight.sum(0)), 0)
+
+
+def _matching(wavelength: np.ndarray) -> np.ndarray:
+    """CIE 1931 color matching functions [w 3]: per lobe its channel, height, center, and slopes to both sides."""
+    result = np.zeros((len(wavelength), 3))
+    for channel, height, center, left, right in _LOBES:
+        t = (wavelength - center) * np.where(wavelength < center, left, right)
+        result[:, channel] += height * np.exp(-(t**2) / 2)
+    return result
