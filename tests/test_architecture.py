@@ -18,15 +18,24 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "inverse", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere", "files"]
+ROOMS = ["__main__", "report", "inverse", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere", "files"]
 SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "reference"}
 
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.
 SIDEWAYS = {
     ("*", "dynamic", "lobe"),  # Sun's system is built on the lobes of its own section 4.1.
+    ("brdf", "measured", "models"),
+    ("brdf", "scattered", "measured"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),
     ("scene", "camera", "mesh"),
+    ("scene", "mesh", "mesh_file"),
+    ("sphere", "harmonics", "cubemap"),
+    ("sphere", "rotation", "harmonics"),
+    ("transport", "visibility", "blocks"),
+    ("transport", "interreflection", "blocks"),
+    ("transport", "interreflection", "harmonic"),
+    ("transport", "interreflection", "visibility"),
 }
 
 # Libraries that only some modules touch: everything that reads files, and the rays.

@@ -37,15 +37,30 @@ BATCH = 3
 JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
+    "report": "measures, and writes files",
     "files": "reads and writes files",
     "transport.visibility": "traces rays",
     "transport.blocks": "runs workers and writes files",
     "transport.separable.precompute": "traces rays",
     "transport.sparse.rms": "counts on the host, after precomputation",
+    "transport.interreflection": "traces rays",
+    "transport.harmonic.precompute": "traces rays",
+    "transport.harmonic.precompute_diffuse": "traces rays",
+    "transport.harmonic.check": "checks values",
     "relight.reference.radiance": "traces rays; its pure part is integrate",
+    "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
+    "brdf.measured.cell_angles": "a NumPy table of angles",
+    "brdf.measured.lower_cosine": "a NumPy table of cosines",
+    "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
+    "brdf.measured.require": "checks values",
+    "brdf.measured.load_merl": "reads a file",
+    "brdf.measured.load_npf": "reads a file",
+    "brdf.measured.load_lafortune": "reads a file",
+    "brdf.harmonic.tabulate": "checks values, and chooses the quadrature by them",
     "brdf.separable.factor": "checks values, and chooses the number of terms by them",
     "brdf.separable.factor_symmetric": "checks values",
     "scene.mesh": "loads, checks and builds meshes",
+    "scene.mesh_file": "reads files",
     "scene.builtin": "builds meshes and lights",
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",
@@ -53,6 +68,7 @@ HOST = {
     "scene.environment.resample": "NumPy in float64, where data enters",
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",
+    "sphere.harmonics.degree_of": "arithmetic on shapes",
     "sphere.haar.face_edge": "arithmetic on shapes",
 }
 
@@ -130,6 +146,16 @@ class Draw:
         position, frame = self.normal(vertices, 3), self.rotation(vertices)
         return transport.SparseTransport(index, value, position, frame, self.uniform(6 * size * size))
 
+    def harmonic(self):
+        """A BRDF in four harmonics."""
+        return brdf.HarmonicBrdf(self.normal(4, 3, 5, 5), (), self.uniform())
+
+    def matrix(self, vertices=3):
+        """Transfer of the same four harmonics."""
+        return transport.TransferMatrix(
+            self.normal(4, 4, 1, vertices), self.normal(vertices, 3), self.rotation(vertices)
+        )
+
     def seen(self, count, size=4):
         """Visibility in sixteenths."""
         return self.integer(17, count, 6 * size * size, dtype=jnp.uint8)
@@ -179,6 +205,7 @@ EXAMPLES = {
     "sphere.directions.normalize": example(lambda draw: call(draw.normal(5, 3))),
     "sphere.directions.tangent": example(lambda draw: call(draw.unit(5))),
     "sphere.directions.frame": example(lambda draw: call(draw.unit(5), draw.normal(5, 3))),
+    "sphere.directions.to_local": example(lambda draw: call(draw.rotation(2), draw.unit(5))),
     "sphere.cubemap.direction": example(nothing, size=3),
     "sphere.cubemap.point": example(nothing, size=3),
     "sphere.cubemap.solid_angle": example(nothing, size=3),
@@ -193,7 +220,25 @@ EXAMPLES = {
     "sphere.hemisphere.parabolic_direction": example(lambda draw: call(draw.uniform(5, 2))),
     "sphere.hemisphere.lookup": example(lambda draw: call(draw.normal(4, 4, 2), draw.uniform(5, 2))),
     "sphere.hemisphere.texel_direction": example(nothing, resolution=5),
+    "sphere.hemisphere.parabolic_texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.texel_area": example(nothing, resolution=5),
+    "sphere.harmonics.evaluate": example(lambda draw: call(draw.unit(5)), degree=4),
+    "sphere.harmonics.reconstruct": example(lambda draw: call(draw.normal(9, 3), draw.unit(5))),
+    "sphere.harmonics.project": example(lambda draw: call(draw.normal(6, 3, 3, 2)), degree=3),
+    "sphere.harmonics.convolve": example(lambda draw: call(draw.normal(9, 2), draw.normal(3))),
+    "sphere.harmonics.cosine": example(nothing, degree=5),
+    "sphere.harmonics.phong": example(lambda draw: call(10 * draw.uniform(4)), degree=5),
+    "sphere.harmonics.hann": example(nothing, degree=5),
+    "sphere.harmonics.lanczos": example(nothing, degree=5),
+    "sphere.harmonics.least_laplacian": example(lambda draw: call(draw.normal(9, 2), draw.uniform())),
+    "sphere.harmonics.disc": example(lambda draw: call(draw.unit(4), draw.uniform(4)), degree=4),
+    # Derivatives by a rotation are along rotations only; tests of the module's own compare those.
+    "sphere.rotation.rotate": example(lambda draw: call(draw.normal(9, 2), draw.rotation()), gradient=("coefficient",)),
+    "sphere.rotation.rotate_each": example(
+        lambda draw: call(draw.normal(9, 2), draw.rotation(4)), gradient=("coefficient",)
+    ),
+    "sphere.rotation.matrix": example(lambda draw: call(draw.rotation()), gradient=(), degree=2),
+    "sphere.rotation.low_matrix": example(lambda draw: call(draw.rotation(3)), degree=2),
     "sphere.haar.forward": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.area": example(nothing, size=4),
@@ -213,11 +258,64 @@ EXAMPLES = {
             brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5), draw.upper(5)
         )
     ),
+    "brdf.measured.HalfDifferenceTable": example(
+        lambda draw: call(
+            brdf.measured.HalfDifferenceTable(draw.uniform(5, 4, 6, 3), draw.uniform()), draw.upper(5), draw.upper(5)
+        )
+    ),
+    "brdf.measured.MicrofacetTable": example(
+        lambda draw: call(
+            brdf.measured.MicrofacetTable(*(draw.uniform(*shape) for shape in ((3,), (3,), (7, 3), (5, 3), (6, 3)))),
+            draw.upper(5),
+            draw.upper(5),
+        )
+    ),
+    "brdf.models.Phong": example(
+        lambda draw: call(brdf.Phong(draw.uniform(3), draw.uniform(1), 8.0), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.models.BlinnPhong": example(
+        lambda draw: call(brdf.BlinnPhong(draw.uniform(3), draw.uniform(1), 20.0), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.models.Ward": example(
+        lambda draw: call(brdf.Ward(draw.uniform(3), draw.uniform(1), 0.4, 0.7), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.models.WardDuer": example(
+        lambda draw: call(brdf.WardDuer(draw.uniform(3), draw.uniform(1), 0.4, 0.7), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.models.CookTorrance": example(
+        lambda draw: call(
+            brdf.CookTorrance(draw.uniform(3), draw.uniform(1), 0.5, draw.uniform(3)), draw.upper(5), draw.upper(5)
+        )
+    ),
+    "brdf.models.Lafortune": example(
+        lambda draw: call(
+            brdf.Lafortune(draw.uniform(3), *(sign * draw.uniform(2, 3) for sign in (-1, -1, 1)), [[5.0], [2.0]]),
+            draw.upper(5),
+            draw.upper(5),
+        )
+    ),
+    "brdf.cylinders.PoulinFournier": example(
+        lambda draw: call(
+            brdf.PoulinFournier(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)
+        )
+    ),
+    "brdf.cylinders.PoulinFournierGrooves": example(
+        lambda draw: call(
+            brdf.PoulinFournierGrooves(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)
+        )
+    ),
     "brdf.separable.SeparableBrdf": example(
         lambda draw: call(draw.separable(), draw.upper(5), draw.upper(5)),
     ),
     # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
     "brdf.separable.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
+    "brdf.harmonic.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
+    "brdf.harmonic.project": example(
+        lambda draw: call(brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5)),
+        degree=2,
+        rings=6,
+        sectors=8,
+    ),
     "image.raster.ray_direction": example(lambda draw: call(draw.camera())),
     "image.raster.view_axes": example(lambda draw: call(draw.camera())),
     # What is seen is constant for derivatives.
@@ -243,6 +341,9 @@ EXAMPLES = {
     "transport.separable.compress": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
+    # Frames have derivatives along rotations only; see sphere.rotation.
+    "transport.harmonic.transfer": example(lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2),
+    "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "transport.sparse.apply": example(lambda draw: call(draw.sparse(), draw.normal(96, 3))),
     "relight.reference.integrate": example(
@@ -255,6 +356,42 @@ EXAMPLES = {
             frame.T @ (3 * draw.upper()),
         )
     ),
+    "relight.harmonic.project": example(lambda draw: call(draw.light()), degree=2),
+    "relight.harmonic.radiance": example(
+        lambda draw: call(each := draw.matrix(), draw.harmonic(), draw.normal(4, 3), eye=draw.above(each)),
+        gradient=("brdf", "light", "eye"),
+    ),
+    "relight.harmonic.unshadowed_radiance": example(
+        lambda draw: call(draw.mesh(), draw.harmonic(), draw.normal(4, 3), eye=draw.camera().eye),
+        gradient=("brdf", "light", "eye"),
+    ),
+    "relight.harmonic.diffuse_radiance": example(
+        lambda draw: call(
+            transport.TransferVector(draw.normal(4, 1, 3), draw.normal(3, 3)), draw.uniform(3), draw.normal(4, 3)
+        ),
+        gradient=("albedo", "light"),
+    ),
+    "relight.harmonic.probe_light": example(
+        lambda draw: call(draw.normal(5, 3), draw.normal(2, 3), draw.normal(2, 4, 3))
+    ),
+    # Rotations have derivatives along rotations only; see sphere.rotation.
+    "relight.harmonic.local_light": example(
+        lambda draw: call(draw.rotation(5), draw.normal(4, 3)), gradient=("light",)
+    ),
+    "relight.harmonic.world_view": example(
+        lambda draw: call(draw.rotation(5), draw.normal(4, 3, 5)), gradient=("view",)
+    ),
+    "relight.harmonic.transferred_light": example(
+        lambda draw: call(draw.matrix(), draw.normal(4, 3)), gradient=("light",)
+    ),
+    "relight.harmonic.transferred_view": example(
+        lambda draw: call(draw.matrix(), draw.normal(4, 3, 3)), gradient=("view",)
+    ),
+    "relight.harmonic.view_coefficients": example(
+        lambda draw: call(draw.harmonic(), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
+        gradient=("brdf", "position", "eye"),
+    ),
+    "relight.harmonic.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
     "relight.separable.project": example(lambda draw: call(draw.light())),
     "relight.separable.choose_by_magnitude": example(lambda draw: call(draw.normal(24, 3)), threshold=9000),
     "relight.separable.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),

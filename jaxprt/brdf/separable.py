@@ -208,14 +208,11 @@ def _leading(matrix: Array, covariance: Array, terms: int | None, error: float |
 
 
 def _parabolic_texels(resolution: int) -> tuple[Array, Array]:
-    """Directions of the texels of a parabolic map, and their solid angles; outside the disk the rim's, and none."""
-    center = (jnp.arange(resolution) + 0.5) / resolution
-    xy = 2 * jnp.stack(jnp.meshgrid(center, center), -1).reshape(-1, 2) - 1
-    radius = jnp.linalg.norm(xy, axis=-1, keepdims=True)
-    inner = xy * jnp.minimum(1, (1 - 0.5 / resolution) / radius)
-    direction = hemisphere.parabolic_direction((inner + 1) / 2)
-    weight = jnp.where(radius < 1, 4 / (1 + radius**2) ** 2, 0.0) * (2 / resolution) ** 2
-    return direction, weight[:, 0]
+    """Directions of the texels of a parabolic map, and their solid angles; outside the disk none."""
+    center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
+    square = (center**2 + center[:, None] ** 2).ravel()
+    weight = jnp.where(square < 1, 4 / (1 + square) ** 2, 0.0) * (2 / resolution) ** 2
+    return hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3), weight
 
 
 def _tabulate(brdf: Callable, direction: Array) -> Array:

@@ -129,6 +129,18 @@ def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return jnp.concatenate([xy, jnp.sqrt(1 - jnp.sum(xy**2, -1, keepdims=True))], -1)
 
 
+def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
+    """Directions at which an n x n parabolic map is sampled: one per texel, those outside the disk drawn in.
+
+    Like `texel_direction`, for `parabolic_coordinates`.
+    """
+    center = (jnp.arange(resolution) + 0.5) / resolution
+    xy = 2 * jnp.stack(jnp.meshgrid(center, center), -1) - 1
+    radius = jnp.linalg.norm(xy, axis=-1, keepdims=True)
+    inner = xy * jnp.minimum(1, (1 - 0.5 / resolution) / jnp.maximum(radius, 0.5 / resolution))
+    return parabolic_direction((inner + 1) / 2)
+
+
 def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
 

@@ -40,8 +40,9 @@ def precompute(
         keep: Wavelet coefficients kept per vertex and term.
         size: Edge of the light's cubemap faces in texels, a power of two.
         occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, if not all; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
+        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
+        path: Folder that keeps finished blocks, made with its parents; a call that was stopped, or killed, goes on
+            from there.
         executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
             Process pools must not fork a process in which JAX runs: use the "spawn" context.
         progress: Whether to show a progress bar.
@@ -50,13 +51,16 @@ def precompute(
         The transport of every vertex.
 
     Raises:
-        ValueError: A size that is no power of two, more coefficients to keep than there are, positions or normals
-            that are not finite, or a store at `path` made from something else.
+        TypeError: The BRDF is not factored.
+        ValueError: A size that is no power of two, more coefficients to keep than there are, positions, normals or
+            tangents that are not finite, no such vertices, or a store at `path` made from something else.
         BlockingIOError: The store is being written by another process.
         RuntimeError: A worker of the executor died.
 
     Reference: Wang, Tran, Luebke 2004, section 3.3.
     """
+    if not isinstance(brdf, SeparableBrdf):
+        raise TypeError(f"brdf must be factored, by jaxprt.brdf.separable.factor, got {type(brdf).__name__}")
     if size < 1 or size & (size - 1):
         raise ValueError(f"size must be a power of two, got {size}")
     if not 1 <= keep <= 6 * size * size:

@@ -189,12 +189,12 @@ class VisibilityJob(blocks.Job):
     @classmethod
     def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
         """A job for some vertices of a mesh, all of them if None, which shadows itself if no occluder is named."""
-        occluder = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
+        shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
         vertex = chosen(mesh, vertex)
-        start = start_points(mesh, Occluder(occluder))[vertex]
+        start = start_points(mesh, Occluder(shadowing))[vertex]
         frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
-        key = blocks.fingerprint(start, frame, occluder.position, occluder.face)
-        return cls(start=start, frame=frame, occluder=occluder, size=size, mesh_key=key, **more)
+        key = blocks.fingerprint(start, frame, shadowing.position, shadowing.face)
+        return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, **more)
 
     @cached_property
     def rays(self) -> Occluder:
@@ -240,10 +240,10 @@ def _tables(size: int) -> _Tables:
 
 
 def _check(mesh: Mesh, name: str) -> None:
-    """Refuses what Embree would hang or lie on."""
+    """Refuses what Embree would hang or lie on, and vectors that make no frame."""
     if not mesh.face.size:
         raise ValueError(f"the {name} must have faces, got none")
-    for field in ("position", "normal"):
+    for field in ("position", "normal", "tangent"):
         broken = np.flatnonzero(~np.isfinite(np.asarray(getattr(mesh, field))).all(1))
         if broken.size:
             value = np.asarray(getattr(mesh, field))[broken[0]]

@@ -1,0 +1,222 @@
+"""Relighting by spherical harmonics: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002).
+
+The published four steps are `local_light` (rotate the light to each vertex's frame), the view turned to that frame
+and the table looked up there (`view_coefficients`), and their dot product (`combine`). With fixed light a caller keeps
+the first, or `transferred_light`; with fixed view the BRDF's coefficients turned to the world, `world_view` or
+`transferred_view`, which then meet the light's coefficients alone. `radiance` and `unshadowed_radiance` do all of it.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt.brdf.harmonic import HarmonicBrdf
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import directions, harmonics, rotation
+from jaxprt.transport.harmonic import TransferMatrix, TransferVector
+
+
+def project(light: Environment, *, degree: int) -> Float[Array, "lm c"]:
+    """SH coefficients of an environment, in its radiance times sr^1/2."""
+    return harmonics.project(light.radiance, degree=degree)
+
+
+@jax.jit
+def radiance(
+    transport: TransferMatrix,
+    brdf: HarmonicBrdf,
+    light: Float[Array, "lm c *w"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "v _"]:
+    """Radiance of every vertex towards the eye, with shadows.
+
+    Differentiable in all arguments.
+
+    Args:
+        transport: Transfer matrices.
+        brdf: The BRDF's table.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Per vertex, the parameters of a BRDF that varies.
+        eye: Position of the viewer.
+
+    Returns:
+        Linear radiance; negative where the harmonics ring.
+
+    Raises:
+        ValueError: Light, transport and table differ in degree.
+
+    Reference: Kautz, Sloan, Snyder 2002, sections 4 and 5.
+    """
+    view = view_coefficients(brdf, transport.position, transport.frame, *parameter, eye=eye)
+    return combine(transferred_light(transport, light), view)
+
+
+@jax.jit
+def unshadowed_radiance(
+    mesh: Mesh,
+    brdf: HarmonicBrdf,
+    light: Float[Array, "lm c *w"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "v _"]:
+    """Radiance of every vertex towards the eye without shadows: nothing is precomputed but the BRDF's table.
+
+    Arguments as of `radiance`.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 4.
+    """
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    return combine(local_light(frame, light), view_coefficients(brdf, mesh.position, frame, *parameter, eye=eye))
+
+
+@jax.jit
+def diffuse_radiance(
+    transport: TransferVector, albedo: Float[Array, "..."], light: Float[Array, "lm c *w"]
+) -> Float[Array, "v _"]:
+    """Radiance of ideal diffuse vertices, the same for all views.
+
+    Args:
+        transport: Transfer vectors.
+        albedo: One for all or one for each vertex.
+        light: As of `radiance`.
+
+    Raises:
+        ValueError: Light and transport differ in degree.
+    """
+    return combine(light, transport.vector) * albedo
+
+
+@jax.jit
+def probe_light(
+    position: Float[Array, "v 3"], probe: Float[Array, "p 3"], coefficient: Float[Array, "p lm c"]
+) -> Float[Array, "lm c v"]:
+    """Light that varies over an object: coefficients at some points, interpolated to the vertices.
+
+    Shepard's weights, by the inverse fourth power of the distance: smooth, exact at the probes, and each vertex's
+    light is a mean of theirs. Where a vertex coincides with a probe derivatives by position are zero.
+
+    Args:
+        position: Where light is wanted.
+        probe: Where it is known.
+        coefficient: SH coefficients of the light around each probe.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting); Shepard 1968.
+    """
+    square = jnp.sum((position[:, None] - probe) ** 2, -1)
+    nearest = jnp.min(square, -1, keepdims=True)
+    ratio = jnp.where(nearest > 0, nearest, 1) / jnp.where(nearest > 0, square, 1)
+    weight = jnp.where(nearest > 0, ratio**2, jnp.where(square > 0, 0, 1))
+    weight = weight / jnp.sum(weight, -1, keepdims=True)
+    return jnp.einsum("vp,plc->lcv", weight, coefficient)
+
+
+@jax.jit
+def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
+    """Light turned to the frame of every vertex: the light side without transfer.
+
+    Args:
+        frame: Rows are tangent, bitangent, normal.
+        light: Coefficients in the world: one set, or one for each vertex.
+    """
+    return rotation.rotate_each(light, frame)
+
+
+@jax.jit
+def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
+    """Light that arrives at every vertex in its own frame: the light side with transfer.
+
+    Args:
+        transport: Transfer matrices.
+        light: Coefficients in the world: one set, or one for each vertex.
+
+    Raises:
+        ValueError: Light and transport differ in degree.
+    """
+    terms, _, colors, count = transport.matrix.shape
+    _check_degree(light.shape[0], terms, "the light", "the transport")
+    if light.ndim == 3:
+        part = [
+            sum(transport.matrix[i, :, _color(c, colors)] * light[i, c] for i in range(terms)) for c in _colors(light)
+        ]
+        return jnp.stack([jnp.asarray(each) for each in part], 1)
+    if colors == 1:
+        arriving = (light.T @ transport.matrix.reshape(terms, -1)).reshape(-1, terms, count)
+        return arriving.swapaxes(0, 1)
+    part = [light[:, c] @ transport.matrix[:, :, c].reshape(terms, -1) for c in _colors(light)]
+    return jnp.stack(part).reshape(-1, terms, count).swapaxes(0, 1)
+
+
+@jax.jit
+def view_coefficients(
+    brdf: HarmonicBrdf,
+    position: Float[Array, "v 3"],
+    frame: Float[Array, "v 3 3"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "lm c v"]:
+    """The BRDF's coefficients for every vertex's view, in its frame: the view side; zero below the horizon."""
+    offset = directions.normalize(eye - position)
+    wo = jnp.stack([sum(frame[:, i, j] * offset[:, j] for j in range(3)) for i in range(3)], -1)
+    return brdf.coefficients(wo, *parameter)
+
+
+@jax.jit
+def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Float[Array, "lm c v"]:
+    """`view_coefficients` turned to the world, so that all vertices meet the same light: for a fixed view."""
+    return rotation.rotate_each(view, frame.swapaxes(1, 2))
+
+
+@jax.jit
+def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) -> Float[Array, "lm _ v"]:
+    """`view_coefficients` through the transfer, to the distant light in the world: for a fixed view with shadows.
+
+    Raises:
+        ValueError: The table and the transport differ in degree.
+    """
+    terms, _, colors, _ = transport.matrix.shape
+    _check_degree(view.shape[0], terms, "the BRDF", "the transport")
+    number = range(max(colors, view.shape[1]))
+    part = [
+        sum(transport.matrix[:, o, _color(c, colors)] * view[o, _color(c, view.shape[1])] for o in range(terms))
+        for c in number
+    ]
+    return jnp.stack(part, 1)
+
+
+@jax.jit
+def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Float[Array, "v _"]:
+    """Dot product of light and BRDF coefficients: radiance.
+
+    Args:
+        light: Coefficients of the light, one set or one for each vertex, in the frame that `view` is in.
+        view: Coefficients of the BRDF, or transfer vectors.
+
+    Raises:
+        ValueError: The two differ in degree.
+
+    Reference: Kautz, Sloan, Snyder 2002, equation 1.
+    """
+    _check_degree(light.shape[0], view.shape[0], "the light", "the BRDF or transport")
+    colors = max(light.shape[1], view.shape[1])
+    part = [
+        sum(light[i, _color(c, light.shape[1])] * view[i, _color(c, view.shape[1])] for i in range(len(light)))
+        for c in range(colors)
+    ]
+    return jnp.stack(part, -1)
+
+
+def _colors(light: Array) -> range:
+    return range(light.shape[1])
+
+
+def _color(number: int, colors: int) -> int:
+    """Index of a color in an axis that is gray or colored."""
+    return number if colors > 1 else 0
+
+
+def _check_degree(mine: int, other: int, name: str, other_name: str) -> None:
+    mine, other = harmonics.degree_of(mine), harmonics.degree_of(other)
+    if mine != other:
+        raise ValueError(f"{name} must have the degree of {other_name}, {other}, got {mine}")

@@ -1,0 +1,339 @@
+"""Real spherical harmonics (SH): evaluation, projection of cubemaps, zonal kernels, windows, and disks of light.
+
+The basis is orthonormal, without the Condon-Shortley phase, its polar axis z. Function (l, m) has index l(l+1)+m,
+so that all up to a degree, the largest l, are (degree+1)^2. The first nine, of a unit direction (x, y, z):
+
+    index   l   m   function
+      0     0   0   sqrt(1 / 4 pi)
+      1     1  -1   sqrt(3 / 4 pi) y
+      2     1   0   sqrt(3 / 4 pi) z
+      3     1   1   sqrt(3 / 4 pi) x
+      4     2  -2   sqrt(15 / 4 pi) x y
+      5     2  -1   sqrt(15 / 4 pi) y z
+      6     2   0   sqrt(5 / 16 pi) (3 z^2 - 1)
+      7     2   1   sqrt(15 / 4 pi) x z
+      8     2   2   sqrt(15 / 16 pi) (x^2 - y^2)
+
+A zonal kernel, a function of the angle to an axis, is given by one factor per band l: what its convolution
+multiplies the band with, which is 2 pi times the integral of k(t) P_l(t) over the cosine t. Windows against ringing
+are such factors too; ``convolve`` applies either.
+"""
+
+import functools
+import math
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.sphere import cubemap
+
+_NEWTON_STEPS = 12  # Each at least doubles the digits; the worst spectrum of 51 bands has all after eight.
+
+
+def degree_of(count: int) -> int:
+    """The largest l of a number of coefficients.
+
+    Args:
+        count: How many coefficients there are.
+
+    Returns:
+        The degree, of which there are (degree+1)^2.
+
+    Raises:
+        ValueError: The count is not the square of a positive number.
+    """
+    root = math.isqrt(max(count, 0))
+    if root < 1 or root**2 != count:
+        raise ValueError(f"the number of SH coefficients must be a square number, got {count}")
+    return root - 1
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def evaluate(direction: Float[Array, "*b 3"], *, degree: int) -> Float[Array, "*b lm"]:
+    """The basis functions in some directions.
+
+    By recurrences in the Cartesian components, without trigonometry. The result is a polynomial in them, which is
+    what is differentiated: the gradient is finite everywhere, the poles included, and its tangential part is the
+    gradient on the sphere. Off the sphere the polynomial has no further meaning.
+
+    Args:
+        direction: Unit directions.
+        degree: The largest l.
+
+    Returns:
+        Values in l(l+1)+m order, (degree+1)^2 for each direction.
+
+    Raises:
+        ValueError: The degree is negative.
+    """
+    return jnp.moveaxis(_basis(jnp, direction, degree), 0, -1)
+
+
+@jax.jit
+def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 3"]) -> Float[Array, "..."]:
+    """The function that the coefficients stand for, in some directions.
+
+    Args:
+        coefficient: Coefficients in l(l+1)+m order.
+        direction: Unit directions; see ``evaluate`` on gradients.
+
+    Returns:
+        Values [*b, *c] in the coefficients' units.
+
+    Raises:
+        ValueError: The number of rows is not a square.
+    """
+    basis = evaluate(direction, degree=degree_of(coefficient.shape[0]))
+    return jnp.tensordot(basis, coefficient, axes=1, precision="highest")
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def project(radiance: Float[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
+    """SH coefficients of a cubemap: the integral of basis times radiance over the sphere.
+
+    Each texel counts as constant, and the basis is integrated over its solid angle by Gauss points, as many as make
+    the quadrature exact to about 1e-12; so the result is that of the piecewise constant function. Mirror images in
+    the coordinate planes are added and subtracted first, which leaves an eighth of the products, and of the table.
+
+    Args:
+        radiance: A cubemap with any trailing axes.
+        degree: The largest l.
+
+    Returns:
+        Coefficients in the radiance's units times sr^1/2.
+
+    Raises:
+        ValueError: The degree is negative, or the edge is 0.
+    """
+    size, channel = radiance.shape[1], radiance.shape[3:]
+    index, place, table = _projection(size, degree)
+    folded = radiance.reshape(6 * size * size, -1)[index]
+    for axis in range(3):
+        positive, negative = jnp.split(folded, 2, axis)
+        folded = jnp.concatenate([positive + negative, positive - negative], axis)
+    folded = folded.reshape(8, -1, folded.shape[-1])
+    part = [
+        jnp.matmul(jnp.asarray(table[parity], radiance.dtype), folded[parity], precision="highest")
+        for parity in range(8)
+    ]
+    return jnp.concatenate(part)[place].reshape(-1, *channel)
+
+
+def _basis(xp: ModuleType, direction: Any, degree: int) -> Any:
+    """Basis functions [lm, *b] by NumPy or JAX.
+
+    sin(theta)^m cos(m phi) and sin(theta)^m sin(m phi) are the real and imaginary parts of (x + iy)^m; what remains
+    is a polynomial in z with a recurrence over l, which is stable upwards. One band, all m at once, in each step.
+    """
+    if degree < 0:
+        raise ValueError(f"degree must be at least 0, got {degree}")
+    x, y, z = (direction[..., i] for i in range(3))
+    real, imaginary = [xp.ones_like(x)], [xp.zeros_like(x)]
+    for _ in range(degree):
+        a, b = real[-1], imaginary[-1]
+        real.append(x * a - y * b)
+        imaginary.append(x * b + y * a)
+    azimuth = xp.stack(imaginary[:0:-1] + real)
+
+    def constant(value):
+        return xp.asarray(value, direction.dtype).reshape(-1, *[1] * x.ndim)
+
+    band, diagonal, past, now = [], math.sqrt(1 / (4 * math.pi)), None, None
+    for l in range(degree + 1):
+        m = np.arange(l)
+        diagonal *= math.sqrt((2 * l + 1) / (2 * l if l > 1 else 1))
+        last = xp.broadcast_to(constant(diagonal), (1, *x.shape))
+        if l == 0:
+            following = last
+        else:
+            scale = np.sqrt((4 * l**2 - 1) / (l**2 - m**2))
+            following = constant(scale) * z * now
+            if l > 1:
+                back = (scale * np.sqrt(((l - 1) ** 2 - m**2) / (4 * (l - 1) ** 2 - 1)))[:-1]
+                less = following[:-1] - constant(back) * past
+                following = xp.concatenate([less, following[-1:]])
+            following = xp.concatenate([following, last])
+        past, now = now, following
+        both_signs = xp.concatenate([now[:0:-1], now])
+        band.append(both_signs * azimuth[degree - l : degree + l + 1])
+    return xp.concatenate(band)
+
+
+@functools.lru_cache(maxsize=8)
+def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Tables for ``project``.
+
+    Returns:
+        For the eight octants [2, 2, 2], signs + and - of x, y and z, the texels that meet them; the place of each
+        coefficient among those sorted by parity; and for each parity, even or odd in x, y and z, the integral of
+        the basis over the part of each texel in the octant +++.
+    """
+    with jax.ensure_compile_time_eval():
+        point = np.asarray(cubemap.point(size=size), np.float64).reshape(-1, 3)
+    edge = np.unique(np.clip(2 * np.arange(size + 1) / size - 1, 0, None))
+    low, high = edge[:-1], edge[1:]
+    # Where the size is odd, the middle texel lies half in the octant, and its center on the border.
+    middle = (2 * np.arange(size) + 1) / size - 1
+    middle = np.maximum(middle[-len(low) :], 0)
+    octant = _three_faces(*np.meshgrid(middle, middle, indexing="ij"))
+
+    def key(place):  # Twice the distance from the corner of the cube, in texels: whole numbers.
+        whole = np.rint((place + 1) * size).astype(np.int64)
+        return whole @ (2 * size + 1) ** np.arange(3)
+
+    order = np.argsort(key(point))
+    sign = np.stack(np.meshgrid([1, -1], [1, -1], [1, -1], indexing="ij"), axis=-1)
+    index = order[np.searchsorted(key(point)[order], key(sign[..., None, :] * octant))]
+
+    # The phase of the highest harmonic over a texel sets the points: 1e-12 or better for all sizes and degrees.
+    count = 4 + math.ceil(3 * (degree + 2) / size)
+    node, weight = np.polynomial.legendre.leggauss(count)
+    table = np.zeros(((degree + 1) ** 2, len(octant)))
+    for (u, wu), (v, wv) in ((a, b) for a in zip(node, weight, strict=True) for b in zip(node, weight, strict=True)):
+        s, t = (low + high + offset * (high - low) for offset in (u, v))
+        place = _three_faces(*np.meshgrid(s / 2, t / 2, indexing="ij"))
+        length = np.linalg.norm(place, axis=-1)
+        area = np.tile(np.outer(high - low, high - low).ravel() / 4, 3)
+        table += wu * wv * area / length**3 * _basis(np, place / length[:, None], degree)
+
+    l = _band(degree)
+    m = np.arange(len(l)) - l * (l + 1)
+    parity = 4 * ((np.abs(m) - (m < 0)) % 2) + 2 * (m < 0) + (l - np.abs(m)) % 2
+    by_parity = np.argsort(parity, kind="stable")
+    place = np.argsort(by_parity)
+    return index.astype(np.int32), place.astype(np.int32), [table[parity == which] for which in range(8)]
+
+
+def _three_faces(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Points (1, s, t), (t, 1, s) and (s, t, 1), one after the other."""
+    local = np.stack([np.ones_like(s), s, t], axis=-1).reshape(-1, 3)
+    return np.concatenate([np.roll(local, turn, axis=-1) for turn in range(3)])
+
+
+@jax.jit
+def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> Float[Array, "lm *c"]:
+    """Multiplies every band by the factor of a zonal kernel, or of a window.
+
+    Args:
+        coefficient: Coefficients in l(l+1)+m order.
+        factor: One factor for each band, from `cosine`, `phong`, `hann`, `lanczos` or `least_laplacian`.
+
+    Raises:
+        ValueError: The number of rows is not a square, or the factors are not of as many bands.
+
+    Reference: the Funk-Hecke theorem; Ramamoorthi and Hanrahan 2001.
+    """
+    degree = degree_of(coefficient.shape[0])
+    if factor.shape[0] != degree + 1:
+        raise ValueError(f"there must be a factor for each of the {degree + 1} bands, got {factor.shape[0]}")
+    rows = factor[jnp.asarray(_band(degree))]
+    return coefficient * rows.reshape(-1, *(1,) * (coefficient.ndim - 1))
+
+
+def cosine(*, degree: int) -> Float[Array, " l"]:
+    """Factors of the clamped cosine max(0, cos): pi, 2 pi / 3, pi / 4, 0, -pi / 24, ...
+
+    Reference: Ramamoorthi and Hanrahan 2001, equation 8.
+    """
+    factor = np.zeros(degree + 1)
+    for l in range(degree + 1):
+        if l == 1:
+            factor[l] = 2 * np.pi / 3
+        elif l % 2 == 0:
+            ratio = math.comb(l, l // 2) / 2**l
+            factor[l] = 2 * np.pi * (-1) ** (l // 2 + 1) / ((l + 2) * (l - 1)) * ratio
+    return jnp.asarray(factor, jnp.result_type(float))
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def phong(exponent: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b l"]:
+    """Factors of the Phong lobe (n + 1) / 2 pi max(0, cos)^n, whose integral is one.
+
+    Args:
+        exponent: n, any number from 0.
+        degree: The largest l.
+
+    Reference: the integral of t^n P_l(t) over [0, 1] falls by (n - l + 2) / (n + l + 1) from l - 2 to l.
+    """
+    factor = [jnp.ones_like(exponent), (exponent + 1) / (exponent + 2)]
+    for l in range(2, degree + 1):
+        factor.append(factor[l - 2] * (exponent - l + 2) / (exponent + l + 1))
+    return jnp.stack(factor[: degree + 1], -1)
+
+
+def hann(*, degree: int) -> Float[Array, " l"]:
+    """Hann's window, (1 + cos(pi l / (degree + 1))) / 2."""
+    return jnp.asarray((1 + np.cos(np.pi * np.arange(degree + 1) / (degree + 1))) / 2, jnp.result_type(float))
+
+
+def lanczos(*, degree: int) -> Float[Array, " l"]:
+    """Lanczos's window, sinc(l / (degree + 1)): the mildest of the three."""
+    return jnp.asarray(np.sinc(np.arange(degree + 1) / (degree + 1)), jnp.result_type(float))
+
+
+@jax.jit
+def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
+    """The window that rings least for what it changes: 1 / (1 + lambda l^2 (l+1)^2).
+
+    It minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere; lambda
+    is such that the squared Laplacian, summed over channels, falls to a share of what it was.
+
+    Args:
+        coefficient: What will be windowed.
+        share: Of its squared Laplacian, above 0 and up to 1, that may remain.
+
+    Returns:
+        One factor for each band, for `convolve`; ones where there is no Laplacian to reduce.
+
+    Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
+    """
+    degree = degree_of(coefficient.shape[0])
+    band = _band(degree)
+    energy = jnp.sum(coefficient.reshape(len(band), -1) ** 2, -1)
+    weight = jnp.asarray((np.arange(degree + 1) * np.arange(1, degree + 2)) ** 2, coefficient.dtype)
+    spectrum = jax.ops.segment_sum(energy, jnp.asarray(band), degree + 1) * weight
+    total = jnp.sum(spectrum)
+    spectrum = spectrum / jnp.where(total > 0, total, 1)
+
+    def step(strength, _):
+        # Newton's method on a convex falling function: from 0 it climbs to the root and never passes it.
+        factor = 1 / (1 + strength * weight)
+        excess = jnp.sum(spectrum * factor**2) - share
+        slope = -2 * jnp.sum(spectrum * factor**3 * weight)
+        return strength - jnp.where(slope < 0, excess / jnp.where(slope < 0, slope, 1), 0), None
+
+    strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
+    return 1 / (1 + jnp.maximum(strength, 0) * weight)
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def disc(direction: Float[Array, "*b 3"], angle: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b lm"]:
+    """Coefficients of circular lights of radiance one.
+
+    In closed form, 2 pi sin^2(a) P_l'(cos a) / (l (l + 1)) times the basis in the light's direction; accurate for
+    lights as small as the sun and smaller.
+
+    Args:
+        direction: Unit directions of the lights' centers.
+        angle: Their angular radii a in radians, from 0 to pi.
+        degree: The largest l.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 3 ("circular light sources"); Legendre's differential equation.
+    """
+    height = jnp.cos(angle)
+    value, slope = [jnp.ones_like(height), height], [jnp.zeros_like(height), jnp.ones_like(height)]
+    factor = [4 * jnp.pi * jnp.sin(angle / 2) ** 2]
+    for l in range(1, degree + 1):
+        factor.append(2 * jnp.pi / (l * (l + 1)) * jnp.sin(angle) ** 2 * slope[l])
+        value.append(((2 * l + 1) * height * value[l] - l * value[l - 1]) / (l + 1))
+        slope.append(slope[l - 1] + (2 * l + 1) * value[l])
+    return evaluate(direction, degree=degree) * jnp.stack(factor, -1)[..., jnp.asarray(_band(degree))]
+
+
+def _band(degree: int) -> np.ndarray:
+    """Band of each coefficient."""
+    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)

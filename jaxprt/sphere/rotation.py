@@ -1,0 +1,265 @@
+"""Rotation of functions on the sphere, given by their SH coefficients.
+
+A rotation R takes f to s -> f(R^T s). Its matrix D(R) on the coefficients is orthogonal and has one block per band.
+R is split into turns about z, y and z, and the turn about y into one about z between fixed quarter turns about x;
+turns about z mix pairs of coefficients, and the quarter turns are sparse constants. Cosines and sines of the angles
+come from the matrix and those of their multiples from a recurrence: there is no trigonometry.
+
+Derivatives with respect to R know only turns: moving R by dR counts as the turn by w, where w x is the antisymmetric
+part of dR R^T, and D changes by (w_x L_x + w_y L_y + w_z L_z) D with the three generators, whose bands have entries
+beside the diagonals only. This is the derivative of the function that maps any matrix to the rotation nearest to it
+(its polar factor) and then rotates; the gradient lies in the tangent space of the rotations at R. It holds at every
+rotation, the identity, half turns and fixed poles included, and so do second derivatives along turns.
+
+Matrices are taken to be proper rotations to rounding; for others the result has no meaning.
+
+Reference: Kautz, Sloan, Snyder 2002, appendix.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from jaxprt.sphere import harmonics
+
+_UNROLLED = 6  # Up to this degree every sum is written out, which is fast, and compiles within two seconds.
+
+
+@jax.jit
+def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) -> Float[Array, "lm *c"]:
+    """Rotates a spherical function given by its SH coefficients.
+
+    The result represents s -> f(R^T s), so rotate(evaluate(s), R) == evaluate(R s). Differentiable in both arguments
+    at every rotation; the module says what the derivative with respect to a matrix means.
+
+    Args:
+        coefficient: Coefficients in l(l+1)+m order; (degree+1)^2 rows.
+        rotation: A proper rotation matrix.
+
+    Returns:
+        Coefficients in the same units.
+
+    Raises:
+        ValueError: The number of rows is not a square.
+
+    Reference: Kautz, Sloan, Snyder 2002, appendix.
+    """
+    return _rotated(coefficient, rotation)
+
+
+@jax.jit
+def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 3 3"]) -> Float[Array, "lm c w"]:
+    """Rotates by many rotations at once, in the layout that is fastest: vertices last.
+
+    Args:
+        coefficient: Coefficients of one function for all, [lm, c], or of one function for each rotation, [lm, c, w].
+        rotation: Proper rotation matrices.
+
+    Returns:
+        Rotated coefficients.
+
+    Raises:
+        ValueError: The number of rows is not a square, or the counts of functions and rotations differ.
+    """
+    count = rotation.shape[0]
+    if coefficient.ndim == 2:
+        coefficient = coefficient[..., None]
+    elif coefficient.shape[2:] != (count,):
+        raise ValueError(f"the last axis must count the {count} rotations, got the shape {coefficient.shape}")
+    return _rotated(coefficient, jnp.moveaxis(rotation, 0, -1))
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def matrix(rotation: Float[Array, "3 3"], *, degree: int) -> Float[Array, "lm lm"]:
+    """D(R) itself, with Y(R s) = D(R) Y(s): orthogonal, one block per band."""
+    return rotate(jnp.eye((degree + 1) ** 2, dtype=rotation.dtype), rotation)
+
+
+@functools.partial(jax.jit, static_argnames="degree")
+def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array, "*b lm lm"]:
+    """D(R) for degrees up to 2, as polynomials in the entries of R.
+
+    Band 1 is R with its axes in the order y, z, x. A function of band 2 is s^T Q s with Q symmetric and without
+    trace, so that its block is made of products of two entries. Differentiable as the polynomial that it is.
+
+    Args:
+        rotation: Proper rotation matrices.
+        degree: The largest l, 0 to 2.
+
+    Raises:
+        ValueError: The degree is above 2.
+
+    Reference: Kautz, Sloan, Snyder 2002, appendix, first method.
+    """
+    if not 0 <= degree <= 2:
+        raise ValueError(f"degree must be 0, 1 or 2, got {degree}; for more use matrix")
+    result = jnp.zeros((*rotation.shape[:-2], 9, 9), rotation.dtype).at[..., 0, 0].set(1)
+    axis = np.array([1, 2, 0])
+    result = result.at[..., 1:4, 1:4].set(rotation[..., axis[:, None], axis])
+    form = jnp.asarray(_QUADRATIC, rotation.dtype)
+    turned = jnp.einsum("...ji,mjk,...kl->...mil", rotation, form, rotation, precision="highest")
+    result = result.at[..., 4:, 4:].set(jnp.einsum("...mil,nil->...mn", turned, form, precision="highest"))
+    return result[..., : (degree + 1) ** 2, : (degree + 1) ** 2]
+
+
+# Band 2 as quadratic forms, scaled to unit norm: x y, y z, 3 z^2 - 1, x z, x^2 - y^2.
+_QUADRATIC = np.zeros((5, 3, 3))
+for _row, (_i, _j) in ((0, (0, 1)), (1, (1, 2)), (3, (0, 2))):
+    _QUADRATIC[_row, _i, _j] = _QUADRATIC[_row, _j, _i] = math.sqrt(1 / 2)
+_QUADRATIC[2] = np.diag([-1, -1, 2]) / math.sqrt(6)
+_QUADRATIC[4] = np.diag([1, -1, 0]) / math.sqrt(2)
+
+
+@functools.partial(jax.custom_jvp)
+def _rotated(coefficient: Array, rotation: Array) -> Array:
+    """Coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the end of *c."""
+    degree = harmonics.degree_of(coefficient.shape[0])
+    shape = jnp.broadcast_shapes(coefficient.shape[1:], rotation.shape[2:])
+    alpha, beta, gamma = (_multiples(*angle, degree) for angle in _euler_angles(rotation))
+    result = []
+    for l in range(degree + 1):
+        band = coefficient[l * l : (l + 1) ** 2]
+        turn = _turn_rows if degree <= _UNROLLED else _turn_band
+        result.extend(turn(l, band, alpha, beta, gamma))
+    return jnp.stack([jnp.broadcast_to(row, shape) for row in result])
+
+
+@functools.partial(_rotated.defjvp, symbolic_zeros=True)
+def _rotated_jvp(primal, tangent):
+    coefficient, rotation = primal
+    result = _rotated(coefficient, rotation)
+    change = jnp.zeros_like(result)
+    if not isinstance(tangent[0], SymbolicZero):
+        change = _rotated(tangent[0], rotation)
+    if not isinstance(tangent[1], SymbolicZero):
+        relative = jnp.einsum("ij...,kj...->ik...", tangent[1], rotation, precision="highest")
+        turn = [(relative[i, j] - relative[j, i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))]
+        change = change + _generate(result, turn)
+    return result, change
+
+
+def _turn_rows(l: int, band: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+    """One band, every sum written out over its few terms."""
+    quarter = _quarter_turn(l)
+
+    def about_z(row, angle):
+        cosine, sine = angle
+        pair = [(row[l + m] * cosine[m], row[l - m] * sine[m]) for m in range(1, l + 1)]
+        other = [(row[l - m] * cosine[m], row[l + m] * sine[m]) for m in range(1, l + 1)]
+        return [a + b for a, b in other[::-1]] + [row[l]] + [a - b for a, b in pair]
+
+    def fixed(row, matrix):
+        return [sum(float(entry) * row[j] for j, entry in enumerate(line) if entry) for line in matrix]
+
+    row = fixed(about_z(list(band), gamma), quarter.T)
+    return about_z(fixed(about_z(row, beta), quarter), alpha)
+
+
+def _turn_band(l: int, band: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+    """One band by matrix products."""
+    quarter = jnp.asarray(_quarter_turn(l), band.dtype)
+
+    def about_z(row, angle):
+        cosine, sine = (jnp.stack(part[: l + 1]) for part in angle)
+        cosine = jnp.concatenate([cosine[:0:-1], cosine])
+        sine = jnp.concatenate([sine[:0:-1], -sine])
+        fill = (1,) * (row.ndim - cosine.ndim)
+        cosine, sine = (part.reshape(2 * l + 1, *fill, *part.shape[1:]) for part in (cosine, sine))
+        return row * cosine + row[::-1] * sine
+
+    row = jnp.tensordot(quarter.T, about_z(band, gamma), axes=1, precision="highest")
+    row = jnp.tensordot(quarter, about_z(row, beta), axes=1, precision="highest")
+    return list(about_z(row, alpha))
+
+
+def _generate(coefficient: Array, turn: list[Array]) -> Array:
+    """(w_x L_x + w_y L_y + w_z L_z) on coefficients [lm, *c], for a turn w of three arrays [*v]."""
+    degree = harmonics.degree_of(coefficient.shape[0])
+    # Broadcast once, so that the transpose sums over the channels once.
+    x, y, z = (jnp.broadcast_to(part, coefficient.shape[1:]) for part in turn)
+    result = []
+    for l in range(degree + 1):
+        row = coefficient[l * l : (l + 1) ** 2]
+        for m in range(-l, l + 1):
+            part = jnp.zeros_like(row[0])
+            if m:
+                part = part - m * z * row[l - m]
+            for other, by_x, by_y in _ladder(l, m):
+                part = part + by_x * x * row[l - other] + by_y * y * row[l + other]
+            result.append(part)
+    return jnp.stack(result)
+
+
+def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
+    """The entries of L_x and L_y in row m: L_y has them in columns m' beside m, L_x in columns -m'.
+
+    Returns:
+        For each such m' its number, the entry of L_x in column -m', and that of L_y in column m'.
+    """
+    entry = []
+    for other in (m - 1, m + 1):
+        low, high = sorted((abs(m), abs(other)))
+        size = math.sqrt((l - low) * (l + high)) / 2 * (math.sqrt(2) if low == 0 else 1)
+        by_x = 0.0 if (m, other) in ((0, -1), (1, 0)) else math.copysign(size, m)
+        by_y = 0.0 if {m, other} == {0, -1} else math.copysign(size, abs(m) - abs(other))
+        if high <= l:
+            entry.append((other, by_x, by_y))
+    return entry
+
+
+def _euler_angles(rotation: Array) -> list[tuple[Array, Array]]:
+    """Cosine and sine of alpha, beta, gamma with R = R_z(alpha) R_y(beta) R_z(gamma).
+
+    With the poles fixed or exchanged any alpha will do. Near there alpha is taken from tiny entries and is inaccurate,
+    which does no harm since gamma is what then remains to be turned.
+    """
+    alpha = _unit(rotation[0, 2], rotation[1, 2])
+    cosine, sine = alpha
+    beta = _unit(rotation[2, 2], cosine * rotation[0, 2] + sine * rotation[1, 2])
+    gamma = _unit(
+        cosine * rotation[1, 1] - sine * rotation[0, 1],
+        cosine * rotation[1, 0] - sine * rotation[0, 0],
+    )
+    return [alpha, beta, gamma]
+
+
+def _unit(x: Array, y: Array) -> tuple[Array, Array]:
+    """Scales (x, y) to unit length; (1, 0) where squares vanish."""
+    square = x**2 + y**2
+    zero = square < jnp.finfo(x.dtype).tiny
+    scale = jax.lax.rsqrt(jnp.where(zero, 1, square))
+    return jnp.where(zero, 1, x * scale), jnp.where(zero, 0, y * scale)
+
+
+def _multiples(cosine: Array, sine: Array, degree: int) -> tuple[list[Array], list[Array]]:
+    """Cosines and sines of 0, 1, ..., degree times an angle."""
+    real, imaginary = [jnp.ones_like(cosine)], [jnp.zeros_like(sine)]
+    for _ in range(degree):
+        a, b = real[-1], imaginary[-1]
+        real.append(a * cosine - b * sine)
+        imaginary.append(b * cosine + a * sine)
+    return real, imaginary
+
+
+@functools.lru_cache(maxsize=128)
+def _quarter_turn(l: int) -> np.ndarray:
+    """D of the turn about x that takes z to y, for one band; by a quadrature that is exact for it.
+
+    It keeps parity in x and exchanges those in y and z, so that a quarter of its entries are not zero.
+    """
+    node, weight = np.polynomial.legendre.leggauss(l + 1)
+    angle = np.pi * np.arange(2 * l + 1) / (l + 0.5)
+    radius = np.sqrt(1 - node**2)
+    height = np.broadcast_to(node[:, None], (l + 1, 2 * l + 1))
+    direction = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), height], axis=-1)
+    back = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # The inverse turn; it takes y to z.
+    here = harmonics._basis(np, direction, l)[l * l :]
+    there = harmonics._basis(np, direction @ back.T, l)[l * l :]
+    matrix = np.einsum("aij,bij,i->ab", here, there, weight * np.pi / (l + 0.5), optimize=True)
+    matrix[np.abs(matrix) < 1e-12] = 0
+    return matrix

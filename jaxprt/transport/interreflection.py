@@ -1,0 +1,234 @@
+"""Interreflection for the harmonic system: bounces added to transfer matrices and vectors, for fixed BRDFs.
+
+Each bounce sends a ray through every texel above a vertex's horizon; where it meets the mesh, the vertices around
+shade the light of the bounce before towards it. Sloan, Kautz and Snyder 2002, section 5.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxprt.brdf.harmonic import HarmonicBrdf
+from jaxprt.files.arrays import Layout
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, haar, harmonics, rotation
+from jaxprt.transport import blocks, visibility
+from jaxprt.transport.harmonic import TransferMatrix, TransferVector, check
+
+_RAYS = 1 << 12  # hits that are shaded at once
+
+
+def interreflect(
+    mesh: Mesh,
+    transport: TransferMatrix,
+    brdf: Sequence[HarmonicBrdf],
+    *,
+    bounces: int = 1,
+    size: int = 16,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> TransferMatrix:
+    """Adds the light that the surfaces throw onto each other to transfer matrices; fixes the BRDFs for that light.
+
+    Args:
+        mesh: The whole scene, which lights itself.
+        transport: Shadowed transfer of all its vertices.
+        brdf: The BRDF of each region of the mesh, of the transport's degree.
+        bounces: How many times light is reflected before it arrives.
+        size: Edge of the cubemap's faces through which rays are sent.
+        executor: As of `precompute`.
+        progress: As of `precompute`.
+
+    Returns:
+        Transfer that includes the bounces; colored where a BRDF is.
+
+    Raises:
+        ValueError: Transport of other vertices or degree, or a region without BRDF.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 5; Sloan, Kautz, Snyder 2002, section 5.
+    """
+    check(harmonics.degree_of(transport.matrix.shape[0]), size)
+    _check_regions(mesh, transport.matrix, len(brdf))
+    wrong = [each.degree for each in brdf if each.table.shape[0] != transport.matrix.shape[0] or each.knot]
+    if wrong:
+        raise ValueError(
+            f"BRDFs must have the transport's degree {harmonics.degree_of(transport.matrix.shape[0])} and no parameters"
+            f", got degrees {wrong}"
+        )
+    colors = max(transport.matrix.shape[2], *(each.table.shape[1] for each in brdf))
+    shape = (*transport.matrix.shape[:2], colors, transport.matrix.shape[3])
+    total = last = np.broadcast_to(np.asarray(transport.matrix), shape)
+    for number in range(bounces):
+        rows = np.ascontiguousarray(last.transpose(3, 2, 1, 0))
+        job = _BounceJob.make(mesh, None, None, size, brdf=tuple(brdf), rows=rows)
+        label = f"bounce {number + 1}"
+        last = blocks.compute(job, executor=executor, progress=progress, label=label)["matrix"]
+        total = total + last
+    return TransferMatrix(jnp.asarray(total), transport.position, transport.frame)
+
+
+def interreflect_diffuse(
+    mesh: Mesh,
+    transport: TransferVector,
+    albedo: Float[np.ndarray | Array, "r l"],
+    *,
+    bounces: int = 1,
+    size: int = 16,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> TransferVector:
+    """Adds the light that diffuse surfaces throw onto each other to transfer vectors.
+
+    Args:
+        mesh: The whole scene, which lights itself.
+        transport: Shadowed transfer of all its vertices.
+        albedo: Albedo of each region of the mesh.
+        bounces: How many times light is reflected before it arrives.
+        size: Edge of the cubemap's faces through which rays are sent.
+        executor: As of `precompute`.
+        progress: As of `precompute`.
+
+    Raises:
+        ValueError: Transport of other vertices, or a region without albedo.
+
+    Reference: Sloan, Kautz, Snyder 2002, section 5.
+    """
+    check(harmonics.degree_of(transport.vector.shape[0]), size)
+    albedo = np.asarray(albedo, transport.vector.dtype)
+    _check_regions(mesh, transport.vector, len(albedo))
+    colors = max(transport.vector.shape[1], albedo.shape[1])
+    total = last = np.broadcast_to(
+        np.asarray(transport.vector), (transport.vector.shape[0], colors, transport.vector.shape[2])
+    )
+    for number in range(bounces):
+        rows = np.ascontiguousarray((last * albedo[np.asarray(mesh.region)].T).transpose(2, 1, 0))
+        job = _DiffuseBounceJob.make(mesh, None, None, size, rows=rows)
+        label = f"bounce {number + 1}"
+        last = blocks.compute(job, executor=executor, progress=progress, label=label)["vector"]
+        total = total + last
+    return TransferVector(jnp.asarray(total), transport.position)
+
+
+@jax.jit
+def _shade(
+    rows: Float[Array, "v l lm lm"],
+    frame: Float[Array, "v 3 3"],
+    region: Int[Array, " v"],
+    brdf: tuple[HarmonicBrdf, ...],
+    corner: Int[Array, "m 3"],
+    weight: Float[Array, "m 3"],
+    direction: Float[Array, "m 3"],
+) -> Float[Array, "m l lm"]:
+    """What leaves the hit points against the rays, as a linear map of the light."""
+
+    def one(total, k):
+        vertex, share = corner[:, k], weight[:, k]
+        wo = jnp.sum(frame[vertex] * -direction[:, None], -1)
+        view = sum(
+            jnp.where(region[vertex] == number, each.coefficients(wo), 0).swapaxes(0, 2)
+            for number, each in enumerate(brdf)
+        )
+        view = jnp.broadcast_to(view, (len(wo), *rows.shape[1:3])) * share[:, None, None]
+        return total + jnp.einsum("mlo,mloi->mli", view, rows[vertex]), None
+
+    start = jnp.zeros((corner.shape[0], rows.shape[1], rows.shape[3]), rows.dtype)
+    return jax.lax.scan(one, start, jnp.arange(3))[0]
+
+
+@jax.jit
+def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "lm lm l b"]:
+    """The light that arrives from all texels, in the local frame."""
+    count, texels, colors, terms = leaving.shape
+    size = haar.face_edge(texels)
+    direction, area = cubemap.direction(size=size).reshape(-1, 3), cubemap.solid_angle(size=size).reshape(-1, 1)
+    basis = harmonics.evaluate(direction, degree=harmonics.degree_of(terms)) * area
+    world = jnp.moveaxis(basis.T @ leaving.reshape(count, texels, -1), 0, -1)
+    return jnp.moveaxis(rotation.rotate_each(world, frame).reshape(terms, colors, terms, count), 2, 0)
+
+
+@dataclass(frozen=True)
+class _BounceJob(visibility.VisibilityJob):
+    """Blocks of what one bounce adds to transfer matrices."""
+
+    brdf: tuple[HarmonicBrdf, ...]
+    rows: np.ndarray  # [v, l, o, i] transfer of the bounce before, vertex by vertex, since hits gather whole matrices
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return {"mesh": self.mesh_key, "size": self.size, "rows": blocks.fingerprint(self.rows)}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        _, colors, terms, _ = self.rows.shape
+        return {"matrix": Layout((terms, terms, colors, visibility.BLOCK), 3, "float32")}
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        part = self.part(block)
+        vertex, texel, corner, weight, count = _hits(self, part)
+        direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
+        leaving = np.zeros((len(part), len(direction), self.rows.shape[1], self.rows.shape[3]), np.float32)
+        region = np.asarray(self.occluder.region)
+        for first in range(0, len(vertex), _RAYS):
+            # Padded with a hit's copies, so that one compiled function serves all.
+            at = np.minimum(np.arange(first, first + _RAYS), len(vertex) - 1)
+            shaded = _shade(self.rows, self.frame, region, self.brdf, corner[at], weight[at], direction[texel[at]])
+            leaving[vertex[at], texel[at]] = shaded
+        return {"matrix": np.asarray(_arriving(leaving, self.frame[part]))}, count
+
+
+@dataclass(frozen=True)
+class _DiffuseBounceJob(visibility.VisibilityJob):
+    """Blocks of what one bounce adds to transfer vectors."""
+
+    rows: np.ndarray  # [v, l, i] albedo times the bounce before
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return {"mesh": self.mesh_key, "size": self.size, "rows": blocks.fingerprint(self.rows)}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        _, colors, terms = self.rows.shape
+        return {"vector": Layout((terms, colors, visibility.BLOCK), 2, "float32")}
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        part = self.part(block)
+        vertex, texel, corner, weight, count = _hits(self, part)
+        area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
+        flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
+        # The front of a surface alone sends light.
+        front = np.sum(self.frame[corner, 2] * area[texel][:, None], -1) < 0
+        leaving = np.einsum("mk,mkli->mli", weight * front * flux[:, None], self.rows[corner])
+        total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
+        np.add.at(total, vertex, leaving)
+        return {"vector": total.transpose(2, 1, 0)}, count
+
+
+def _hits(
+    job: visibility.VisibilityJob, part: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Where rays through the upper texels meet the mesh: vertex of the block, texel, corners, weights; ray count."""
+    area = np.asarray(cubemap.vector_area(size=job.size), np.float32).reshape(-1, 3)
+    direction = np.asarray(cubemap.direction(size=job.size), np.float32).reshape(-1, 3)
+    vertex, texel = np.nonzero(job.frame[part, 2] @ area.T > 0)
+    triangle, _, weight = job.rays.hit(job.start[part][vertex], direction[texel])
+    met = np.flatnonzero(triangle >= 0)
+    corner = np.asarray(job.occluder.face)[triangle[met]]
+    return vertex[met], texel[met], corner, weight[met], len(vertex)
+
+
+def _check_regions(mesh: Mesh, transport: Array, count: int) -> None:
+    """Refuses transport of other vertices, and regions without a material."""
+    if transport.shape[-1] != len(mesh.position):
+        raise ValueError(
+            f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {transport.shape[-1]}"
+        )
+    regions = int(np.max(mesh.region, initial=0)) + 1
+    if count < regions:
+        raise ValueError(f"each of the mesh's {regions} regions must have a material, got {count}")
