@@ -9,18 +9,22 @@ An absolute time is a fact about a machine; a ratio and an error are facts about
 """
 
 import argparse
+import concurrent.futures
 import json
 import math
+import os
 import pathlib
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
+_THREADS = 2
 _KEYS = ("benchmark", "case", "seconds", "compile_seconds", "error", "bytes")
 _PEER_KEYS = ("peer", "peer_seconds", "peer_error")
 
@@ -117,6 +121,20 @@ def report(line: Mapping[str, Any], output: pathlib.Path | None = None) -> dict[
         with output.open("a", encoding="utf-8") as file:
             file.write(text + "\n")
     return line
+
+
+def data() -> pathlib.Path:
+    """The folder of real meshes and lights, JAXPRT_DATA; one that does not exist where it is not set."""
+    return pathlib.Path(os.environ.get("JAXPRT_DATA", "missing"))
+
+
+def reader(arrays: Sequence[np.ndarray]) -> Callable[[], Any]:
+    """A function that reads every byte of some arrays once, on two threads."""
+    words = [np.ascontiguousarray(array).ravel().view(np.uint8) for array in arrays]
+    words = [flat[: len(flat) // 8 * 8].view(np.uint64) for flat in words]
+    parts = [part for flat in words for part in np.array_split(flat, _THREADS)]
+    pool = concurrent.futures.ThreadPoolExecutor(_THREADS)
+    return lambda: list(pool.map(np.bitwise_xor.reduce, parts))
 
 
 def peak_memory() -> int:

@@ -24,7 +24,6 @@ from jaxprt.transport import separable as transport
 from jaxprt.transport import visibility
 
 SIZE = 64
-BLOCK = 64
 EVERY = 8
 
 
@@ -53,7 +52,7 @@ def main() -> None:
     # One block of each part compiles.
     for (mesh, _, _), brdf in zip(parts, factored, strict=True):
         transport.precompute(mesh, brdf, occluder=whole, vertex=np.arange(1), progress=False)
-    chosen = np.arange(0, len(start), BLOCK)[:: 2 if arguments.quick else EVERY]
+    chosen = np.arange(0, len(start), visibility.BLOCK)[:: 2 if arguments.quick else EVERY]
     counts = [embree_alone(recorder, start, normal, chosen[0::2])]
     began = time.perf_counter()
     result = [
@@ -103,7 +102,7 @@ def scene(quick: bool) -> tuple[str, list]:
     return "bunny + ground", [(bunny, glossy, 4), (ground_plane(bunny, vertices=22_000), Lambert(0.5), 1)]
 
 
-def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, first: np.ndarray):
+def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, first: np.ndarray, size: int = SIZE):
     """Rays of some blocks, the seconds that Embree takes for them on all threads, and the vertices in them."""
     threads = os.cpu_count() or 1
     count, seconds, vertices = visibility.RayCount(0, 0, 0), 0.0, 0
@@ -112,9 +111,9 @@ def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, firs
         for group in np.array_split(first, max(1, len(first) // threads)):
             batches = []
             for begin in group:
-                part = slice(begin, begin + BLOCK)
+                part = slice(begin, begin + visibility.BLOCK)
                 recorder.rays.clear()
-                count += visibility.fractional(recorder, start[part], normal[part], size=SIZE)[1]
+                count += visibility.fractional(recorder, start[part], normal[part], size=size)[1]
                 batches.append(list(recorder.rays))
                 vertices += len(start[part])
             began = time.perf_counter()

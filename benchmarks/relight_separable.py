@@ -7,8 +7,6 @@ Kept coefficients lie anywhere among all 24,576, which is harder on caches than 
 reading the arrays once on two threads; the view change against the light change; both at growing mesh sizes.
 """
 
-import concurrent.futures
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +21,6 @@ from jaxprt.transport import SparseTransport, sparse
 SIZE = 64
 TERMS = 4
 KEEP = 96
-THREADS = 2
 
 
 def main() -> None:
@@ -64,7 +61,10 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
         "vertices": vertices,
     }
     lines = []
-    peers = {"scipy-csr": lambda: matrix @ dense_light, "memory-read": reader(transport)}
+    peers = {
+        "scipy-csr": lambda: matrix @ dense_light,
+        "memory-read": harness.reader([np.asarray(x) for x in (transport.index, transport.value)]),
+    }
     for name, peer in peers.items():
         first, second = harness.compare(lambda: sparse.apply(transport, light), peer, repeats=repeats)
         wrong = (
@@ -92,14 +92,6 @@ def as_csr(transport: SparseTransport) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix(
         (value.ravel(), index.ravel().astype(np.int32), start), (len(index), 6 * SIZE * SIZE)
     )
-
-
-def reader(transport: SparseTransport):
-    """A function that reads every byte of the arrays once, on all threads."""
-    words = [np.asarray(array).ravel().view(np.uint64) for array in (transport.index, transport.value)]
-    parts = [part for array in words for part in np.array_split(array, THREADS)]
-    pool = concurrent.futures.ThreadPoolExecutor(THREADS)
-    return lambda: list(pool.map(np.bitwise_xor.reduce, parts))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import functools
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 
@@ -25,6 +26,9 @@ f 2 4 3
 """
 
 
+SYSTEMS = ("separable", "harmonic")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def small():
     """Coarse maps, skies and ground: what the command does with them is the same."""
@@ -33,6 +37,9 @@ def small():
             (prt.brdf.separable, "factor", {"resolution": 8}),
             (prt.scene, "load_environment", {"size": 8}),
             (prt.transport.separable, "precompute", {"size": 8}),
+            (prt.transport.harmonic, "precompute", {"size": 8}),
+            (prt.transport.harmonic, "precompute_diffuse", {"size": 8}),
+            (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1.0}),
             (prt.scene.mesh, "ground_plane", {"vertices": 49}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
@@ -85,26 +92,30 @@ def report(output):
 
 @pytest.fixture(scope="module")
 def output(place):
-    """What one whole run leaves: two lights and a coarse ground."""
+    """What one whole run leaves: two lights, a coarse ground, both systems."""
     folder = place / "deep" / "whole"
-    assert run(place, "--ground", "--azimuth", "-30", sky=("sky.exr", "dusk.exr"), output=folder) == 0
+    options = ["--ground", "--azimuth", "-30", "--system", *SYSTEMS]
+    assert run(place, *options, sky=("sky.exr", "dusk.exr"), output=folder) == 0
     return folder
 
 
 def test_pictures_and_report_are_written(output):
-    expected = {
-        f"{light}_{kind}.{suffix}"
-        for light in ("sky", "dusk")
-        for kind in ("image", "reference", "difference")
-        for suffix in ("exr", "png")
-    }
-    found = {path.name for path in output.iterdir()}
-    assert found == expected | {"report.json", "object.prt", "ground.prt"}
+    kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
+    names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
+    expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
+    stores = {f"{part}{order}.prt" for part in ("object", "ground") for order in ("", "_order_5")}
+    assert {path.name for path in output.iterdir()} == expected | stores | {"report.json"}
     for name in expected:
         assert (output / name).stat().st_size > 50
-    picture, _ = prt.files.read_image(output / "sky_image.exr")
+    picture, _ = prt.files.read_image(output / "sky_harmonic.exr")
     assert picture.shape == (32, 32, 3)
     assert np.isfinite(picture).all()
+
+
+def test_the_systems_stand_side_by_side_before_the_reference(output):
+    row, _ = prt.files.read_image(output / "sky.png")
+    parts = [prt.files.read_image(output / f"sky_{kind}.png")[0] for kind in (*SYSTEMS, "reference")]
+    np.testing.assert_array_equal(row, np.concatenate(parts, 1))
 
 
 def test_the_report_is_json_of_finite_numbers(output):
@@ -112,16 +123,31 @@ def test_the_report_is_json_of_finite_numbers(output):
     assert told["vertices"] == {"object": 4, "ground": 49}
     assert set(told["lights"]) == {"sky", "dusk"}
     for light in told["lights"].values():
-        assert 0 < light["image_error"] < 0.5
-        assert set(light["vertex_error"]) == {"object", "ground"}
-    assert told["precompute"]["object"]["keep"] == 8
-    assert min(told["times"].values()) > 0
+        for system in SYSTEMS:
+            assert 0 < light[system]["image_error"] < 0.5
+            assert set(light[system]["vertex_error"]) == {"object", "ground"}
+    assert told["precompute"]["separable"]["object"]["keep"] == 8
+    assert told["precompute"]["harmonic"]["object"]["coefficients"] == 25
+    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("object", "ground")}
+    assert min(numbers(told["times"])) > 0
     assert told["peak_bytes"] > 1e7
+
+
+def test_the_report_says_what_was_relit(place, output):
+    told = report(output)
+    assert told["mesh"] == str(place / "mesh.obj")
+    assert told["up"] == "y"
+    assert told["ground"] is True
+    assert told["environments"] == {name: str(place / f"{name}.exr") for name in ("sky", "dusk")}
+    camera = told["camera"]
+    assert (camera["width"], camera["height"]) == (32, 32)
+    offset = np.subtract(camera["eye"], camera["target"])
+    np.testing.assert_allclose(np.degrees(np.arctan2(offset[0], offset[2])), -30, atol=1e-3)
 
 
 def test_the_pictures_differ_by_what_the_report_says(output):
     image, reference, difference = (
-        prt.files.read_image(output / f"sky_{kind}.exr")[0] for kind in ("image", "reference", "difference")
+        prt.files.read_image(output / f"sky_{kind}.exr")[0] for kind in ("harmonic", "reference", "harmonic_difference")
     )
     np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
 
@@ -132,17 +158,21 @@ def test_a_second_run_takes_the_transport_from_the_first(place, tmp_path, capsys
     told = capsys.readouterr()
     assert "pictures and report.json are in" in told.out
     assert "error" not in told.err.lower()
-    assert report(tmp_path)["lights"]["sky"]["image_error"] < 0.5
+    assert report(tmp_path)["lights"]["sky"]["separable"]["image_error"] < 0.5
 
 
 def test_glossy_brdfs_and_the_error_table(place, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxprt.__main__._TABLE_TERMS", (1, 4))
-    monkeypatch.setattr("jaxprt.__main__._TABLE_KEEP", (32, 96))
+    for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("ORDERS", (2, 4))):
+        monkeypatch.setattr(f"jaxprt.report.TABLE_{name}", values)
     options = ["--table", "3", "--terms", "2", "--diffuse", "0.2", "0.3", "0.4", "--specular", "0.1", "--nu", "10"]
-    assert run(place, *options, "--brdf", "ashikhmin-shirley", output=tmp_path) == 0
+    options += ["--system", *SYSTEMS, "--order", "3", "--window", "hann", "--brdf", "ashikhmin-shirley"]
+    assert run(place, *options, output=tmp_path) == 0
     table = report(tmp_path)["table"]
-    assert {(row["terms"], row["keep"]) for row in table} == {(t, k) for t in (1, 4) for k in (32, 96)}
+    separable, harmonic = ([row for row in table if row["system"] == system] for system in SYSTEMS)
+    assert {(row["terms"], row["keep"]) for row in separable} == {(t, k) for t in (1, 4) for k in (32, 96)}
+    assert {row["coefficients"] for row in harmonic} == {4, 16}
     assert all(0 < row["error sky"] < 2 for row in table)
+    assert report(tmp_path)["precompute"]["harmonic"]["object"]["coefficients"] == 9
 
 
 # The command prints warnings itself; here they would be errors before they reach it.
@@ -176,16 +206,21 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
     ("options", "message"),
     [
         (["--size", "0"], "--size must be at least 1, got 0"),
-        (["--keep", "0"], "keep must be .* at least 1, got 0"),
-        (["--keep", "30000"], "keep must be at most 384 .* got 30000"),
-        (["--brdf", "ashikhmin-shirley", "--terms", "0"], "terms must be between 1 and .* got 0"),
+        (["--keep", "0"], "--keep must be at least 1, got 0"),
+        (["--keep", "30000"], "--keep must be at most 384, got 30000"),
+        (["--terms", "0"], "--terms must be at least 1, got 0"),
+        (["--brdf", "ashikhmin-shirley", "--terms", "300"], "terms must be between 1 and .* got 300"),
         (["--diffuse", "0.1", "0.2"], "--diffuse must be one number or three, got 2"),
         (["--specular", "1", "2", "3", "4"], "--specular must be one number or three, got 4"),
-        (["--diffuse", "nan"], "finite"),
-        (["--brdf", "ashikhmin-shirley", "--nu", "-5"], "nu|finite"),
-        (["--elevation", "100"], "elevation must be from"),
-        (["--azimuth", "nan"], "azimuth must be finite"),
-        (["--table", "-3"], "table must be"),
+        (["--diffuse", "nan"], "--diffuse must be not negative and finite, got nan"),
+        (["--diffuse=-1"], "--diffuse must be not negative and finite, got -1"),
+        (["--specular", "0.1", "0.2", "-0.5"], "--specular must be not negative and finite, got -0.5"),
+        (["--order", "0"], "--order must be from 1 to 15, got 0"),
+        (["--nu", "-5"], "--nu must be positive and finite, got -5"),
+        (["--nv", "inf"], "--nv must be positive and finite, got inf"),
+        (["--elevation", "95"], "--elevation must be from -90 to 90 degrees, got 95"),
+        (["--azimuth", "nan"], "--azimuth must be finite, got nan"),
+        (["--table", "-3"], "--table must be at least 1, got -3"),
     ],
 )
 def test_bad_numbers_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
@@ -218,7 +253,47 @@ def test_an_output_that_is_a_file_is_refused(place, tmp_path, capsys):
 def test_another_meshs_store_in_the_output_is_refused(place, tmp_path, capsys):
     assert run(place, output=tmp_path) == 0
     assert run(place, "--keep", "9", output=tmp_path) == 2
-    assert_told(capsys, "object.prt holds arrays made from something else .*keep: there 8, now 9")
+    assert_told(
+        capsys, "object.prt holds arrays made from something else .*keep: there 8, now 9.* name another --output"
+    )
+
+
+def stop(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("options", [["--keep", "0"], ["--keep", "30000"], ["--diffuse=-1"], ["--nu", "0"]])
+def test_bad_numbers_are_refused_before_anything_is_factored(place, tmp_path, monkeypatch, options):
+    monkeypatch.setattr(prt.brdf.separable, "factor", stop)
+    assert run(place, *options, output=tmp_path) == 2
+
+
+def test_an_interrupt_ends_in_one_line_and_status_130(place, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(prt.brdf.separable, "factor", stop)
+    assert run(place, output=tmp_path) == 130
+    assert capsys.readouterr().err == "jaxprt: stopped; the same command goes on from here\n"
+
+
+def test_two_skies_of_one_name_are_both_relit(place, tmp_path):
+    (tmp_path / "other").mkdir()
+    shutil.copy(place / "dusk.exr", tmp_path / "other" / "sky.exr")
+    skies = (str(place / "sky.exr"), str(tmp_path / "other" / "sky.exr"))
+    assert run(place, sky=skies, output=tmp_path) == 0
+    told = report(tmp_path)
+    assert told["environments"] == dict(zip(("sky", "sky_2"), skies, strict=True))
+    first, second = (prt.files.read_image(tmp_path / f"{name}_separable.exr")[0] for name in ("sky", "sky_2"))
+    assert np.abs(first - second).max() > 0.1
+
+
+@pytest.mark.parametrize(("mesh", "count"), [("mesh.obj", 0), ("inside_out.obj", 1)])
+def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
+    swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
+    (place / "inside_out.obj").write_text(swapped)
+    monkeypatch.setattr(prt.brdf.separable, "factor", stop)
+    assert run(place, mesh=mesh, output=tmp_path) == 130
+    warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jaxprt: warning: ")]
+    assert len(warned) == count
+    assert not count or re.search(r"\d of \d triangles in the picture face away .* inside out", warned[0])
 
 
 def test_the_module_runs_as_a_program():

@@ -1,0 +1,211 @@
+"""What does low-frequency relighting cost per frame, and how wrong is it? The paper's Table 1, and errors by order.
+
+    python -m benchmarks.relight_harmonic [--quick] [--output FILE] [--plot FILE]
+
+Times are of real meshes of JAXPRT_DATA (a sphere without it) and of a sphere of 150,000 vertices, 25 coefficients,
+three colors of light. General: light and view change, measured against rotating the light alone. Transfer: the same
+with shadows; fixed light and fixed view: what is left to do when only the other changes. These are measured against
+reading their arrays once on two threads. Transfer matrices hold random numbers, on which times do not depend.
+
+Errors are relative L2 of radiance against quadrature over all texels, on vertices of the bunny that face the eye.
+Precomputed transfer is timed against Embree alone on the very rays that it traces.
+"""
+
+import pathlib
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness
+from benchmarks.precompute_separable import Recorder, embree_alone
+from jaxprt import brdf, scene
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.relight import harmonic as relight
+from jaxprt.relight import reference
+from jaxprt.scene import Mesh, builtin, load_mesh
+from jaxprt.sphere import directions, harmonics, rotation
+from jaxprt.transport import TransferMatrix, visibility
+from jaxprt.transport import harmonic as transport
+
+DEGREE = 4
+# Frames per second of the paper: no transfer, transfer, fixed light, fixed view (2.2 GHz Pentium 4, Radeon 8500).
+PAPER = {"buddha": (4.05, 3.22, 15.6, 127.0), "teapot": (2.0, 1.64, 9.5, 48.9)}
+MESHES = {"buddha": "happy_buddha_100k.ply", "dragon": "dragon_100k.ply", "nefertiti": "nefertiti.ply"}
+LIGHTS = {"grace": "grace_cross.hdr", "eucalyptus": "eucalyptus_rnl_cross.hdr", "sunrise": "polyhaven_sunrise_1k.exr"}
+BRDFS = {
+    "matte": Lambert(0.8),
+    "glossy (12, 4)": AshikhminShirley(nu=12, nv=4),
+    "sharp (48, 16)": AshikhminShirley(nu=48, nv=16),
+}
+WINDOWS = {"none": None, "hann": harmonics.hann, "lanczos": harmonics.lanczos}
+
+
+def main() -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--plot", type=pathlib.Path, metavar="FILE", help="draw errors against time")
+    arguments = parser.parse_args()
+    lines = [*frames(arguments.quick), *errors(arguments.quick), precomputation(arguments.quick)]
+    for line in lines:
+        harness.report(line, arguments.output)
+    if arguments.plot:
+        plot([line for line in lines if "coefficients" in line], arguments.plot)
+
+
+def meshes(quick: bool) -> dict[str, Mesh]:
+    """What is relit: about 50,000 vertices each, and 150,000."""
+    folder = harness.data() / "meshes"
+    if quick:
+        return {"sphere": builtin.sphere(rings=20, sectors=40)}
+    found = {name: load_mesh(folder / file) for name, file in MESHES.items() if (folder / file).exists()}
+    return (found or {"sphere": builtin.sphere(rings=160, sectors=312)}) | {
+        "teapot": builtin.sphere(rings=275, sectors=550)  # The paper's largest, in size alone.
+    }
+
+
+def frames(quick: bool) -> list[dict]:
+    """The paper's Table 1."""
+    table = brdf.harmonic.tabulate(BRDFS["glossy (12, 4)"], degree=DEGREE, resolution=32 if quick else 128)
+    light = jax.random.normal(jax.random.key(0), ((DEGREE + 1) ** 2, 3))
+    return [
+        line for name, mesh in meshes(quick).items() for line in frame(name, mesh, table, light, 3 if quick else 15)
+    ]
+
+
+def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[dict]:
+    """One row of it."""
+    count, terms = len(mesh.position), len(light)
+    axes = directions.frame(mesh.normal, mesh.tangent)
+    eye = mesh.position.mean(0) + 3 * (mesh.position.max(0) - mesh.position.min(0))
+    matrix = jax.random.normal(jax.random.key(1), (terms, terms, 1, count))
+    shadowed = TransferMatrix(matrix, mesh.position, axes)
+    view = relight.view_coefficients(table, mesh.position, axes, eye=eye)
+    turned, through = relight.world_view(axes, view), relight.transferred_view(shadowed, view)
+    arriving = relight.local_light(axes, light)
+    cases = {
+        "general": (lambda: relight.unshadowed_radiance(mesh, table, light, eye=eye), "rotation", table.nbytes),
+        "transfer": (lambda: relight.radiance(shadowed, table, light, eye=eye), matrix, shadowed.nbytes),
+        "fixed light": (
+            lambda: relight.combine(arriving, relight.view_coefficients(table, mesh.position, axes, eye=eye)),
+            arriving,
+            arriving.nbytes,
+        ),
+        "fixed view": (lambda: relight.combine(light, turned), turned, turned.nbytes),
+        "fixed view, transfer": (lambda: relight.combine(light, through), through, through.nbytes),
+    }
+    lines = []
+    paper = dict(zip(("general", "transfer", "fixed light", "fixed view"), PAPER.get(name, ()), strict=False))
+    for case, (function, array, size) in cases.items():
+        rotating = isinstance(array, str)
+        peer = (lambda: rotation.rotate_each(light, axes)) if rotating else harness.reader([np.asarray(array)])
+        mine, theirs = harness.compare(function, peer, repeats=repeats)
+        lines.append(
+            {
+                "benchmark": "relight_harmonic",
+                "case": f"{case}, {name}, {count} vertices",
+                **mine.line(),
+                "error": None,
+                "bytes": size,
+                "peer": "rotation" if rotating else "memory-read",
+                "peer_seconds": theirs.seconds,
+                "peer_error": 0.0,
+                "frames_per_second": 1 / mine.seconds,
+                **({"paper_frames_per_second": paper[case]} if case in paper else {}),
+            }
+        )
+    return lines
+
+
+def errors(quick: bool) -> list[dict]:
+    """Errors by order, BRDF, light and window, with what they cost."""
+    orders = (3, 5) if quick else (3, 5, 7, 10, 15)
+    path = harness.data() / "meshes" / "stanford_bunny.ply"
+    real = path.exists() and not quick
+    mesh = load_mesh(path) if real else builtin.sphere(rings=20, sectors=40)
+    lights = {"daylight": builtin.daylight()}
+    if real:
+        lights = {name: scene.load_environment(harness.data() / "env" / file) for name, file in LIGHTS.items()}
+    eye = mesh.position.mean(0) + jnp.array([0.5, 0.7, 2.0]) * jnp.linalg.norm(jnp.ptp(mesh.position, 0))
+    facing = np.flatnonzero(np.sum(np.asarray(mesh.normal * (eye - mesh.position)), 1) > 0)
+    vertex = np.random.default_rng(0).permutation(facing)[: 50 if quick else 400]
+    full = transport.precompute(mesh, degree=max(orders) - 1, vertex=vertex, progress=False)
+    lines = []
+    for name, model in BRDFS.items():
+        table = brdf.harmonic.tabulate(model, degree=max(orders) - 1, resolution=32 if quick else 128)
+        for sky, light in lights.items():
+            truth = reference.radiance(mesh, model, light, eye=eye, vertex=vertex)
+            for order in orders:
+                matrix = full.matrix[: order**2, : order**2]
+                short, few = TransferMatrix(matrix, full.position, full.frame), table.truncate(degree=order - 1)
+                for window, factor in WINDOWS.items():
+                    coefficient = relight.project(light, degree=order - 1)
+                    if factor is not None:
+                        coefficient = harmonics.convolve(coefficient, factor(degree=order - 1))
+                    call = lambda s=short, f=few, c=coefficient: relight.radiance(s, f, c, eye=eye)  # noqa: E731
+                    color = call()
+                    lines.append(
+                        {
+                            "benchmark": "relight_harmonic",
+                            "case": f"error, {name}, {sky}, {order**2} coefficients, window {window}",
+                            **harness.measure(call, repeats=3).line(),
+                            "error": float(jnp.linalg.norm(color - truth) / jnp.linalg.norm(truth)),
+                            "bytes": short.nbytes,
+                            "bytes_per_vertex": short.nbytes / len(vertex),
+                            "vertices": len(vertex),
+                            "negative": float(jnp.mean(jnp.any(color < 0, -1))),
+                            "coefficients": order**2,
+                            "brdf": name,
+                            "light": sky,
+                            "window": window,
+                        }
+                    )
+    return lines
+
+
+def precomputation(quick: bool) -> dict:
+    """Transfer matrices of 50,000 vertices against their rays alone."""
+    name, mesh = next(iter(meshes(quick).items()))
+    recorder, size = Recorder(mesh), 32
+    start, normal = visibility.start_points(mesh, recorder), np.asarray(mesh.normal)
+    transport.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), progress=False)
+    chosen = np.arange(0, len(start), visibility.BLOCK)[:: 2 if quick else 8]
+    before = embree_alone(recorder, start, normal, chosen[0::2], size)
+    began = time.perf_counter()
+    made = transport.precompute(mesh, degree=DEGREE, size=size, progress=not quick)
+    seconds = time.perf_counter() - began
+    after = embree_alone(recorder, start, normal, chosen[1::2], size)
+    embree = (before[1] + after[1]) / (before[2] + after[2]) * len(start)
+    return {
+        "benchmark": "relight_harmonic",
+        "case": f"precomputed transfer, {name}, {len(start)} vertices, 25 x 25",
+        "seconds": seconds,
+        "compile_seconds": 0.0,
+        "error": None,
+        "bytes": made.nbytes,
+        "peer": "embree-rays",
+        "peer_seconds": embree,
+        "peer_error": 0.0,
+    }
+
+
+def plot(lines: list[dict], path: pathlib.Path) -> None:
+    """Error against time per vertex, one panel for each light."""
+    from matplotlib import pyplot
+
+    lights = list(dict.fromkeys(line["light"] for line in lines))
+    figure, axes = pyplot.subplots(1, len(lights), figsize=(5 * len(lights), 4), sharey=True, squeeze=False)
+    for panel, light in zip(axes[0], lights, strict=True):
+        for name in BRDFS:
+            for window, style in zip(WINDOWS, ("-", "--", ":"), strict=True):
+                row = [x for x in lines if (x["light"], x["brdf"], x["window"]) == (light, name, window)]
+                time_each = [1e9 * x["seconds"] / x["vertices"] for x in row]
+                panel.loglog(time_each, [x["error"] for x in row], style, marker="o", label=f"{name}, {window}")
+        panel.set(title=light, xlabel="nanoseconds per vertex")
+    axes[0, 0].set_ylabel("relative L2 error")
+    axes[0, -1].legend(fontsize=6)
+    figure.savefig(path, dpi=120, bbox_inches="tight")
+
+
+if __name__ == "__main__":
+    main()
