@@ -1,10 +1,11 @@
-"""Fixtures that every test may ask for: ``data``, ``x64`` and ``close``."""
+"""Fixtures that every test may ask for: ``data``, ``x64``, ``unchecked`` and ``close``."""
 
 import os
 import pathlib
 from collections.abc import Callable, Iterator
 
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
@@ -35,6 +36,12 @@ def x64() -> Iterator[None]:
     """Float64 for one test."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shape checks, as users run: for what the package itself says of wrong shapes."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")

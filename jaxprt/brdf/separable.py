@@ -80,6 +80,10 @@ def factor(
     Maps are parabolic: on the orthographic disk the last texel before the rim spans 14 degrees at 48 x 48, and at
     grazing angles, where glossy BRDFs are brightest, bilinear lookup is then off by more than all else.
 
+    Runs on the host, and its derivatives by a BRDF's parameters are not promised: singular vectors have none where
+    singular values repeat, as those of isotropic BRDFs do, and transport made with the old light maps would not follow.
+    `relight.reference` is differentiable in them.
+
     Args:
         brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
         terms: Number of terms; or

@@ -12,7 +12,11 @@ def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Flo
 
     0 for two images without light, infinite if only the reference has none. Differentiable except where the
     difference is zero; there the derivative is zero.
+
+    Raises:
+        ValueError: The images differ in shape.
     """
+    image, reference = _pair(image, reference)
     scale = jnp.maximum(jnp.max(jnp.abs(reference), initial=0), jnp.max(jnp.abs(image), initial=0))
     scale = jax.lax.stop_gradient(jnp.where(scale > 0, scale, 1))
     error = jnp.sum(((image - reference) / scale) ** 2)
@@ -32,7 +36,11 @@ def psnr(
         image: Values to judge.
         reference: What they should be.
         peak: The largest value that the medium holds; 1 for display values.
+
+    Raises:
+        ValueError: The images differ in shape.
     """
+    image, reference = _pair(image, reference)
     return 10 * (2 * jnp.log10(jnp.asarray(peak, image.dtype)) - jnp.log10(jnp.mean((image - reference) ** 2)))
 
 
@@ -45,6 +53,7 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
 
     Raises:
         ImportError: The package flip-evaluator is missing.
+        ValueError: The images differ in shape.
 
     Reference: Andersson et al. 2021, "Visualizing and communicating errors in rendered images".
     """
@@ -52,7 +61,18 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
         import flip_evaluator
     except ImportError as error:
         raise ImportError("flip needs the package flip-evaluator: pip install 'jaxprt[bench]'") from error
+    image, reference = _pair(image, reference)
     true, seen = (np.maximum(np.ascontiguousarray(x, np.float32), 0) for x in (reference, image))
     # A fresh dict: the package keeps what it adds to the default one, hence the first reference's exposures, for later.
     _, mean, _ = flip_evaluator.evaluate(true, seen, "HDR", inputsRGB=False, applyMagma=False, parameters={})
     return float(mean)
+
+
+def _pair(image: Array, reference: Array) -> tuple[Array, Array]:
+    """Two images of one shape, integers as floating-point numbers."""
+    if image.shape != reference.shape:
+        raise ValueError(f"images must have one shape, got {list(image.shape)} and {list(reference.shape)}")
+    image, reference = (
+        x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float)) for x in (image, reference)
+    )
+    return image, reference

@@ -86,11 +86,16 @@ def render(
     view many times keep the result of `rasterize` and call `interpolate`.
 
     Args:
-        mesh: What is drawn, both sides of it.
+        mesh: What is drawn, both sides of it; radiance is black on the back.
         color: Linear radiance of each vertex towards the camera.
         camera: From where.
         background: What is seen past the mesh; black if not given.
+
+    Raises:
+        ValueError: There is not one color per vertex, or as in `rasterize`.
     """
+    if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
+        raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
     fragments = rasterize(mesh, camera)
     image = interpolate(fragments, mesh.face, color)
     if background is None:

@@ -10,6 +10,7 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # Of linear Rec. 709 RGB.
 @jax.jit
 def expose(radiance: Float[Array, "*b"], *, stops: Float[Array, ""] | float) -> Float[Array, "*b"]:
     """Scales radiance by 2^stops, as a camera's exposure would; nothing is clamped."""
+    radiance = _floating(radiance)
     return radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype))
 
 
@@ -27,6 +28,7 @@ def automatic_exposure(
         percentile: Part of the lit pixels that stays at or below `white`, in percent.
         white: Linear value that the percentile is brought to; 1 is display white.
     """
+    image = _floating(image)
     luminance = image @ jnp.asarray(LUMINANCE, image.dtype)
     lit = luminance > 0
     level = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
@@ -60,3 +62,8 @@ def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def display(radiance: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Exposed linear radiance as values in [0, 1] to show or save as 8 bits: clamps, then encodes."""
     return encode_srgb(jnp.clip(radiance, 0, 1))
+
+
+def _floating(value: Array) -> Array:
+    """Integers as floating-point numbers, or options would be rounded to integers with them."""
+    return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(jnp.result_type(float))

@@ -30,22 +30,28 @@ def radiance(
 
     Args:
         mesh: The vertices.
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
+        brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions; a new function object,
+            as a lambda in a loop, compiles anew.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
         occluder: What casts shadows; the mesh itself if None.
-        vertex: Numbers of the vertices asked for; all if None.
+        vertex: Numbers of the vertices asked for, or a mask; all if None.
         progress: Whether to show a progress bar.
 
     Returns:
-        Linear radiance [*l v c], in the light's units.
+        Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
+
+    Raises:
+        ValueError: No such vertices, or the BRDF's values have no axis for colors.
     """
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     start = visibility.start_points(mesh, rays)
-    vertex = np.arange(len(start)) if vertex is None else np.asarray(vertex)
+    vertex = visibility.chosen(mesh, vertex)
     normal = np.asarray(mesh.normal, np.float32)
     frame = directions.frame(mesh.normal, mesh.tangent)
     size = light.radiance.shape[-2]
+    if jax.tree_util.all_leaves([brdf]):  # A plain function: what is not an array must not be an argument of jit.
+        brdf = jax.tree_util.Partial(brdf)
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []
@@ -90,9 +96,12 @@ def integrate(
 
     def one(argument):
         visible, place, axes = argument
-        flux = jnp.maximum(area @ axes[2], 0) * visible.astype(axes.dtype) / visibility.LEVELS
+        flux = jnp.maximum(directions.to_local(axes, area)[:, 2], 0) * visible.astype(axes.dtype) / visibility.LEVELS
         wo = directions.normalize(axes @ (eye - place))
-        value = brdf(direction @ axes.T, jnp.broadcast_to(wo, direction.shape)) * flux[:, None]
+        value = brdf(directions.to_local(axes, direction), jnp.broadcast_to(wo, direction.shape))
+        if jnp.ndim(value) != 2 or value.shape[0] != len(direction):
+            raise ValueError(f"the BRDF must return [{len(direction)}, c] here, got {list(jnp.shape(value))}")
+        value = value * flux[:, None]
         value = jnp.broadcast_to(value, (value.shape[0], max(value.shape[1], table.shape[-1])))
         return jnp.einsum("...dc,dc->...c", table, value)
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import haar
+from jaxprt.sphere import directions, haar
 from jaxprt.transport import sparse
 from jaxprt.transport.sparse import SparseTransport
 
@@ -104,14 +104,11 @@ def light_tuple(
         The light-modulated tuple of every vertex.
 
     Raises:
-        ValueError: The light's cubemap differs in size from the transport's.
+        ValueError: The light is a batch, or its cubemap is not six faces of the transport's size.
     """
-    if light.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6 n n c], got {light.radiance.shape}")
-    texels = light.radiance.shape[-2] ** 2 * 6
-    if texels != transport.rms.shape[0]:
-        size = haar.face_edge(transport.rms.shape[0])
-        raise ValueError(f"the light must have faces of {size} x {size} texels, got {light.radiance.shape}")
+    size = haar.face_edge(transport.rms.shape[0])
+    if light.radiance.shape[:-1] != (6, size, size):
+        raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
     coefficient = project(light)
     if light_keep is not None:
         coefficient = choose_by_transport(coefficient, transport.rms, count=light_keep)
@@ -132,18 +129,20 @@ def view_tuple(transport: SparseTransport, brdf: SeparableBrdf, eye: Float[Array
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
-    offset = eye - transport.position
-    local = jnp.einsum("vij,vj->vi", transport.frame, offset)
-    square = jnp.sum(local**2, -1, keepdims=True)
-    wo = local * jax.lax.rsqrt(jnp.where(square > 0, square, 1))
-    return brdf.view(wo)
+    local = jnp.einsum("vij,vj->vi", transport.frame, eye - transport.position)
+    return brdf.view(directions.normalize(local))
 
 
 @jax.jit
 def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
     """Dot product of the two tuples: outgoing radiance per vertex and color.
 
-    Either may be gray (one channel) and then serves all colors of the other.
+    Args:
+        light: `light_tuple`; its c channels are the light's, one if that is gray.
+        view: `view_tuple`; its d channels are the BRDF's.
+
+    Returns:
+        Linear radiance in e colors, the larger of c and d: a gray side serves all colors of the other.
     """
     return jnp.sum(light * view, 1)
 
@@ -156,7 +155,11 @@ def radiance(
     eye: Float[Array, "3"],
     light_keep: int | None = None,
 ) -> Float[Array, "v c"]:
-    """Radiance that each vertex sends to the eye. Differentiable in light, brdf, eye and transport.
+    """Radiance that each vertex sends to the eye.
+
+    Differentiable in the light, the eye, the view maps and the transport's values. The light maps are not read: they
+    are in the transport. So the gradient in the BRDF is the view maps' part alone; for parameters of a BRDF
+    model take `jaxprt.relight.reference.radiance`.
 
     Args:
         transport: Precomputed transport.
@@ -169,7 +172,8 @@ def radiance(
         Linear radiance per vertex, in the light's units.
 
     Raises:
-        ValueError: The BRDF or the light does not fit the transport.
+        ValueError: The BRDF has another number of terms than the transport, or as in `light_tuple`. That the
+            transport was made for this BRDF is not known and not checked.
 
     Reference: Wang, Tran, Luebke 2004, equation 6.
     """

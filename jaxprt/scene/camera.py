@@ -8,22 +8,28 @@ from jaxtyping import Array, Float
 from jaxprt.scene.mesh import Mesh, bounds
 
 
+def _floating(value) -> Array:
+    """A list, an array of integers and the like as a floating-point array."""
+    value = jnp.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
+
+
 class Camera(eqx.Module):
-    """A pinhole camera.
+    """A pinhole camera. Lists and NumPy arrays become arrays.
 
     Attributes:
         eye: Position in world units.
         target: The point that falls on the picture's center.
         up: Direction that points up in the picture; not parallel to the view.
-        field_of_view: Full vertical angle of view in radians.
+        field_of_view: Full vertical angle of view in radians, between 0 and pi.
         width: Picture width in pixels.
         height: Picture height in pixels.
     """
 
-    eye: Float[Array, "3"]
-    target: Float[Array, "3"]
-    up: Float[Array, "3"]
-    field_of_view: Float[Array, ""]
+    eye: Float[Array, "3"] = eqx.field(converter=_floating)
+    target: Float[Array, "3"] = eqx.field(converter=_floating)
+    up: Float[Array, "3"] = eqx.field(converter=_floating)
+    field_of_view: Float[Array, ""] = eqx.field(converter=_floating)
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
 

@@ -146,7 +146,7 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
     Args:
         light: One light, or a batch of them.
-        rotation: A proper rotation matrix.
+        rotation: A proper rotation matrix. Not checked, as this is jitted; other matrices give wrong light.
         samples: Parts along the edge of a texel.
 
     Returns:

@@ -1,25 +1,21 @@
 """Triangle meshes: the type, making them from files and arrays, joining and splitting, the ground beneath."""
 
-import io
 import pathlib
-import re
-import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
+from jaxprt.scene import mesh_file
 from jaxprt.sphere import directions
 
-SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 _CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alone is as near to it as this.
 _GAP = 5e-4  # Of the diagonal, between a mesh and the ground: more than rays start off a surface.
 _BLOCK = 8192
+_ORTHOGONAL = 1e-4  # What rounding may do to R R^T of a rotation made in float32.
 _DENSE = 0.4  # Spacing of the ground's vertices in its center, over that of a uniform grid.
 
 
@@ -62,16 +58,11 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is of no known kind, damaged or empty, has positions that are not finite, or faces that
-            name missing vertices.
+            name missing vertices. An OBJ that was cut off between two faces cannot be told from a whole one.
     """
     path = pathlib.Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no mesh file {path}")
-    position, face, normal, region = _concatenate(_read(path, suffix, groups), suffix, groups, str(path))
-    return _make(position, face, normal, None, region, name=str(path), welded=suffix != ".stl")
+    position, face, normal, region = mesh_file.read(path, groups=groups)
+    return _make(position, face, normal, None, region, name=str(path), welded=path.suffix.lower() != ".stl")
 
 
 def make_mesh(
@@ -100,8 +91,8 @@ def make_mesh(
         The mesh, in float32 and int32.
 
     Raises:
-        ValueError: There are no vertices or faces, a position is not finite, a face names a missing vertex, or a
-            region is negative.
+        ValueError: An array has another shape or kind of number, there are no vertices or faces, a position is not
+            finite, a face names a missing vertex, or a region is negative.
     """
     return _make(position, face, normal, tangent, region, name=name, welded=False)
 
@@ -165,7 +156,15 @@ def split(mesh: Mesh) -> list[Mesh]:
 
 
 def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
-    """The mesh turned by a rotation about the origin, frames and all."""
+    """The mesh turned by a rotation about the origin, frames and all.
+
+    Raises:
+        ValueError: The matrix is no proper rotation: it mirrors, scales or shears.
+    """
+    matrix = np.asarray(rotation, np.float64)
+    same = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL)
+    if not same or np.linalg.det(matrix) < 0:
+        raise ValueError(f"rotation must be a 3 x 3 matrix that turns and nothing else, got {matrix.tolist()}")
     place, normal, tangent = (v @ jnp.asarray(rotation, v.dtype).T for v in (mesh.position, mesh.normal, mesh.tangent))
     return Mesh(place, mesh.face, normal, tangent, mesh.region)
 
@@ -216,22 +215,35 @@ def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
 
 
 def _make(position, face, normal, tangent, region, *, name: str, welded: bool) -> Mesh:
+    position = _array(position, "position", (None, 3), name)
     with np.errstate(over="ignore"):  # What overflows float32 is reported below.
-        position = np.asarray(position, np.float32)
-    face = np.asarray(face)
+        position = position.astype(np.float32)
     count = len(position)
-    region = np.zeros(count, np.int32) if region is None else np.asarray(region)
+    face = _array(face, "face", (None, 3), name, whole=True)
+    region = np.zeros(count, np.int32) if region is None else _array(region, "region", (count,), name, whole=True)
     _check(position, face, region, name)
-    given = np.zeros(position.shape) if normal is None else np.asarray(normal, np.float64)
+    given = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
     length = np.linalg.norm(given, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
     given = np.where(bad, 0, given) / np.where(bad, 1, length)
     if bad.any():
         given = np.where(bad, _vertex_normal(position.astype(np.float64), face, welded), given)
-    brought = np.zeros(position.shape) if tangent is None else np.asarray(tangent, np.float64)
+    brought = np.zeros((count, 3)) if tangent is None else _array(tangent, "tangent", (count, 3), name)
+    brought = brought.astype(np.float64)
     brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
     normal, tangent = _frame(given, brought)
     return Mesh(jnp.asarray(position), jnp.asarray(face, jnp.int32), normal, tangent, jnp.asarray(region, jnp.int32))
+
+
+def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
+    """A field as an array, of the shape that it must have; None is any number."""
+    array = np.asarray(value)
+    fits = array.ndim == len(shape) and all(must in (None, n) for must, n in zip(shape, array.shape, strict=True))
+    kinds = (jnp.integer,) if whole else (jnp.integer, jnp.floating)
+    if not fits or not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
+        must = f"{'integers' if whole else 'real numbers'} [{', '.join(str(n or 'any') for n in shape)}]"
+        raise ValueError(f"{name}: {field} must be {must}, got {array.dtype} {list(array.shape)}")
+    return array
 
 
 def _check(position: np.ndarray, face: np.ndarray, region: np.ndarray, name: str) -> None:
@@ -298,95 +310,3 @@ def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.n
     order = order[area[order] > 0]
     some[face[order]] = unit[order, None]
     return np.where((normal == 0).all(1, keepdims=True), some, normal)
-
-
-def _read(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
-    """The file as trimesh has it, or an error that names it."""
-    options: dict[str, Any] = {}
-    source = path
-    if suffix == ".obj":
-        source = io.BytesIO(_obj_text(path).encode())
-        options = {
-            "skip_materials": True,
-            "group_material": not groups,
-            "split_objects": groups,
-            "split_groups": groups,
-        }
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return trimesh.load_scene(source, file_type=suffix[1:], process=False, **options)
-    except Exception as error:  # trimesh's parsers raise what they stumble over.
-        text = isinstance(error, ModuleNotFoundError)  # It guesses encodings with a package that is not needed.
-        detail = "it is not text" if text else f"{type(error).__name__}: {error}"
-        raise ValueError(
-            f"{path} must be an undamaged {suffix[1:].upper()} file, got one that cannot be read: {detail}"
-        ) from error
-
-
-def _obj_text(path: pathlib.Path) -> str:
-    """An OBJ with absolute indices: trimesh counts relative ones from the end of the file, not from their line."""
-    content = path.read_bytes()
-    if b"\0" in content:
-        raise ValueError(f"{path} must be an undamaged OBJ file, got one that is not text")
-    text = content.decode(errors="replace").replace("\t", " ").replace("\r\n", "\n").replace("\\\n", " ")
-    lines = [line.strip() for line in text.splitlines()]
-    count = {"v": 0, "vt": 0, "vn": 0}
-    absolute = lines.copy()
-    faces = []  # Line number, number of corners, lowest and highest vertex.
-    for number, line in enumerate(lines):
-        kind, _, rest = line.partition(" ")
-        if kind in count:
-            count[kind] += 1
-        elif kind == "f":
-            corners = rest.partition("#")[0].split()
-            if "-" in rest or "#" in rest:
-                corners = ["/".join(map(_absolute, corner.split("/"), count.values())) for corner in corners]
-                absolute[number] = "f " + " ".join(corners)
-            vertex = [int(index) if index.isdecimal() else 0 for index in (c.partition("/")[0] for c in corners)]
-            faces.append((number, len(vertex), min(vertex, default=0), max(vertex, default=0)))
-    wrong = [number for number, corners, low, high in faces if corners < 3 or low < 1 or high > count["v"]]
-    if wrong:
-        raise ValueError(
-            f"{path}: faces must name three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
-            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
-        )
-    return "\n".join(absolute)
-
-
-def _absolute(index: str, count: int) -> str:
-    """An index counted back from the latest element, counted from the first one instead."""
-    return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
-
-
-def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
-    """Positions, faces, normals (NaN where the file has none) and regions of all geometries in their places."""
-    parts, labels = [], {}
-    first = 0
-    nodes = list(scene.graph.nodes_geometry)
-    for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
-        transform, key = scene.graph[node]
-        geometry = scene.geometry[key]
-        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
-            continue
-        position, face = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
-        if position.ndim != 2 or position.shape[1] != 3:
-            raise ValueError(f"{name} must have three coordinates per vertex, got the shape {position.shape}")
-        # Asked for by name, normals that the file lacks would be computed.
-        normal = geometry._cache.cache.get("vertex_normals", np.full(position.shape, np.nan))
-        if transform is not None and not np.array_equal(transform, np.eye(4)):
-            linear = transform[:3, :3]
-            position = position @ linear.T + transform[:3, 3]
-            # The adjugate also serves a node that is scaled to nothing.
-            cofactor = np.stack([np.cross(linear[i - 2], linear[i - 1]) for i in range(3)])
-            mirrored = np.linalg.det(linear) < 0
-            normal = normal @ cofactor.T * (-1 if mirrored else 1)
-            face = face[:, ::-1] if mirrored else face
-        material = getattr(getattr(geometry.visual, "material", None), "name", None)
-        label = node if groups or suffix == ".obj" or not material else (material,)
-        region = np.full(len(position), labels.setdefault(label, len(labels)))
-        parts.append((position, face + first, normal, region))
-        first += len(position)
-    if not parts:
-        raise ValueError(f"{name} must hold vertices and faces, got no faces")
-    return tuple(np.concatenate(field) for field in zip(*parts, strict=True))

@@ -54,6 +54,20 @@ def test_psnr_of_a_constant_difference_is_known():
     assert metrics.psnr(image, image) == np.inf
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("metric", [metrics.relative_l2, metrics.psnr, metrics.flip])
+def test_images_of_different_shapes_are_refused(metric):
+    with pytest.raises(ValueError, match=r"images must have one shape, got \[4, 1, 3\] and \[1, 4, 3\]"):
+        metric(jnp.ones((4, 1, 3)), jnp.ones((1, 4, 3)))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("metric", [metrics.relative_l2, metrics.psnr])
+def test_images_of_small_integers_are_compared_as_numbers(metric):
+    dark, light = jnp.array([1, 250], jnp.uint8), jnp.array([3, 240], jnp.uint8)
+    assert metric(dark, light) == metric(jnp.array([1.0, 250]), jnp.array([3.0, 240]))
+
+
 def test_flip_is_zero_for_equal_images_and_grows_with_the_difference():
     pytest.importorskip("flip_evaluator")
     image, _ = _pair()

@@ -342,6 +342,14 @@ def test_an_attribute_may_have_any_trailing_shape():
     np.testing.assert_allclose(deep, jnp.stack([image, image], axis=2), atol=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(3, 3), (5, 3), (4, 0, 3), (4,)])
+@pytest.mark.usefixtures("unchecked")
+def test_another_number_of_colors_than_vertices_is_refused(shape):
+    mesh = Mesh(jnp.zeros((4, 3)), jnp.zeros((2, 3), jnp.int32), *[jnp.zeros((4, 3))] * 2, jnp.zeros(4, jnp.int32))
+    with pytest.raises(ValueError, match=r"color must be \[4, c\], one per vertex, got"):
+        raster.render(mesh, jnp.ones(shape), _camera())
+
+
 def test_a_mesh_without_triangles_is_refused():
     with pytest.raises(ValueError, match="got 0 triangles"):
         raster.rasterize(_mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), _camera())

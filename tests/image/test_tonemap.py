@@ -12,6 +12,13 @@ def test_a_stop_doubles_the_radiance():
     np.testing.assert_allclose(tonemap.expose(radiance, stops=-2.0), radiance / 4, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_pictures_of_integers_are_exposed_by_parts_of_stops():
+    np.testing.assert_allclose(tonemap.expose(jnp.array([1, 2]), stops=0.5), np.sqrt(2) * np.array([1, 2]), rtol=1e-6)
+    image = jnp.arange(1, 61).reshape(4, 5, 3)
+    assert tonemap.automatic_exposure(image) == tonemap.automatic_exposure(image.astype(jnp.float32))
+
+
 def test_srgb_equals_the_published_values():
     # IEC 61966-2-1: the end of the linear part, middle gray (encoded 0.5 is linear 0.21404114), white.
     linear = jnp.asarray([0.0, 0.0031308, 0.21404114, 1.0])

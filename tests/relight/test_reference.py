@@ -1,6 +1,7 @@
 """The reference against itself: batches, selections, linearity, closed forms. Mitsuba judges it elsewhere."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from jaxprt.sphere import cubemap, directions
 SIZE = 8
 EYE = jnp.array([2.0, 3.0, 4.0])
 HORIZON = 1e-2  # Texels of 8 x 8 faces that the horizon cuts: measured .7 % at worst.
+GRADIENT = 1e-2  # Differences of sums in float32 over a step of a fortieth.
 TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
 GLOSSY = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=0.3, nu=20, nv=60)
 
@@ -97,6 +99,20 @@ def test_vertices_do_not_depend_on_who_else_is_asked_for(mesh, random, close, co
     close(reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex), whole[vertex])
 
 
+def test_vertices_may_be_chosen_by_a_mask(mesh, random):
+    light, mask = some_light(random), random.random(len(mesh.position)) < 0.2
+    masked = reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=mask)
+    np.testing.assert_array_equal(masked, reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=np.flatnonzero(mask)))
+
+
+@pytest.mark.parametrize(
+    "vertex", [np.array(3), np.zeros((2, 2), int), np.zeros(5, bool), np.array([0.0]), np.array([999])]
+)
+def test_vertices_that_cannot_be_are_refused(mesh, random, vertex):
+    with pytest.raises(ValueError, match=r"vertex must be a mask .* or whole numbers below"):
+        reference.radiance(mesh, GLOSSY, some_light(random), eye=EYE, vertex=vertex)
+
+
 def test_radiance_is_linear_in_light_and_albedo(random, close):
     arrays = hemisphere(random, 5)
     first, second = some_light(random), some_light(random)
@@ -161,6 +177,30 @@ def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close)
         reference.radiance(mesh, brdf, light, eye=EYE, vertex=vertex),
         tolerance=TURNED,
     )
+
+
+def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
+    light, model = some_light(random), Lambert([0.2, 0.5, 0.9])
+    expected = reference.radiance(mesh, model, light, eye=EYE)
+    close(reference.radiance(mesh, lambda wi, wo: model(wi, wo), light, eye=EYE), expected)
+    close(reference.radiance(mesh, model.__call__, light, eye=EYE), expected)
+
+
+@pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
+def test_values_without_one_row_per_direction_are_refused(mesh, random, value):
+    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] here, got \["):
+        reference.radiance(mesh, value, some_light(random), eye=EYE)
+
+
+def test_the_gradient_in_parameters_of_a_brdf_equals_finite_differences(mesh, random):
+    light = some_light(random)
+
+    def total(nu):
+        brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=nu, nv=30)
+        return jnp.sum(reference.radiance(mesh, brdf, light, eye=EYE))
+
+    slope = float(jax.grad(total)(20.0))
+    assert abs(slope - float(total(20.5) - total(19.5))) < GRADIENT * abs(slope)
 
 
 def test_lights_whose_faces_are_no_power_of_two_are_refused(mesh):

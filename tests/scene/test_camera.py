@@ -1,8 +1,10 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxprt.image import rasterize, ray_direction
 from jaxprt.scene.builtin import sphere
-from jaxprt.scene.camera import orbit
+from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.mesh import make_mesh
 
 
@@ -74,6 +76,19 @@ def test_a_mesh_without_extent_is_seen_from_a_distance():
     camera = orbit(point)
     assert np.isfinite(camera.eye).all()
     assert np.linalg.norm(camera.eye) > 0
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_a_camera_may_be_made_of_lists_and_whole_numbers(kind):
+    camera = Camera(kind([0, 0, 4]), target=kind([0, 0, 0]), up=kind([0, 1, 0]), field_of_view=1, width=8, height=6)
+    arrays = Camera(jnp.array([0.0, 0, 4]), jnp.zeros(3), jnp.array([0.0, 1, 0]), jnp.float32(1), 8, 6)
+    np.testing.assert_array_equal(ray_direction(camera), ray_direction(arrays))
+    assert camera.eye.dtype == camera.field_of_view.dtype == jnp.float32
+    np.testing.assert_array_equal(rasterize(sphere(), camera).triangle, rasterize(sphere(), arrays).triangle)
+
+
+def test_a_camera_keeps_double_precision(x64):
+    assert Camera(np.array([0.1, 0, 4]), np.zeros(3), [0, 1, 0], 1, 8, 6).eye.dtype == jnp.float64
 
 
 @pytest.mark.parametrize(

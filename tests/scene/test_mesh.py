@@ -143,6 +143,77 @@ def test_impossible_arrays_are_refused_with_name_count_and_first_offender(change
         make_mesh(fields.pop("position"), fields.pop("face"), name="hat", **fields)
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position": SQUARE[:, :2]}, r"hat: position must be real numbers \[any, 3\], got float64 \[4, 2\]"),
+        ({"position": SQUARE.ravel()}, r"hat: position must be real numbers \[any, 3\], got float64 \[12\]"),
+        ({"position": SQUARE.astype(complex)}, r"position must be real numbers .* got complex128"),
+        ({"face": np.array([[0, 1, 2, 3]])}, r"hat: face must be integers \[any, 3\], got int64 \[1, 4\]"),
+        ({"face": np.array([0, 1, 2])}, r"face must be integers \[any, 3\], got int64 \[3\]"),
+        ({"face": SQUARE_FACE.astype(float)}, r"face must be integers \[any, 3\], got float64 \[2, 3\]"),
+        ({"face": SQUARE_FACE > 1}, r"face must be integers \[any, 3\], got bool \[2, 3\]"),
+        ({"normal": SQUARE[:3]}, r"normal must be real numbers \[4, 3\], got float64 \[3, 3\]"),
+        ({"tangent": SQUARE[0]}, r"tangent must be real numbers \[4, 3\], got float64 \[3\]"),
+        ({"region": np.zeros(3, int)}, r"region must be integers \[4\], got int64 \[3\]"),
+        ({"region": np.zeros(4)}, r"region must be integers \[4\], got float64 \[4\]"),
+    ],
+)
+def test_arrays_of_another_shape_or_kind_are_refused_with_what_was_required_and_what_came(change, message):
+    fields = {"position": SQUARE, "face": SQUARE_FACE} | change
+    with pytest.raises(ValueError, match=message):
+        make_mesh(fields.pop("position"), fields.pop("face"), name="hat", **fields)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_lists_make_a_mesh(close):
+    mesh = make_mesh(SQUARE.tolist(), SQUARE_FACE.tolist(), normal=[[0, 0, 2]] * 4, region=[0, 0, 0, 0])
+    assert_equal(mesh, make_mesh(SQUARE, SQUARE_FACE))
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        2 * np.eye(3),
+        np.diag([1.0, 1, -1]),
+        -np.eye(3),
+        np.eye(2),
+        np.eye(4),
+        np.eye(3) + np.eye(3, k=1),
+        np.full((3, 3), np.nan),
+    ],
+)
+def test_only_rotations_turn_a_mesh(matrix):
+    with pytest.raises(ValueError, match="rotation must be a 3 x 3 matrix that turns and nothing else, got"):
+        turn(make_mesh(SQUARE, SQUARE_FACE), matrix)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.995])
+@pytest.mark.parametrize("suffix", ["ply", "off"])
+def test_text_that_is_cut_off_is_refused(tmp_path, suffix, share):
+    text = ball().export(file_type=suffix, **({"encoding": "ascii"} if suffix == "ply" else {}))
+    text = text if isinstance(text, bytes) else text.encode()
+    assert len(load_mesh(write(tmp_path, f"whole.{suffix}", text)).face) == 320
+    with pytest.raises(ValueError, match=rf"cut.{suffix} must be an undamaged {suffix.upper()} file"):
+        load_mesh(write(tmp_path, f"cut.{suffix}", text[: int(share * len(text))]))
+
+
+def test_text_that_ends_within_its_last_face_is_refused_and_more_than_is_counted_is_not(tmp_path):
+    rows = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n\n4 0 1 2 3\n"
+    ply = "ply\nformat ascii 1.0\ncomment property of nobody\nelement vertex 4\nproperty float x\nproperty float y\n"
+    ply += "property float z\nelement face 2\nproperty list uchar int vertex_indices\nelement edge 0\nproperty int a\n"
+    texts = {
+        "a.ply": ply + "end_header\n" + rows.replace("\n\n", "\n"),
+        "a.off": "OFF # 9 9 9\n4 2 0\n# two faces\n" + rows,
+    }
+    for name, text in texts.items():
+        assert load_mesh(write(tmp_path, name, text)).face.shape == (3, 3)
+        assert load_mesh(write(tmp_path, name, text.replace("\n", "\r\n") + "\n1 2\n")).face.shape == (3, 3)
+        with pytest.raises(ValueError, match="its last row must have 5 numbers, but has 4"):
+            load_mesh(write(tmp_path, name, text.removesuffix(" 3\n")))
+
+
 def test_normals_are_smooth_across_seams_of_an_obj_but_not_across_creases(tmp_path, close):
     # Texture coordinates that differ per face split every vertex of this sphere and of this cube.
     source = ball()

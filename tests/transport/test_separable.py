@@ -152,7 +152,13 @@ def test_impossible_sizes_are_refused(factored, options, message):
         precompute(prt.scene.builtin.plane(cells=1), factored, progress=False, **options)
 
 
-@pytest.mark.parametrize("field", ["position", "normal"])
+@pytest.mark.usefixtures("unchecked")
+def test_a_brdf_that_is_not_factored_is_refused():
+    with pytest.raises(TypeError, match=r"must be factored, by jaxprt.brdf.separable.factor, got Lambert"):
+        precompute(prt.scene.builtin.plane(cells=1), prt.brdf.Lambert(0.5), keep=4, size=2, progress=False)
+
+
+@pytest.mark.parametrize("field", ["position", "normal", "tangent"])
 def test_values_that_are_not_finite_are_refused(factored, field):
     mesh = prt.scene.builtin.plane(cells=1)
     broken = prt.scene.Mesh(

@@ -1,0 +1,140 @@
+"""Meshes in files: what trimesh reads of each format, with the damage that it passes over refused."""
+
+import io
+import pathlib
+import re
+import warnings
+from typing import Any
+
+import numpy as np
+import trimesh
+
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
+
+
+def read(path: pathlib.Path, *, groups: bool) -> tuple[np.ndarray, ...]:
+    """Positions, faces, normals (NaN where the file has none) and regions; see `jaxprt.scene.load_mesh`."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no mesh file {path}")
+    return _concatenate(_load(path, suffix, groups), suffix, groups, str(path))
+
+
+def _load(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
+    """The file as trimesh has it, or an error that names it."""
+    options: dict[str, Any] = {}
+    source = path
+    if suffix == ".obj":
+        source = io.BytesIO(_obj_text(path).encode())
+        options = {
+            "skip_materials": True,
+            "group_material": not groups,
+            "split_objects": groups,
+            "split_groups": groups,
+        }
+    try:
+        if suffix in (".ply", ".off"):
+            _check_rows(path.read_bytes(), suffix)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return trimesh.load_scene(source, file_type=suffix[1:], process=False, **options)
+    except Exception as error:  # trimesh's parsers raise what they stumble over.
+        text = isinstance(error, ModuleNotFoundError)  # It guesses encodings with a package that is not needed.
+        detail = "it is not text" if text else f"{type(error).__name__}: {error}"
+        raise ValueError(
+            f"{path} must be an undamaged {suffix[1:].upper()} file, got one that cannot be read: {detail}"
+        ) from error
+
+
+def _check_rows(content: bytes, suffix: str) -> None:
+    """Refuses PLY and OFF text that ends before the rows which its header counts."""
+    if suffix == ".ply":
+        header, _, body = content.partition(b"end_header")
+        element = re.findall(rb"^element\s+\S+\s+(\d+)([^\0]*?)(?=^element|\Z)", header, re.MULTILINE)
+        known = b"format ascii" in header and element
+    else:
+        text = re.sub(rb"#.*", b"", content)
+        known = re.match(rb"\s*\w*OFF\s+(\d+)\s+(\d+).*", text)
+        body = text[known.end() :] if known else b""
+        element = [(known[1], b""), (known[2], b"property list")] if known else []
+    expected = sum(int(count) for count, _ in element)
+    if not known or not expected:
+        return
+    rows = [row for row in body.splitlines() if row.strip()]
+    if len(rows) < expected:
+        raise ValueError(f"its header counts {expected} rows, but it has {len(rows)}")
+    last, length = rows[expected - 1].split(), 0
+    for is_list in re.findall(rb"^property\s+(list\b)?", [p for n, p in element if int(n)][-1], re.MULTILINE):
+        length += 1 + (int(last[length]) if is_list and length < len(last) else 0)
+    if len(last) < length:
+        raise ValueError(f"its last row must have {length} numbers, but has {len(last)}")
+
+
+def _obj_text(path: pathlib.Path) -> str:
+    """An OBJ with absolute indices: trimesh counts relative ones from the end of the file, not from their line."""
+    content = path.read_bytes()
+    if b"\0" in content:
+        raise ValueError(f"{path} must be an undamaged OBJ file, got one that is not text")
+    text = content.decode(errors="replace").replace("\t", " ").replace("\r\n", "\n").replace("\\\n", " ")
+    lines = [line.strip() for line in text.splitlines()]
+    count = {"v": 0, "vt": 0, "vn": 0}
+    absolute = lines.copy()
+    faces = []  # Line number, number of corners, lowest and highest vertex.
+    for number, line in enumerate(lines):
+        kind, _, rest = line.partition(" ")
+        if kind in count:
+            count[kind] += 1
+        elif kind == "f":
+            corners = rest.partition("#")[0].split()
+            if "-" in rest or "#" in rest:
+                corners = ["/".join(map(_absolute, corner.split("/"), count.values())) for corner in corners]
+                absolute[number] = "f " + " ".join(corners)
+            vertex = [int(index) if index.isdecimal() else 0 for index in (c.partition("/")[0] for c in corners)]
+            faces.append((number, len(vertex), min(vertex, default=0), max(vertex, default=0)))
+    wrong = [number for number, corners, low, high in faces if corners < 3 or low < 1 or high > count["v"]]
+    if wrong:
+        raise ValueError(
+            f"{path}: faces must name three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
+            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
+        )
+    return "\n".join(absolute)
+
+
+def _absolute(index: str, count: int) -> str:
+    """An index counted back from the latest element, counted from the first one instead."""
+    return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
+
+
+def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
+    """Positions, faces, normals (NaN where the file has none) and regions of all geometries in their places."""
+    parts, labels = [], {}
+    first = 0
+    nodes = list(scene.graph.nodes_geometry)
+    for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
+        transform, key = scene.graph[node]
+        geometry = scene.geometry[key]
+        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
+            continue
+        position, face = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise ValueError(f"{name} must have three coordinates per vertex, got the shape {position.shape}")
+        # Asked for by name, normals that the file lacks would be computed.
+        normal = geometry._cache.cache.get("vertex_normals", np.full(position.shape, np.nan))
+        if transform is not None and not np.array_equal(transform, np.eye(4)):
+            linear = transform[:3, :3]
+            position = position @ linear.T + transform[:3, 3]
+            # The adjugate also serves a node that is scaled to nothing.
+            cofactor = np.stack([np.cross(linear[i - 2], linear[i - 1]) for i in range(3)])
+            mirrored = np.linalg.det(linear) < 0
+            normal = normal @ cofactor.T * (-1 if mirrored else 1)
+            face = face[:, ::-1] if mirrored else face
+        material = getattr(getattr(geometry.visual, "material", None), "name", None)
+        label = node if groups or suffix == ".obj" or not material else (material,)
+        region = np.full(len(position), labels.setdefault(label, len(labels)))
+        parts.append((position, face + first, normal, region))
+        first += len(position)
+    if not parts:
+        raise ValueError(f"{name} must hold vertices and faces, got no faces")
+    return tuple(np.concatenate(field) for field in zip(*parts, strict=True))
