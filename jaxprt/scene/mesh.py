@@ -169,6 +169,27 @@ def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     return Mesh(place, mesh.face, normal, tangent, mesh.region)
 
 
+def brush(mesh: Mesh, direction: ArrayLike | Sequence[float]) -> Mesh:
+    """The mesh brushed along one direction: its tangents are that direction, projected to every tangent plane.
+
+    Where it is parallel to the normal, the normal's own tangent of `sphere.directions` takes its place.
+
+    Args:
+        mesh: The mesh.
+        direction: In the world, of any length.
+
+    Raises:
+        ValueError: The direction is zero, or not three finite numbers.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 6.
+    """
+    along = np.asarray(direction, np.float64)
+    if along.shape != (3,) or not np.all(np.isfinite(along)) or not np.any(along):
+        raise ValueError(f"direction must be three finite numbers that are not all zero, got {along.tolist()}")
+    same = jnp.broadcast_to(jnp.asarray(along / np.abs(along).max(), mesh.normal.dtype), mesh.normal.shape)
+    return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, same)[:, 0])
+
+
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
     """A square grid of ground for a mesh to stand on, centered under it.
 

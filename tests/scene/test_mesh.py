@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import Mesh, ground_plane, join, load_mesh, make_mesh, split, turn
+from jaxprt.scene.mesh import Mesh, brush, ground_plane, join, load_mesh, make_mesh, split, turn
 from jaxprt.sphere import directions
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -340,3 +340,22 @@ def test_turned_mesh_keeps_its_shape_and_frames():
     assert_frames(turned)
     np.testing.assert_allclose(turned.normal, turned.position, atol=1e-6)
     np.testing.assert_array_equal(turned.face, mesh.face)
+
+
+def test_brushed_tangents_are_the_direction_in_every_tangent_plane():
+    mesh = brush(builtin.sphere(rings=9, sectors=12), [0, 3e-30, 0])
+    assert_frames(mesh)
+    level = np.asarray(mesh.normal)
+    flat = np.array([0, 1, 0]) - level * level[:, 1:2]
+    length = np.linalg.norm(flat, axis=1)
+    off_poles = length > 1e-3
+    assert off_poles.sum() > 0.9 * len(level)
+    np.testing.assert_allclose(
+        mesh.tangent[off_poles], (flat / np.maximum(length, 1e-3)[:, None])[off_poles], atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("direction", [[0, 0, 0], [np.nan, 0, 1], [1, 2]])
+def test_no_mesh_is_brushed_along_nothing(direction):
+    with pytest.raises(ValueError, match="direction must be three finite numbers that are not all zero, got"):
+        brush(builtin.plane(cells=1), direction)
