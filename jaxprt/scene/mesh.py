@@ -169,7 +169,7 @@ def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     return Mesh(place, mesh.face, normal, tangent, mesh.region)
 
 
-def brush(mesh: Mesh, direction: ArrayLike | Sequence[float]) -> Mesh:
+def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     """The mesh brushed along one direction: its tangents are that direction, projected to every tangent plane.
 
     Where it is parallel to the normal, the normal's own tangent of `sphere.directions` takes its place.

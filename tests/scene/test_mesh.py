@@ -343,7 +343,7 @@ def test_turned_mesh_keeps_its_shape_and_frames():
 
 
 def test_brushed_tangents_are_the_direction_in_every_tangent_plane():
-    mesh = brush(builtin.sphere(rings=9, sectors=12), [0, 3e-30, 0])
+    mesh = brush(builtin.sphere(rings=9, sectors=12), np.array([0, 3e-30, 0]))
     assert_frames(mesh)
     level = np.asarray(mesh.normal)
     flat = np.array([0, 1, 0]) - level * level[:, 1:2]
@@ -358,4 +358,4 @@ def test_brushed_tangents_are_the_direction_in_every_tangent_plane():
 @pytest.mark.parametrize("direction", [[0, 0, 0], [np.nan, 0, 1], [1, 2]])
 def test_no_mesh_is_brushed_along_nothing(direction):
     with pytest.raises(ValueError, match="direction must be three finite numbers that are not all zero, got"):
-        brush(builtin.plane(cells=1), direction)
+        brush(builtin.plane(cells=1), np.array(direction))
