@@ -78,7 +78,7 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
     count, terms = len(mesh.position), len(light)
     axes = directions.frame(mesh.normal, mesh.tangent)
     eye = mesh.position.mean(0) + 3 * (mesh.position.max(0) - mesh.position.min(0))
-    matrix = jax.random.normal(jax.random.key(1), (terms, terms, 1, count))
+    matrix = jax.random.normal(jax.random.key(1), (count, 1, terms, terms))
     shadowed = TransferMatrix(matrix, mesh.position, axes)
     view = relight.view_coefficients(table, mesh.position, axes, eye=eye)
     turned, through = relight.world_view(axes, view), relight.transferred_view(shadowed, view)
@@ -136,7 +136,7 @@ def errors(quick: bool) -> list[dict]:
         for sky, light in lights.items():
             truth = reference.radiance(mesh, model, light, eye=eye, vertex=vertex)
             for order in orders:
-                matrix = full.matrix[: order**2, : order**2]
+                matrix = full.matrix[..., : order**2, : order**2]
                 short, few = TransferMatrix(matrix, full.position, full.frame), table.truncate(degree=order - 1)
                 for window, factor in WINDOWS.items():
                     coefficient = relight.project(light, degree=order - 1)

@@ -283,7 +283,7 @@ def table_harmonic(whole: Scene, vertex: np.ndarray, truth: np.ndarray) -> list[
     full = transport.harmonic.precompute(part.mesh, degree=degree, occluder=whole.mesh, vertex=vertex)
     rows = []
     for order, window in itertools.product(TABLE_ORDERS, WINDOWS):
-        matrix = full.matrix[: order**2, : order**2]
+        matrix = full.matrix[..., : order**2, : order**2]
         short = transport.TransferMatrix(matrix, full.position, full.frame)
         few = table.truncate(degree=order - 1)
         row = {"system": "harmonic", "coefficients": order**2, "window": window}

@@ -153,7 +153,7 @@ class Draw:
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
         return transport.TransferMatrix(
-            self.normal(4, 4, 1, vertices), self.normal(vertices, 3), self.rotation(vertices)
+            self.normal(vertices, 1, 4, 4), self.normal(vertices, 3), self.rotation(vertices)
         )
 
     def seen(self, count, size=4):

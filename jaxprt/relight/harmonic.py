@@ -50,7 +50,7 @@ def radiance(
     Reference: Kautz, Sloan, Snyder 2002, sections 4 and 5.
     """
     view = view_coefficients(brdf, transport.position, transport.frame, *parameter, eye=eye)
-    return combine(transferred_light(transport, light), view)
+    return combine(light, transferred_view(transport, view))
 
 
 @jax.jit
@@ -134,18 +134,16 @@ def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"])
     Raises:
         ValueError: Light and transport differ in degree.
     """
-    terms, _, colors, count = transport.matrix.shape
+    count, colors, terms, _ = transport.matrix.shape
     _check_degree(light.shape[0], terms, "the light", "the transport")
     if light.ndim == 3:
-        part = [
-            sum(transport.matrix[i, :, _color(c, colors)] * light[i, c] for i in range(terms)) for c in _colors(light)
-        ]
-        return jnp.stack([jnp.asarray(each) for each in part], 1)
+        several = jnp.broadcast_to(light, (terms, max(colors, light.shape[1]), count))
+        return jnp.einsum(
+            "vcoi,icv->ocv", jnp.broadcast_to(transport.matrix, (count, several.shape[1], terms, terms)), several
+        )
     if colors == 1:
-        arriving = (light.T @ transport.matrix.reshape(terms, -1)).reshape(-1, terms, count)
-        return arriving.swapaxes(0, 1)
-    part = [light[:, c] @ transport.matrix[:, :, c].reshape(terms, -1) for c in _colors(light)]
-    return jnp.stack(part).reshape(-1, terms, count).swapaxes(0, 1)
+        return (transport.matrix.reshape(-1, terms) @ light).reshape(count, terms, -1).transpose(1, 2, 0)
+    return jnp.einsum("vcoi,ic->ocv", transport.matrix, jnp.broadcast_to(light, (terms, colors)))
 
 
 @jax.jit
@@ -175,14 +173,14 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
     Raises:
         ValueError: The table and the transport differ in degree.
     """
-    terms, _, colors, _ = transport.matrix.shape
+    count, colors, terms, _ = transport.matrix.shape
     _check_degree(view.shape[0], terms, "the BRDF", "the transport")
-    number = range(max(colors, view.shape[1]))
-    part = [
-        sum(transport.matrix[:, o, _color(c, colors)] * view[o, _color(c, view.shape[1])] for o in range(terms))
-        for c in number
-    ]
-    return jnp.stack(part, 1)
+    rows = view.transpose(2, 1, 0)
+    if colors == 1:
+        # Color by color, each a product of one vector and one matrix per vertex.
+        part = [jnp.einsum("voi,vo->iv", transport.matrix[:, 0], rows[:, c]) for c in range(view.shape[1])]
+        return jnp.stack(part, 1)
+    return jnp.einsum("vcoi,vco->icv", transport.matrix, jnp.broadcast_to(rows, (count, colors, terms)))
 
 
 @jax.jit
@@ -205,10 +203,6 @@ def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Flo
         for c in range(colors)
     ]
     return jnp.stack(part, -1)
-
-
-def _colors(light: Array) -> range:
-    return range(light.shape[1])
 
 
 def _color(number: int, colors: int) -> int:

@@ -28,13 +28,14 @@ class TransferMatrix(eqx.Module):
     """Light that arrives at each vertex, as a linear map of the distant light.
 
     Attributes:
-        matrix: From the light's coefficient in the world (first axis) to the arriving light's in the local frame;
-            gray, or one per color where colored surfaces light each other.
+        matrix: To each coefficient of the arriving light in the local frame (third axis) from those of the light in
+            the world (last axis); gray, or one per color where colored surfaces light each other. Vertices come
+            first, so that a view's coefficients meet a matrix in one place.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
     """
 
-    matrix: Float[Array, "lm lm l v"]
+    matrix: Float[Array, "v l lm lm"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
 
@@ -117,8 +118,8 @@ def precompute_diffuse(
 
 
 @partial(jax.jit, static_argnames="degree")
-def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "lm lm b"]:
-    """Transfer matrices of shadowed light: M_io = ∫ V y_i (in the world) y_o (in the local frame).
+def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "b lm lm"]:
+    """Transfer matrices of shadowed light: M_oi = ∫ V y_o (in the local frame) y_i (in the world).
 
     Below the horizon, where no BRDF meets it, the light counts as dimmed by the mean visibility, and not as dark: an
     edge there would only ring. So an open vertex has the rotation to its frame, and one that sees nothing zero.
@@ -142,7 +143,7 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ visible)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
-    return rotation.rotate_each(jnp.moveaxis(world, 0, -1), frame).swapaxes(0, 1)
+    return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), frame), -1, 0)
 
 
 @partial(jax.jit, static_argnames="degree")
@@ -198,12 +199,12 @@ class _MatrixJob(visibility.VisibilityJob):
     @property
     def layout(self) -> Mapping[str, Layout]:
         terms = (self.degree + 1) ** 2
-        return {"matrix": Layout((terms, terms, 1, visibility.BLOCK), 3, "float32")}
+        return {"matrix": Layout((visibility.BLOCK, 1, terms, terms), 0, "float32")}
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         matrix = transfer(seen, self.frame[self.part(block)], degree=self.degree)
-        return {"matrix": np.asarray(matrix)[:, :, None]}, count.rays
+        return {"matrix": np.asarray(matrix)[:, None]}, count.rays
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ shade the light of the bounce before towards it. Sloan, Kautz and Snyder 2002, s
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -53,20 +54,17 @@ def interreflect(
 
     Reference: Kautz, Sloan, Snyder 2002, section 5; Sloan, Kautz, Snyder 2002, section 5.
     """
-    check(harmonics.degree_of(transport.matrix.shape[0]), size)
-    _check_regions(mesh, transport.matrix, len(brdf))
-    wrong = [each.degree for each in brdf if each.table.shape[0] != transport.matrix.shape[0] or each.knot]
+    check(harmonics.degree_of(transport.matrix.shape[-1]), size)
+    _check_regions(mesh, len(transport.position), len(brdf))
+    wrong = [each.degree for each in brdf if each.table.shape[0] != transport.matrix.shape[-1] or each.knot]
     if wrong:
-        raise ValueError(
-            f"BRDFs must have the transport's degree {harmonics.degree_of(transport.matrix.shape[0])} and no parameters"
-            f", got degrees {wrong}"
-        )
-    colors = max(transport.matrix.shape[2], *(each.table.shape[1] for each in brdf))
-    shape = (*transport.matrix.shape[:2], colors, transport.matrix.shape[3])
+        degree = harmonics.degree_of(transport.matrix.shape[-1])
+        raise ValueError(f"BRDFs must have the transport's degree {degree} and no parameters, got degrees {wrong}")
+    colors = max(transport.matrix.shape[1], *(each.table.shape[1] for each in brdf))
+    shape = (len(transport.matrix), colors, *transport.matrix.shape[2:])
     total = last = np.broadcast_to(np.asarray(transport.matrix), shape)
     for number in range(bounces):
-        rows = np.ascontiguousarray(last.transpose(3, 2, 1, 0))
-        job = _BounceJob.make(mesh, None, None, size, brdf=tuple(brdf), rows=rows)
+        job = _BounceJob.make(mesh, None, None, size, brdf=tuple(brdf), rows=np.ascontiguousarray(last))
         label = f"bounce {number + 1}"
         last = blocks.compute(job, executor=executor, progress=progress, label=label)["matrix"]
         total = total + last
@@ -101,7 +99,7 @@ def interreflect_diffuse(
     """
     check(harmonics.degree_of(transport.vector.shape[0]), size)
     albedo = np.asarray(albedo, transport.vector.dtype)
-    _check_regions(mesh, transport.vector, len(albedo))
+    _check_regions(mesh, len(transport.position), len(albedo))
     colors = max(transport.vector.shape[1], albedo.shape[1])
     total = last = np.broadcast_to(
         np.asarray(transport.vector), (transport.vector.shape[0], colors, transport.vector.shape[2])
@@ -142,14 +140,15 @@ def _shade(
 
 
 @jax.jit
-def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "lm lm l b"]:
+def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "b l lm lm"]:
     """The light that arrives from all texels, in the local frame."""
     count, texels, colors, terms = leaving.shape
     size = haar.face_edge(texels)
     direction, area = cubemap.direction(size=size).reshape(-1, 3), cubemap.solid_angle(size=size).reshape(-1, 1)
     basis = harmonics.evaluate(direction, degree=harmonics.degree_of(terms)) * area
     world = jnp.moveaxis(basis.T @ leaving.reshape(count, texels, -1), 0, -1)
-    return jnp.moveaxis(rotation.rotate_each(world, frame).reshape(terms, colors, terms, count), 2, 0)
+    local = rotation.rotate_each(world, frame).reshape(terms, colors, terms, count)
+    return local.transpose(3, 1, 0, 2)
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,12 @@ class _BounceJob(visibility.VisibilityJob):
     """Blocks of what one bounce adds to transfer matrices."""
 
     brdf: tuple[HarmonicBrdf, ...]
-    rows: np.ndarray  # [v, l, o, i] transfer of the bounce before, vertex by vertex, since hits gather whole matrices
+    rows: np.ndarray  # [v, l, o, i] transfer of the bounce before
+
+    @cached_property
+    def shading(self) -> tuple[Array, Array, Array, tuple[HarmonicBrdf, ...]]:
+        """What hits are shaded with, on the device once for all blocks."""
+        return jnp.asarray(self.rows), jnp.asarray(self.frame), jnp.asarray(self.occluder.region), self.brdf
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -166,18 +170,17 @@ class _BounceJob(visibility.VisibilityJob):
     @property
     def layout(self) -> Mapping[str, Layout]:
         _, colors, terms, _ = self.rows.shape
-        return {"matrix": Layout((terms, terms, colors, visibility.BLOCK), 3, "float32")}
+        return {"matrix": Layout((visibility.BLOCK, colors, terms, terms), 0, "float32")}
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
         vertex, texel, corner, weight, count = _hits(self, part)
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         leaving = np.zeros((len(part), len(direction), self.rows.shape[1], self.rows.shape[3]), np.float32)
-        region = np.asarray(self.occluder.region)
         for first in range(0, len(vertex), _RAYS):
             # Padded with a hit's copies, so that one compiled function serves all.
             at = np.minimum(np.arange(first, first + _RAYS), len(vertex) - 1)
-            shaded = _shade(self.rows, self.frame, region, self.brdf, corner[at], weight[at], direction[texel[at]])
+            shaded = _shade(*self.shading, corner[at], weight[at], direction[texel[at]])
             leaving[vertex[at], texel[at]] = shaded
         return {"matrix": np.asarray(_arriving(leaving, self.frame[part]))}, count
 
@@ -223,12 +226,10 @@ def _hits(
     return vertex[met], texel[met], corner, weight[met], len(vertex)
 
 
-def _check_regions(mesh: Mesh, transport: Array, count: int) -> None:
+def _check_regions(mesh: Mesh, vertices: int, materials: int) -> None:
     """Refuses transport of other vertices, and regions without a material."""
-    if transport.shape[-1] != len(mesh.position):
-        raise ValueError(
-            f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {transport.shape[-1]}"
-        )
+    if vertices != len(mesh.position):
+        raise ValueError(f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {vertices}")
     regions = int(np.max(mesh.region, initial=0)) + 1
-    if count < regions:
-        raise ValueError(f"each of the mesh's {regions} regions must have a material, got {count}")
+    if materials < regions:
+        raise ValueError(f"each of the mesh's {regions} regions must have a material, got {materials}")
