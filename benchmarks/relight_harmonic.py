@@ -20,12 +20,12 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.precompute_separable import Recorder, embree_alone
-from jaxprt import brdf, scene
+from jaxprt import brdf, report, scene
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.relight import harmonic as relight
 from jaxprt.relight import reference
 from jaxprt.scene import Mesh, builtin, load_mesh
-from jaxprt.sphere import directions, harmonics, rotation
+from jaxprt.sphere import directions, rotation
 from jaxprt.transport import TransferMatrix, visibility
 from jaxprt.transport import harmonic as transport
 
@@ -39,7 +39,6 @@ BRDFS = {
     "glossy (12, 4)": AshikhminShirley(nu=12, nv=4),
     "sharp (48, 16)": AshikhminShirley(nu=48, nv=16),
 }
-WINDOWS = {"none": None, "hann": harmonics.hann, "lanczos": harmonics.lanczos}
 
 
 def main() -> None:
@@ -138,10 +137,8 @@ def errors(quick: bool) -> list[dict]:
             for order in orders:
                 matrix = full.matrix[..., : order**2, : order**2]
                 short, few = TransferMatrix(matrix, full.position, full.frame), table.truncate(degree=order - 1)
-                for window, factor in WINDOWS.items():
-                    coefficient = relight.project(light, degree=order - 1)
-                    if factor is not None:
-                        coefficient = harmonics.convolve(coefficient, factor(degree=order - 1))
+                for window in report.WINDOWS:
+                    coefficient = report.harmonic_light(light, order=order, window=window)
                     call = lambda s=short, f=few, c=coefficient: relight.radiance(s, f, c, eye=eye)  # noqa: E731
                     color = call()
                     lines.append(
@@ -197,7 +194,7 @@ def plot(lines: list[dict], path: pathlib.Path) -> None:
     figure, axes = pyplot.subplots(1, len(lights), figsize=(5 * len(lights), 4), sharey=True, squeeze=False)
     for panel, light in zip(axes[0], lights, strict=True):
         for name in BRDFS:
-            for window, style in zip(WINDOWS, ("-", "--", ":"), strict=True):
+            for window, style in zip(report.WINDOWS, ("-", "--", ":", "-."), strict=True):
                 row = [x for x in lines if (x["light"], x["brdf"], x["window"]) == (light, name, window)]
                 time_each = [1e9 * x["seconds"] / x["vertices"] for x in row]
                 panel.loglog(time_each, [x["error"] for x in row], style, marker="o", label=f"{name}, {window}")

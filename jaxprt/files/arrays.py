@@ -45,7 +45,8 @@ class BlockStore:
     def __init__(self, path: str | os.PathLike, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int):
         self.path = Path(path)
         self._layout = dict(layout)
-        header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, **header}
+        shapes = {name: [*at.shape, at.dtype] for name, at in layout.items()}
+        header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, "shapes": shapes, **header}
         if not self.path.exists():
             _create(self.path, header, self._layout, blocks)
         self._group = _open(self.path, header)
