@@ -33,8 +33,8 @@ class HarmonicBrdf(eqx.Module):
         table: Coefficients in l(l+1)+m order, gray or one per color, at the texels of a parabolic map of the view
             direction; axes between follow the parameters.
         knot: Increasing values of each parameter at which the table was made; none where the BRDF does not vary.
-        error: Relative L2 error of the quadrature over all coefficients of some fifty views: the rule that was used
-            against the next finer one.
+        error: Relative L2 error of the quadrature over all coefficients of some fifty views, evenly spread in height:
+            the rule that was used against the next finer one. Views that graze the surface may have several times it.
     """
 
     table: Float[Array, "lm c *q n n"]
@@ -93,9 +93,10 @@ class HarmonicBrdf(eqx.Module):
 
         Not zero below the horizon of wi, where the sum rings about zero.
         """
-        wi, wo, *values = (each.reshape(-1, *each.shape[wo.ndim - 1 :]) for each in (wi, wo, *parameter))
-        basis = harmonics.evaluate(wi, degree=self.degree)
-        return jnp.einsum("vi,icv->vc", basis, self.coefficients(wo, *values))
+        batch = wo.shape[:-1]
+        basis = harmonics.evaluate(wi.reshape(-1, 3), degree=self.degree)
+        row = self.coefficients(wo.reshape(-1, 3), *(each.reshape(-1) for each in parameter))
+        return jnp.einsum("vi,icv->vc", basis, row).reshape(*batch, row.shape[1])
 
 
 def tabulate(
@@ -104,7 +105,8 @@ def tabulate(
     """Tabulates a BRDF times cosine in spherical harmonics.
 
     Args:
-        brdf: A BRDF (wi, wo) -> value in 1/sr; with `knot` a function of the parameters that makes one.
+        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the
+            parameters that makes one.
         degree: Highest degree of the harmonics: 4 for the 25 coefficients of the paper.
         resolution: Edge of the parabolic map of view directions.
         error: Largest quadrature error; four rules are tried, each finer, and what was reached is in the result.
@@ -114,7 +116,8 @@ def tabulate(
         The table.
 
     Raises:
-        ValueError: An option is out of range, knots do not increase, or the BRDF has values that are not finite.
+        ValueError: An option is out of range, knots do not increase, or the BRDF has values that are not finite or
+            no axis for colors.
 
     Reference: Kautz, Sloan, Snyder 2002, section 3.
     """
@@ -128,7 +131,7 @@ def tabulate(
         raise ValueError(f"at most two parameters can be tabulated, got {len(knots)}")
     grid = list(itertools.product(*knots))
     # A middle and the extreme parameters stand for all where the number of nodes is chosen.
-    made = [brdf(*map(jnp.asarray, point)) if knots else brdf for point in grid]
+    made = [_as_argument(brdf(*map(jnp.asarray, point)) if knots else brdf) for point in grid]
     probes = [made[i] for i in sorted({0, len(made) // 2, len(made) - 1})]
     rings, sectors, reached = _choose_rule(probes, degree, error)
     wo = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
@@ -184,10 +187,17 @@ def project(
         side = [across[i] * cosine + up[i] * sine for i in range(3)]
         wi = jnp.stack([(1 - height) * mirror[i] + reach * side[i] for i in range(3)], -1).reshape(-1, 3)
         area = (whole * weight * (2 * np.pi / sectors)).reshape(-1, 1)
-        value = brdf(wi, jnp.broadcast_to(view, wi.shape)) * jnp.maximum(wi[:, 2:], 0) * area
-        return harmonics.evaluate(wi, degree=degree).T @ value
+        value = brdf(wi, jnp.broadcast_to(view, wi.shape))
+        if jnp.ndim(value) != 2 or value.shape[0] != len(wi):
+            raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
+        return harmonics.evaluate(wi, degree=degree).T @ (value * jnp.maximum(wi[:, 2:], 0) * area)
 
     return jnp.moveaxis(jax.lax.map(one, wo, batch_size=_BATCH), 0, -1)
+
+
+def _as_argument(brdf: Callable) -> Callable:
+    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
+    return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 
 
 @lru_cache(maxsize=8)

@@ -17,7 +17,7 @@ import filelock
 import numpy as np
 import zarr
 
-VERSION = 1
+VERSION = 2
 _FORMAT = "jaxprt blocks"
 
 

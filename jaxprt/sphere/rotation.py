@@ -27,7 +27,9 @@ from jaxtyping import Array, Float
 
 from jaxprt.sphere import harmonics
 
-_UNROLLED = 6  # Up to this degree every sum is written out, which is fast, and compiles within two seconds.
+# Up to this degree every sum is written out, which is fast and compiles in two seconds; beyond, compiling takes
+# minutes, and whole bands are multiplied.
+_UNROLLED = 6
 
 
 @jax.jit
@@ -120,13 +122,12 @@ def _rotated(coefficient: Array, rotation: Array) -> Array:
     """Coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the end of *c."""
     degree = harmonics.degree_of(coefficient.shape[0])
     shape = jnp.broadcast_shapes(coefficient.shape[1:], rotation.shape[2:])
-    alpha, beta, gamma = (_multiples(*angle, degree) for angle in _euler_angles(rotation))
-    result = []
-    for l in range(degree + 1):
-        band = coefficient[l * l : (l + 1) ** 2]
-        turn = _turn_rows if degree <= _UNROLLED else _turn_band
-        result.extend(turn(l, band, alpha, beta, gamma))
-    return jnp.stack([jnp.broadcast_to(row, shape) for row in result])
+    angle = _euler_angles(rotation)
+    if degree <= _UNROLLED:
+        row = _turn_rows(coefficient, *(_multiples(*each, degree) for each in angle))
+        return jnp.stack([jnp.broadcast_to(each, shape) for each in row])
+    band = _turn_bands(coefficient, *(_signed_multiples(*each, degree, coefficient.ndim) for each in angle))
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), *shape)) for each in band])
 
 
 @functools.partial(_rotated.defjvp, symbolic_zeros=True)
@@ -139,16 +140,15 @@ def _rotated_jvp(primal, tangent):
     if not isinstance(tangent[1], SymbolicZero):
         relative = jnp.einsum("ij...,kj...->ik...", tangent[1], rotation, precision="highest")
         turn = [(relative[i, j] - relative[j, i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))]
-        change = change + _generate(result, turn)
+        change = change + (_generate_rows if len(result) <= (_UNROLLED + 1) ** 2 else _generate)(result, turn)
     return result, change
 
 
-def _turn_rows(l: int, band: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
-    """One band, every sum written out over its few terms."""
-    quarter = _quarter_turn(l)
+def _turn_rows(coefficient: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+    """Rows of all bands, every sum written out over its few terms."""
 
     def about_z(row, angle):
-        cosine, sine = angle
+        (cosine, sine), l = angle, len(row) // 2
         pair = [(row[l + m] * cosine[m], row[l - m] * sine[m]) for m in range(1, l + 1)]
         other = [(row[l - m] * cosine[m], row[l + m] * sine[m]) for m in range(1, l + 1)]
         return [a + b for a, b in other[::-1]] + [row[l]] + [a - b for a, b in pair]
@@ -156,43 +156,71 @@ def _turn_rows(l: int, band: Array, alpha: tuple, beta: tuple, gamma: tuple) -> 
     def fixed(row, matrix):
         return [sum(float(entry) * row[j] for j, entry in enumerate(line) if entry) for line in matrix]
 
-    row = fixed(about_z(list(band), gamma), quarter.T)
-    return about_z(fixed(about_z(row, beta), quarter), alpha)
+    result = []
+    for l in range(harmonics.degree_of(len(coefficient)) + 1):
+        quarter = _quarter_turn(l)
+        row = fixed(about_z(list(coefficient[l * l : (l + 1) ** 2]), gamma), quarter.T)
+        result.extend(about_z(fixed(about_z(row, beta), quarter), alpha))
+    return result
 
 
-def _turn_band(l: int, band: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
-    """One band by matrix products."""
-    quarter = jnp.asarray(_quarter_turn(l), band.dtype)
+def _turn_bands(coefficient: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+    """The bands by matrix products; cosines and sines are of m = -degree to degree."""
 
     def about_z(row, angle):
-        cosine, sine = (jnp.stack(part[: l + 1]) for part in angle)
-        cosine = jnp.concatenate([cosine[:0:-1], cosine])
-        sine = jnp.concatenate([sine[:0:-1], -sine])
-        fill = (1,) * (row.ndim - cosine.ndim)
-        cosine, sine = (part.reshape(2 * l + 1, *fill, *part.shape[1:]) for part in (cosine, sine))
+        cosine, sine = (part[(len(part) - len(row)) // 2 :][: len(row)] for part in angle)
         return row * cosine + row[::-1] * sine
 
-    row = jnp.tensordot(quarter.T, about_z(band, gamma), axes=1, precision="highest")
-    row = jnp.tensordot(quarter, about_z(row, beta), axes=1, precision="highest")
-    return list(about_z(row, alpha))
+    result = []
+    for l in range(harmonics.degree_of(len(coefficient)) + 1):
+        quarter = jnp.asarray(_quarter_turn(l), coefficient.dtype)
+        row = about_z(coefficient[l * l : (l + 1) ** 2], gamma)
+        row = about_z(jnp.tensordot(quarter.T, row, axes=1, precision="highest"), beta)
+        result.append(about_z(jnp.tensordot(quarter, row, axes=1, precision="highest"), alpha))
+    return result
 
 
-def _generate(coefficient: Array, turn: list[Array]) -> Array:
-    """(w_x L_x + w_y L_y + w_z L_z) on coefficients [lm, *c], for a turn w of three arrays [*v]."""
-    degree = harmonics.degree_of(coefficient.shape[0])
+def _generate_rows(coefficient: Array, turn: list[Array]) -> Array:
+    """(w_x L_x + w_y L_y + w_z L_z) on coefficients [lm, *c], for a turn w of three arrays [*v]; written out."""
     # Broadcast once, so that the transpose sums over the channels once.
     x, y, z = (jnp.broadcast_to(part, coefficient.shape[1:]) for part in turn)
     result = []
-    for l in range(degree + 1):
+    for l in range(harmonics.degree_of(len(coefficient)) + 1):
         row = coefficient[l * l : (l + 1) ** 2]
         for m in range(-l, l + 1):
-            part = jnp.zeros_like(row[0])
-            if m:
-                part = part - m * z * row[l - m]
+            part = -m * z * row[l - m]
             for other, by_x, by_y in _ladder(l, m):
                 part = part + by_x * x * row[l - other] + by_y * y * row[l + other]
             result.append(part)
     return jnp.stack(result)
+
+
+def _generate(coefficient: Array, turn: list[Array]) -> Array:
+    """The same, all rows at once: L_y shifts them by one, L_z reverses bands, and L_x does both."""
+    reverse, entry = _generators(harmonics.degree_of(len(coefficient)))
+    entry = jnp.asarray(entry, coefficient.dtype).reshape(5, -1, *(1,) * (coefficient.ndim - 1))
+    reversed_ = coefficient[reverse]
+    none = jnp.zeros_like(coefficient[:1])
+
+    def beside(rows, below, above):
+        return below * jnp.concatenate([none, rows[:-1]]) + above * jnp.concatenate([rows[1:], none])
+
+    x, y, z = (jnp.broadcast_to(part, coefficient.shape[1:]) for part in turn)
+    return x * beside(reversed_, *entry[:2]) + y * beside(coefficient, *entry[2:4]) + z * entry[4] * reversed_
+
+
+@functools.lru_cache(maxsize=16)
+def _generators(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the rows with every band reversed; and entries: L_x below and above, L_y below and above, L_z."""
+    reverse, entry = [], np.zeros((5, (degree + 1) ** 2))
+    for l in range(degree + 1):
+        for m in range(-l, l + 1):
+            place = l * (l + 1) + m
+            reverse.append(place - 2 * m)
+            entry[4, place] = -m
+            for other, by_x, by_y in _ladder(l, m):
+                entry[int(other > m), place], entry[2 + int(other > m), place] = by_x, by_y
+    return np.array(reverse, np.int32), entry
 
 
 def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
@@ -244,6 +272,19 @@ def _multiples(cosine: Array, sine: Array, degree: int) -> tuple[list[Array], li
         real.append(a * cosine - b * sine)
         imaginary.append(b * cosine + a * sine)
     return real, imaginary
+
+
+def _signed_multiples(cosine: Array, sine: Array, degree: int, axes: int) -> tuple[Array, Array]:
+    """Cosines, and sines of the opposite sign, of -degree to degree times an angle, to go with arrays of many axes."""
+
+    def step(power, _):
+        a, b = power
+        return (a * cosine - b * sine, b * cosine + a * sine), power
+
+    _, (real, imaginary) = jax.lax.scan(step, (jnp.ones_like(cosine), jnp.zeros_like(sine)), length=degree + 1)
+    both = jnp.concatenate([real[:0:-1], real]), jnp.concatenate([imaginary[:0:-1], -imaginary])
+    shape = (2 * degree + 1, *(1,) * (axes - 1 - cosine.ndim), *cosine.shape)
+    return both[0].reshape(shape), both[1].reshape(shape)
 
 
 @functools.lru_cache(maxsize=128)

@@ -50,12 +50,12 @@ def interreflect(
         Transfer that includes the bounces; colored where a BRDF is.
 
     Raises:
-        ValueError: Transport of other vertices or degree, or a region without BRDF.
+        ValueError: Transport of other vertices or degree, a region without BRDF, or bounces below 0.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5; Sloan, Kautz, Snyder 2002, section 5.
     """
     check(harmonics.degree_of(transport.matrix.shape[-1]), size)
-    _check_regions(mesh, len(transport.position), len(brdf))
+    _check(mesh, len(transport.position), len(brdf), bounces)
     wrong = [each.degree for each in brdf if each.table.shape[0] != transport.matrix.shape[-1] or each.knot]
     if wrong:
         degree = harmonics.degree_of(transport.matrix.shape[-1])
@@ -93,13 +93,16 @@ def interreflect_diffuse(
         progress: As of `precompute`.
 
     Raises:
-        ValueError: Transport of other vertices, or a region without albedo.
+        ValueError: Transport of other vertices, a region without albedo, albedos that are not finite, or bounces
+            below 0.
 
     Reference: Sloan, Kautz, Snyder 2002, section 5.
     """
     check(harmonics.degree_of(transport.vector.shape[0]), size)
     albedo = np.asarray(albedo, transport.vector.dtype)
-    _check_regions(mesh, len(transport.position), len(albedo))
+    _check(mesh, len(transport.position), len(albedo), bounces)
+    if not np.all(np.isfinite(albedo)):
+        raise ValueError(f"albedos must be finite, got {albedo.tolist()}")
     colors = max(transport.vector.shape[1], albedo.shape[1])
     total = last = np.broadcast_to(
         np.asarray(transport.vector), (transport.vector.shape[0], colors, transport.vector.shape[2])
@@ -205,9 +208,13 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
         vertex, texel, corner, weight, count = _hits(self, part)
         area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
         flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
-        # The front of a surface alone sends light.
-        front = np.sum(self.frame[corner, 2] * area[texel][:, None], -1) < 0
-        leaving = np.einsum("mk,mkli->mli", weight * front * flux[:, None], self.rows[corner])
+        # The front of a surface alone sends light: that of the triangle, on the side of its vertices' normals, since
+        # one of these may look away where the others are seen.
+        at = np.asarray(self.occluder.position)[corner]
+        across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+        side = np.sum(across * np.sum(self.frame[corner, 2], 1), -1)
+        front = side * np.sum(across * area[texel], -1) < 0
+        leaving = np.einsum("mk,mkli->mli", weight * (front * flux)[:, None], self.rows[corner])
         total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
         np.add.at(total, vertex, leaving)
         return {"vector": total.transpose(2, 1, 0)}, count
@@ -226,8 +233,10 @@ def _hits(
     return vertex[met], texel[met], corner, weight[met], len(vertex)
 
 
-def _check_regions(mesh: Mesh, vertices: int, materials: int) -> None:
-    """Refuses transport of other vertices, and regions without a material."""
+def _check(mesh: Mesh, vertices: int, materials: int, bounces: int) -> None:
+    """Refuses transport of other vertices, regions without a material, and bounces that are no count."""
+    if not isinstance(bounces, int | np.integer) or bounces < 0:
+        raise ValueError(f"bounces must be a whole number from 0, got {bounces}")
     if vertices != len(mesh.position):
         raise ValueError(f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {vertices}")
     regions = int(np.max(mesh.region, initial=0)) + 1

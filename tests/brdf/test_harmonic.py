@@ -1,0 +1,306 @@
+"""The product table of a BRDF times cosine: closed forms, independent quadrature, lookup by SciPy, and its errors."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.ndimage
+
+from jaxprt.brdf import AshikhminShirley, CookTorrance, HarmonicBrdf, Lafortune, Lambert, Phong, Ward
+from jaxprt.brdf.harmonic import project, tabulate
+from jaxprt.sphere import harmonics, hemisphere
+
+RESOLUTION = 16
+QUADRATURE = 1e-4  # What the independent quadrature is accurate to, where the horizon cuts it.
+NODES = 300  # In each direction of the independent quadrature.
+LOOKUP = 2e-5  # Coordinates of a texel in float32, times the sixteen texels between which they tell.
+COLORED = AshikhminShirley(diffuse=[0.5, 0.2, 0.1], specular=[0.2, 0.4, 0.6], nu=10.0, nv=100.0)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture(scope="module")
+def table(tables):
+    return tables("anisotropic")
+
+
+def upper(random, *shape, least=0.0):
+    """Unit vectors at least so high above the horizon."""
+    height, angle = random.uniform(least, 1, shape), random.uniform(0, 2 * np.pi, shape)
+    radius = np.sqrt(1 - height**2)
+    return jnp.asarray(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1), jnp.float32)
+
+
+@jax.jit
+def by_half_vectors(brdf, view):
+    """Coefficients by a quadrature over half vectors, in float64: d wi = 4 (wo.h) dh; [lm, c, v]."""
+    node, weight = np.polynomial.legendre.leggauss(NODES)
+    t = (node + 1) / 2
+    drop, weight = t**4, 2 * t**3 * weight  # 1 - cos(theta_h), crowded around the normal
+    angle = 2 * np.pi * (np.arange(NODES) + 0.5) / NODES
+    radius = np.sqrt(drop * (2 - drop))
+    half = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), np.outer(1 - drop, angle**0)])
+    weight = np.repeat(weight * 2 * np.pi / NODES, NODES)
+
+    def one(wo):
+        axis = jnp.asarray(half.reshape(3, -1).T)
+        cosine = axis @ wo
+        wi = 2 * cosine[:, None] * axis - wo
+        area = weight * 4 * jnp.maximum(cosine, 0) * jnp.maximum(wi[:, 2], 0)
+        return harmonics.evaluate(wi, degree=4).T @ (brdf(wi, jnp.broadcast_to(wo, wi.shape)) * area[:, None])
+
+    return jnp.moveaxis(jax.lax.map(one, view), 0, -1)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return functools.lru_cache(maxsize=None)(lambda name: tabulate(SHARPNESS[name], resolution=RESOLUTION))
+
+
+def test_lambert_is_the_cosine_kernel_in_closed_form(tables):
+    table = tables("matte")
+    expected = np.zeros(25)
+    expected[[0, 2, 6, 20]] = np.sqrt(np.pi) / 2, np.sqrt(np.pi / 3), np.sqrt(5 * np.pi) / 8, -np.sqrt(np.pi) / 16
+    expected = (
+        expected[:, None, None, None] / np.pi * np.array([1, 0.5, 0])[:, None, None] * np.ones((RESOLUTION, RESOLUTION))
+    )
+    error = np.linalg.norm(table.table - expected, axis=(0, 1)) / np.linalg.norm(expected[..., 0, 0])
+    assert error[4:12, 4:12].max() < float(table.error) < 2e-4
+    assert error.max() < 1e-3  # What was asked for; the map has many views that graze the surface.
+    assert table.degree == 4
+    assert table.nbytes == 25 * 3 * RESOLUTION**2 * 4
+
+
+SHARPNESS = {
+    "matte": Lambert([1.0, 0.5, 0.0]),
+    "glossy": Phong(diffuse=0.2, specular=0.6, exponent=20.0),
+    "anisotropic": COLORED,
+    "sharp": CookTorrance(diffuse=0.1, specular=0.6, roughness=0.05),
+    "sharper": Ward(diffuse=0.0, specular=1.0, along=0.02, across=0.1),
+    "back where it came from": Lafortune(diffuse=0.1, cx=[0.9], cy=[0.9], cz=[0.9], exponent=[30.0]),
+}
+
+
+@pytest.mark.parametrize("name", SHARPNESS)
+def test_tables_agree_with_another_quadrature_as_well_as_they_say(tables, name):
+    table = tables(name)
+    said = float(table.error)
+    assert said <= 1e-3
+    row, column = np.array([[8, 8], [5, 10], [12, 6], [9, 14], [1, 7]]).T
+    actual = np.asarray(table.table)[:, :, row, column]
+    with jax.enable_x64(True):
+        view = np.asarray(hemisphere.parabolic_texel_direction(resolution=RESOLUTION))[row, column]
+        brdf = jax.tree.map(lambda leaf: leaf.astype(float), SHARPNESS[name])
+        expected = np.asarray(by_half_vectors(brdf, jnp.asarray(view)))
+    single = np.linalg.norm(actual - expected, axis=(0, 1)) / np.linalg.norm(expected, axis=(0, 1))
+    # Single views may differ by more than all together, of which the error tells.
+    assert single.max() < 4 * said + QUADRATURE, f"{single}, said {said:.1e}"
+    assert np.linalg.norm(actual - expected) < (1.5 * said + QUADRATURE) * np.linalg.norm(expected)
+
+
+def test_one_coefficient_agrees_with_scipys_adaptive_quadrature():
+    brdf, view = Phong(diffuse=0.2, specular=0.6, exponent=8.0), np.array([0.48, -0.6, 0.64])
+
+    def integrand(angle, height):
+        radius = np.sqrt(1 - height**2)
+        wi = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        lobe = max(wi @ (view * [-1, -1, 1]), 0) ** 8
+        return (0.2 / np.pi + 0.6 * 10 / (2 * np.pi) * lobe) * height * np.sqrt(15 / (4 * np.pi)) * wi[0] * wi[2]
+
+    expected, _ = scipy.integrate.dblquad(integrand, 0, 1, 0, 2 * np.pi, epsabs=1e-7)
+    actual = project(brdf, jnp.asarray(view[None], jnp.float32), degree=2, rings=24, sectors=96)[7, 0, 0]
+    np.testing.assert_allclose(actual, expected, rtol=1e-4)
+
+
+def test_an_error_that_no_rule_reaches_is_told():
+    mirror = CookTorrance(diffuse=0.0, specular=1.0, roughness=0.001)
+    table = tabulate(mirror, degree=1, resolution=2, error=1e-9)
+    assert 1e-9 < float(table.error) < 1
+
+
+def test_lookup_at_texels_gives_the_table(table):
+    direction = hemisphere.parabolic_texel_direction(resolution=RESOLUTION)
+    center = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
+    row, column = np.nonzero(center[:, None] ** 2 + center**2 < 1 - 1 / RESOLUTION)
+    assert len(row) > 100
+    actual = table.coefficients(direction[row, column])
+    expected = np.asarray(table.table)[:, :, row, column]
+    assert np.linalg.norm(actual - expected) < LOOKUP * np.linalg.norm(expected)
+
+
+def test_lookup_between_texels_is_bilinear(table, random):
+    view = upper(random, 300, least=1e-3)
+    place = (np.asarray(view, float)[:, :2] / (1 + np.asarray(view, float)[:, 2:]) + 1) / 2 * RESOLUTION - 0.5
+    flat = np.asarray(table.table, float).reshape(75, RESOLUTION, RESOLUTION)
+    expected = [scipy.ndimage.map_coordinates(each, place[:, ::-1].T, order=1, mode="nearest") for each in flat]
+    actual = table.coefficients(view).reshape(75, -1)
+    assert np.linalg.norm(actual - np.array(expected)) < LOOKUP * np.linalg.norm(expected)
+
+
+def test_finer_tables_interpolate_better(tables, random):
+    view, brdf = upper(random, RESOLUTION**2, least=0.2), SHARPNESS["glossy"]
+    exact = project(brdf, view, degree=4, rings=24, sectors=96)
+    error = [
+        np.linalg.norm(made.coefficients(view) - exact) / np.linalg.norm(exact)
+        for made in (tabulate(brdf, resolution=6), tables("glossy"))
+    ]
+    assert error[0] > 5 * error[1]
+    assert error[1] < 0.06
+
+
+def test_views_below_the_horizon_and_on_it_see_nothing_and_gradients_are_finite(table):
+    view = jnp.array([[0.6, 0, -0.8], [0, 0, -1], [1, 0, 0], [0, 1, -1e-7], [0, 0, 1], [0, 1, 1e-7]], jnp.float32)
+    value = table.coefficients(view)
+    np.testing.assert_array_equal(value[..., :4], 0)
+    assert np.all(np.linalg.norm(value[..., 4:], axis=(0, 1)) > 0.01)
+    gradient = jax.grad(lambda v: jnp.sum(table.coefficients(v) ** 2))(view)
+    assert np.isfinite(np.asarray(gradient)).all()
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (2, 3), (0,)])
+def test_values_are_the_sum_of_coefficients_times_harmonics_for_any_batch(table, random, close, shape):
+    wi, wo = upper(random, *shape), upper(random, *shape, least=0.1)
+    value = table(wi, wo)
+    assert value.shape == (*shape, 3)
+    row = table.coefficients(wo.reshape(-1, 3))
+    basis = harmonics.evaluate(wi.reshape(-1, 3), degree=4)
+    expected = jnp.stack([row[:, :, n].T @ basis[n] for n in range(basis.shape[0])]) if value.size else value
+    close(value.reshape(-1, 3), expected.reshape(-1, 3))
+
+
+def test_more_bands_carry_more_of_the_brdf(tables, random):
+    table = tables("glossy")
+    texel = np.asarray(hemisphere.parabolic_texel_direction(resolution=RESOLUTION))[4:12, 4:12].reshape(-1, 3)
+    wo = jnp.repeat(jnp.asarray(texel), 100, 0)
+    wi = upper(random, len(wo))
+    exact = np.asarray(SHARPNESS["glossy"](wi, wo) * wi[:, 2:])
+    error = [np.linalg.norm(table.truncate(degree=n)(wi, wo) - exact) / np.linalg.norm(exact) for n in range(5)]
+    assert (np.diff(error) < -0.05).all()
+    assert table.truncate(degree=2).degree == 2
+    np.testing.assert_array_equal(table.truncate(degree=2).table, table.table[:9])
+
+
+@pytest.fixture(scope="module")
+def varying():
+    return tabulate(
+        lambda exponent, specular: Phong(diffuse=0.3, specular=specular, exponent=exponent),
+        degree=3,
+        resolution=6,
+        knot=(np.array([2.0, 5.0, 20.0]), np.array([0.0, 0.6])),
+    )
+
+
+def test_knots_have_the_tables_of_their_brdfs(varying, close):
+    assert varying.table.shape == (16, 1, 3, 2, 6, 6)
+    view = jnp.array([[0.2, -0.3, 0.93], [0.6, 0, 0.8]])
+    for i, exponent in ((0, 2.0), (2, 20.0)):
+        for j, specular in enumerate((0.0, 0.6)):
+            single = tabulate(Phong(diffuse=0.3, specular=specular, exponent=exponent), degree=3, resolution=6)
+            close(varying.table[:, :, i, j], single.table, tolerance=2e-3)  # Each has a rule of its own.
+            parameter = jnp.full(2, exponent), jnp.full(2, specular)
+            close(varying.coefficients(view, *parameter), single.coefficients(view), tolerance=2e-3)
+
+
+def test_parameters_interpolate_linearly_and_clamp_to_their_knots(varying, random, close):
+    view = upper(random, 8, least=0.2)
+    exponent = jnp.array([2.0, 3.5, 5.0, 12.5, 20.0, 1.0, -jnp.inf, 1e9])
+    specular = jnp.array([0.0, 0.3, 0.6, 0.15, 0.45, -5.0, 0.7, jnp.inf])
+    low, first = np.array([0, 0, 1, 1, 1, 0, 0, 1]), np.array([0, 0.5, 0, 0.5, 1, 0, 0, 1])
+    second = np.array([0, 0.5, 1, 0.25, 0.75, 0, 1, 1])
+
+    def corner(i, j):
+        part = [
+            HarmonicBrdf(varying.table[:, :, a, j], (), varying.error).coefficients(view[n : n + 1])
+            for n, a in enumerate(i)
+        ]
+        return np.concatenate(part, -1)
+
+    expected = sum(
+        corner(low + a, b) * np.where(a, first, 1 - first) * np.where(b, second, 1 - second)
+        for a in (0, 1)
+        for b in (0, 1)
+    )
+    actual = varying.coefficients(view, jnp.clip(exponent, -1e30, 1e30), jnp.clip(specular, -1e30, 1e30))
+    close(actual, expected)
+    close(varying.coefficients(view, exponent, specular), expected)
+
+
+def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
+    def made(share):
+        return Lambert(0.5) if share < 0.5 else Lambert([0.5, 0.25, 0.1])
+
+    table = tabulate(made, degree=1, resolution=4, knot=(np.array([0.0, 1.0]),))
+    assert table.table.shape == (4, 3, 2, 4, 4)
+    np.testing.assert_allclose(table.table[0, :, 0, 2, 2], 0.5 / np.sqrt(np.pi) / 2 * np.ones(3), rtol=1e-3)
+    np.testing.assert_allclose(table.table[0, :, 1, 2, 2], np.array([0.5, 0.25, 0.1]) / np.sqrt(np.pi) / 2, rtol=1e-3)
+
+
+def test_any_function_is_tabulated_as_the_model_that_it_is(close):
+    model = Lambert(0.5)
+    plain = tabulate(lambda wi, wo: model(wi, wo), degree=2, resolution=4)
+    close(plain.table, tabulate(model, degree=2, resolution=4).table)
+
+
+def test_a_quarter_turn_about_the_normal_exchanges_the_exponents(table, random):
+    other = AshikhminShirley(diffuse=COLORED.diffuse, specular=COLORED.specular, nu=100.0, nv=10.0)
+    quarter = jnp.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], jnp.float32)
+    turned = tabulate(other, resolution=RESOLUTION)
+    wi, wo = upper(random, 40), upper(random, 40, least=0.1)
+    np.testing.assert_allclose(turned(wi @ quarter.T, wo @ quarter.T), table(wi, wo), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "options", [{"degree": -1}, {"degree": 51}, {"resolution": 1}, {"error": 0.0}, {"error": float("nan")}]
+)
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(ValueError, match=r"degree of 0 to 50, a resolution of at least 2 and an error above 0, got"):
+        tabulate(Lambert(), **options)
+
+
+@pytest.mark.parametrize("knot", [[1.0], [1.0, 1.0], [2.0, 1.0], [0.0, np.nan], [0.0, np.inf], [[0.0, 1.0]]])
+def test_knots_that_do_not_increase_are_refused(knot):
+    with pytest.raises(ValueError, match="knots of parameter 1 must be at least two finite increasing numbers, got"):
+        tabulate(lambda a, b: Lambert(a), knot=(np.array([0.0, 1.0]), np.array(knot)))
+
+
+def test_three_parameters_are_refused():
+    with pytest.raises(ValueError, match="at most two parameters can be tabulated, got 3"):
+        tabulate(lambda a, b, c: Lambert(a), knot=(np.array([0.0, 1.0]),) * 3)
+
+
+def test_a_wrong_number_of_parameters_is_refused(table, varying):
+    view = jnp.array([[0.0, 0, 1]])
+    with pytest.raises(ValueError, match="the table has 0 parameters, got 1"):
+        table.coefficients(view, jnp.ones(1))
+    with pytest.raises(ValueError, match="the table has 2 parameters, got 0"):
+        varying.coefficients(view)
+
+
+def test_brdfs_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match="must be finite for all directions above the horizon"):
+        tabulate(Lambert(jnp.nan), degree=1, resolution=2)
+    with pytest.raises(ValueError, match=r"and is not at parameters \(.*2\.0.*\)"):
+        tabulate(lambda a: Lambert(jnp.where(a < 1.5, a, jnp.nan)), degree=1, resolution=2, knot=(np.arange(3.0),))
+
+
+def test_brdfs_without_an_axis_of_colors_are_refused():
+    with pytest.raises(ValueError, match=r"the BRDF must return \[\d+, c\] here, got \[\d+\]"):
+        tabulate(lambda wi, wo: wi[:, 2], degree=1, resolution=2)
+
+
+@pytest.mark.parametrize("degree", [-1, 5])
+def test_bands_that_are_not_there_are_refused(table, degree):
+    with pytest.raises(ValueError, match=f"degree must be between 0 and the table's 4, got {degree}"):
+        table.truncate(degree=degree)
+
+
+def test_a_table_whose_rows_are_no_square_is_refused(random):
+    broken = HarmonicBrdf(jnp.zeros((8, 1, 4, 4)), (), jnp.zeros(()))
+    with pytest.raises(ValueError, match="must be a square number, got 8"):
+        broken(upper(random, 2), upper(random, 2))

@@ -1,0 +1,346 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import eval_legendre, sph_harm_y
+
+from jaxprt.sphere import cubemap, harmonics
+
+DEGREE = 50
+# SciPy's own distance from orthonormality at degree 50 by quadrature is of this size, and so is that of the angles.
+SCIPY = 1e-11
+TEXEL = 5e-4  # A harmonic of degree 4 or less, constant on texels of 1/32 of a face: second order in their width.
+POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
+
+
+def unit(seed, count, dtype=np.float64):
+    vector = np.random.default_rng(seed).normal(size=(count, 3))
+    return jnp.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True), dtype)
+
+
+def normal(seed, *shape, dtype=np.float64):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), dtype)
+
+
+def band(degree):
+    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+
+
+def scipy_basis(direction, degree):
+    """SciPy's complex harmonics as real ones, and without their Condon-Shortley phase."""
+    x, y, z = np.asarray(direction, np.float64).T
+    l = band(degree)
+    m = np.arange(len(l)) - l * (l + 1)
+    value = sph_harm_y(l, abs(m), np.arctan2(np.hypot(x, y), z)[:, None], np.arctan2(y, x)[:, None])
+    part = np.where(m < 0, value.imag, value.real) * np.where(m == 0, 1, np.sqrt(2))
+    return part * (-1.0) ** abs(m)
+
+
+@functools.lru_cache
+def quadrature(degree):
+    """Directions and weights that integrate products of two harmonics exactly."""
+    height, weight = np.polynomial.legendre.leggauss(degree + 1)
+    azimuth = 2 * np.pi * np.arange(2 * degree + 2) / (2 * degree + 2)
+    radius, around = np.sqrt(1 - height**2), np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+    flat = radius[:, None, None] * around
+    direction = np.concatenate([flat, np.broadcast_to(height[:, None, None], (*flat.shape[:2], 1))], -1)
+    return direction.reshape(-1, 3), np.repeat(weight * 2 * np.pi / len(azimuth), len(azimuth))
+
+
+def zonal_factor(kernel, l, low, high):
+    return 2 * np.pi * quad(lambda t: kernel(t) * eval_legendre(l, t), low, high, epsabs=1e-13, epsrel=1e-13)[0]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 14, DEGREE])
+def test_the_basis_is_orthonormal_and_scipys_in_real_form_without_its_phase(degree, x64, close):
+    direction, weight = quadrature(degree)
+    others = np.concatenate([unit(0, 100), POLES, np.eye(3), -np.eye(3)])
+    basis = np.asarray(harmonics.evaluate(jnp.asarray(np.concatenate([direction, others])), degree=degree))
+    inside, outside = np.split(basis, [len(direction)])
+    some = np.unique(np.random.default_rng(1).integers(0, (degree + 1) ** 2, 200))
+    close((inside[:, some] * weight[:, None]).T @ inside, np.eye((degree + 1) ** 2)[some])
+    close(outside, scipy_basis(others, degree), tolerance=SCIPY)
+
+
+def test_degree_50_evaluates_in_float32(x64, close):
+    direction = jnp.concatenate([unit(1, 200, np.float32), jnp.asarray(POLES, jnp.float32)])
+    exact = np.asarray(direction, np.float64)
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    close(harmonics.evaluate(direction, degree=DEGREE), scipy_basis(exact, DEGREE))
+
+
+def test_the_first_nine_have_the_signs_and_factors_of_the_table(x64, close):
+    direction = unit(2, 30)
+    x, y, z = np.asarray(direction).T
+    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
+    expected = [
+        np.full_like(x, np.sqrt(1 / (4 * np.pi))),
+        first * y,
+        first * z,
+        first * x,
+        second * x * y,
+        second * y * z,
+        np.sqrt(5 / (16 * np.pi)) * (3 * z**2 - 1),
+        second * x * z,
+        np.sqrt(15 / (16 * np.pi)) * (x**2 - y**2),
+    ]
+    close(harmonics.evaluate(direction, degree=2), np.stack(expected, -1))
+
+
+@pytest.mark.parametrize("pole", POLES)
+def test_the_gradient_at_the_poles_is_that_along_great_circles(pole, x64, close):
+    jacobian = jax.jacfwd(lambda s: harmonics.evaluate(s, degree=8))(jnp.asarray(pole))
+    close(jax.jacrev(lambda s: harmonics.evaluate(s, degree=8))(jnp.asarray(pole)), jacobian)
+    for tangent in np.eye(3)[:2]:
+
+        def along(t, tangent=tangent):
+            return scipy_basis((np.cos(t) * pole + np.sin(t) * tangent)[None], 8)[0]
+
+        h = 1e-3
+        expected = (8 * (along(h) - along(-h)) - (along(2 * h) - along(-2 * h))) / (12 * h)
+        close(jacobian @ tangent, expected, tolerance=1e-8)  # The rule's error, of fourth order.
+
+
+def test_gradients_of_degree_50_in_float32_are_those_of_finite_differences(x64, close):
+    direction = np.concatenate([unit(3, 20), POLES, np.eye(3)])
+    weight = normal(4, (DEGREE + 1) ** 2)
+    _, pull = jax.vjp(lambda s: harmonics.evaluate(s, degree=DEGREE), jnp.asarray(direction, jnp.float32))
+    (gradient,) = pull(jnp.broadcast_to(jnp.asarray(weight, jnp.float32), (len(direction), len(weight))))
+
+    def along(axis, h):  # NumPy's copy of the same polynomial, in float64.
+        return np.asarray(weight) @ harmonics._basis(np, direction + h * np.eye(3)[axis], DEGREE)
+
+    h = 1e-4
+    expected = [(8 * (along(i, h) - along(i, -h)) - (along(i, 2 * h) - along(i, -2 * h))) / (12 * h) for i in range(3)]
+    # Directions are rounded to 6e-8, and the polynomial's slope changes DEGREE times as quickly as its value.
+    close(gradient, np.stack(expected, -1), tolerance=DEGREE * 1e-6)
+
+
+@pytest.mark.parametrize("l", [0, 1, 2, 4])
+def test_a_cubemap_that_holds_one_harmonic_projects_to_it(l, close):
+    basis = np.asarray(harmonics.evaluate(cubemap.direction(size=32), degree=4))
+    rows = np.arange(l * l, (l + 1) ** 2)
+    coefficient = harmonics.project(jnp.asarray(basis[..., rows]), degree=4)
+    close(coefficient, np.eye(25, dtype=np.float32)[:, rows], tolerance=TEXEL * np.sqrt(len(rows)) * 2)
+
+
+def test_the_error_of_projected_harmonics_falls_with_the_square_of_the_texels(x64):
+    error = []
+    for size in (8, 16, 32):
+        basis = harmonics.evaluate(jnp.asarray(np.asarray(cubemap.direction(size=size), np.float64)), degree=3)
+        error.append(np.linalg.norm(harmonics.project(basis, degree=3) - np.eye(16)))
+    ratio = np.array(error[:-1]) / error[1:]
+    assert (ratio > 3.5).all()
+    assert (ratio < 4.5).all()
+
+
+@pytest.mark.parametrize(("size", "degree"), [(1, 12), (2, 3), (5, 12), (16, 0), (16, 4)])
+def test_constant_light_has_one_coefficient_only(size, degree, x64, close):
+    expected = np.zeros(((degree + 1) ** 2, 2))
+    expected[0] = np.sqrt(4 * np.pi) * np.array([1, 3])
+    radiance = jnp.broadcast_to(jnp.array([1.0, 3.0]), (6, size, size, 2))
+    close(harmonics.project(radiance, degree=degree), expected)
+
+
+@pytest.mark.parametrize("size", [1, 4, 5])
+def test_projection_is_of_the_piecewise_constant_function(size, x64, close):
+    radiance = normal(5, 6, size, size, 2)
+    fine = jnp.repeat(jnp.repeat(radiance, 3, 1), 3, 2)
+    close(harmonics.project(fine, degree=10), harmonics.project(radiance, degree=10))
+
+
+def test_one_texel_projects_to_the_integral_of_scipys_basis_over_it(x64, close):
+    size, face, row, column = 5, 3, 1, 2
+    node, weight = np.polynomial.legendre.leggauss(24)
+    s, t = ((2 * k + 1 + node) / size - 1 for k in (column, row))
+    t, s = np.meshgrid(t, s, indexing="ij")
+    place = np.stack([s, -np.ones_like(s), -t], -1).reshape(-1, 3)  # Face -y: s along +x, t along -z.
+    length = np.linalg.norm(place, axis=1)
+    solid_angle = np.outer(weight, weight).ravel() / size**2 / length**3
+    radiance = jnp.zeros((6, size, size)).at[face, row, column].set(2)
+    close(harmonics.project(radiance, degree=9), 2 * solid_angle @ scipy_basis(place / length[:, None], 9))
+
+
+def test_the_mean_of_any_cubemap_is_weighted_by_its_solid_angles(x64, close):
+    radiance = normal(6, 6, 7, 7)
+    expected = np.sum(np.asarray(radiance) * np.asarray(cubemap.solid_angle(size=7))) / np.sqrt(4 * np.pi)
+    close(harmonics.project(radiance, degree=2)[0], expected)
+
+
+def test_projection_is_the_same_in_float32(x64, close):
+    radiance = jnp.abs(normal(7, 6, 32, 32, 3))
+    expected = harmonics.project(radiance, degree=14)
+    close(harmonics.project(radiance.astype(jnp.float32), degree=14), expected)
+
+
+def test_reconstruction_sums_coefficients_times_the_basis(x64, close):
+    direction = unit(8, 12).reshape(3, 4, 3)
+    basis = scipy_basis(direction.reshape(-1, 3), 6).reshape(3, 4, 49)
+    for channel in ((), (3,), (2, 3)):
+        coefficient = normal(9, 49, *channel)
+        close(harmonics.reconstruct(coefficient, direction), np.tensordot(basis, coefficient, 1))
+
+
+def test_a_reconstructed_function_has_the_coefficients_it_came_from(x64, close):
+    coefficient = normal(10, 81, 3)
+    direction, weight = quadrature(8)
+    value = np.asarray(harmonics.reconstruct(coefficient, jnp.asarray(direction)))
+    close((scipy_basis(direction, 8) * weight[:, None]).T @ value, coefficient)
+
+
+def test_the_clamped_cosine_has_the_factors_of_its_integral(x64, close):
+    expected = [zonal_factor(lambda t: t, l, 0, 1) for l in range(15)]
+    close(harmonics.cosine(degree=14), np.array(expected))
+    close(harmonics.cosine(degree=0), np.array(expected[:1]))
+    close(harmonics.cosine(degree=1), np.array(expected[:2]))
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 7.0, 33.3, 200.0])
+def test_phong_lobes_have_the_factors_of_their_integral(exponent, x64, close):
+    scale = (exponent + 1) / (2 * np.pi)
+    expected = [zonal_factor(lambda t: scale * t**exponent, l, 0, 1) for l in range(15)]
+    close(harmonics.phong(jnp.array(exponent), degree=14), np.array(expected))
+    close(harmonics.phong(jnp.array(exponent), degree=0), np.ones(1))
+
+
+def test_the_phong_lobe_of_exponent_one_is_the_cosine_over_pi(x64, close):
+    close(np.pi * harmonics.phong(jnp.array(1.0), degree=20), harmonics.cosine(degree=20))
+
+
+def test_a_convolved_light_is_the_integral_of_the_light_over_the_kernel(x64, close):
+    # White furnace with a lamp: irradiance of a function in its own harmonics, by quadrature over half the sphere.
+    coefficient, node = normal(11, 16), 30
+    height, weight = np.polynomial.legendre.leggauss(node)
+    height, weight = (height + 1) / 2, weight / 2
+    azimuth = 2 * np.pi * np.arange(node) / node
+    radius = np.sqrt(1 - height**2)[:, None]
+    local = np.stack(np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), height[:, None]), -1)
+    expected = 2 * np.pi / node * np.einsum("i,i,ijb,b->", weight, height, _basis(local, 3), coefficient)
+    irradiance = harmonics.convolve(coefficient, harmonics.cosine(degree=3))
+    close(harmonics.reconstruct(irradiance, jnp.array([0.0, 0, 1])), expected)
+
+
+def _basis(direction, degree):
+    return scipy_basis(direction.reshape(-1, 3), degree).reshape(*direction.shape[:-1], -1)
+
+
+ANGLE = [1e-4, 4.7e-3, 0.1, 0.7, np.pi / 2, 2.5, np.pi - 1e-3, np.pi]
+
+
+def disc_factors(angle, degree):
+    """2 pi times the integral of sin P_l(cos) from 0 to the angle, by Gauss points in the angle."""
+    node, weight = np.polynomial.legendre.leggauss(60)
+    theta = angle * (node + 1) / 2
+    l = np.arange(degree + 1)[:, None]
+    return np.pi * angle * np.sum(weight * np.sin(theta) * eval_legendre(l, np.cos(theta)), -1)
+
+
+@pytest.mark.parametrize("angle", ANGLE)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_discs_of_any_size_are_their_quadrature(angle, dtype, x64, close):
+    direction = unit(12, 5, dtype)
+    expected = scipy_basis(np.asarray(direction, np.float64), 14) * disc_factors(float(dtype(angle)), 14)[band(14)]
+    actual = harmonics.disc(direction, jnp.full(5, angle, dtype), degree=14)
+    assert actual.dtype == dtype
+    close(actual, expected)
+
+
+@pytest.mark.parametrize("angle", [0.0, *ANGLE])
+def test_the_change_of_a_disc_with_its_angle_is_its_rim(angle, x64, close):
+    direction = unit(13, 1)[0]
+    actual = jax.jacfwd(lambda a: harmonics.disc(direction, a, degree=14))(jnp.array(angle))
+    rim = 2 * np.pi * np.sin(angle) * eval_legendre(np.arange(15), np.cos(angle))
+    expected = scipy_basis(direction[None], 14)[0] * rim[band(14)]
+    if angle == np.pi:
+        assert np.abs(np.asarray(actual)).max() < 1e-12
+    else:
+        close(actual, expected)
+    close(jax.jacrev(lambda a: harmonics.disc(direction, a, degree=14))(jnp.array(angle)), actual)
+
+
+def test_the_change_of_a_disc_with_its_direction_is_that_of_the_basis(x64, close):
+    for direction in (*unit(14, 2), *jnp.asarray(POLES)):
+        jacobian = jax.jacrev(lambda s: harmonics.disc(s, jnp.array(0.3), degree=6))(direction)
+        basis = jax.jacfwd(lambda s: harmonics.evaluate(s, degree=6))(direction)
+        close(jacobian, disc_factors(0.3, 6)[band(6)][:, None] * basis)
+
+
+def test_hann_and_lanczos_are_their_values_of_the_band_over_the_first_left_out(x64, close):
+    root = np.sqrt(0.5)
+    close(harmonics.hann(degree=3), np.array([1, (1 + root) / 2, 0.5, (1 - root) / 2]))
+    close(harmonics.lanczos(degree=3), np.array([1, root * 4 / np.pi, 2 / np.pi, root * 4 / (3 * np.pi)]))
+
+
+def laplacian(coefficient):
+    l = band(harmonics.degree_of(len(coefficient)))
+    return float(np.sum((l * (l + 1))[:, None] ** 2 * np.asarray(coefficient) ** 2))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.9, 0.1, 1e-3, 1e-6])
+@pytest.mark.parametrize("degree", [1, 14, DEGREE])
+def test_the_window_of_least_laplacian_leaves_the_share_that_was_asked_for(share, degree, x64, close):
+    coefficient = normal(15, (degree + 1) ** 2, 3)
+    factor = harmonics.least_laplacian(coefficient, jnp.array(share))
+    assert (np.diff(factor) <= 0).all()
+    assert factor[0] == 1
+    left = laplacian(harmonics.convolve(coefficient, factor)) / laplacian(coefficient)
+    close(np.array(left), np.array(share), tolerance=1e-9)
+
+
+def test_no_other_window_of_its_laplacian_changes_the_function_less(x64):
+    coefficient = normal(16, 81, 3)
+    for window in (harmonics.hann(degree=8), harmonics.lanczos(degree=8)):
+        other = harmonics.convolve(coefficient, window)
+        share = laplacian(other) / laplacian(coefficient)
+        least = harmonics.convolve(coefficient, harmonics.least_laplacian(coefficient, jnp.array(share)))
+        assert laplacian(least) == pytest.approx(laplacian(other), rel=1e-9)
+        assert np.linalg.norm(least - coefficient) < 0.999 * np.linalg.norm(other - coefficient)
+
+
+def test_where_there_is_no_laplacian_the_window_is_one_and_gradients_are_finite(x64):
+    for coefficient in (jnp.zeros((25, 3)), jnp.zeros((25, 3)).at[0].set(2.0)):
+        factor = harmonics.least_laplacian(coefficient, jnp.array(0.5))
+        np.testing.assert_array_equal(factor, 1)
+        gradient = jax.grad(lambda c: jnp.sum(harmonics.least_laplacian(c, jnp.array(0.5))))(coefficient)
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("degree", [4, 8])
+def test_every_window_reduces_the_ringing_of_a_sun_of_one_texel(degree):
+    sun = harmonics.project(jnp.zeros((6, 32, 32)).at[2, 11, 20].set(1e4), degree=degree)
+    direction = cubemap.direction(size=24)
+
+    def most_negative(factor):
+        value = harmonics.reconstruct(harmonics.convolve(sun, factor), direction)
+        return float(-value.min() / value.max())
+
+    plain = most_negative(jnp.ones(degree + 1))
+    assert plain > 0.1
+    least = harmonics.least_laplacian(sun, jnp.array(0.05))
+    for factor in (harmonics.hann(degree=degree), harmonics.lanczos(degree=degree), least):
+        assert most_negative(factor) < 0.6 * plain
+
+
+def test_wrong_numbers_are_refused_by_what_was_required_and_what_came(unchecked):
+    for count in (-4, 0, 5, 24):
+        with pytest.raises(ValueError, match=f"square number, got {count}"):
+            harmonics.degree_of(count)
+    assert [harmonics.degree_of((l + 1) ** 2) for l in range(51)] == list(range(51))
+    direction = jnp.array([0.0, 0, 1])
+    with pytest.raises(ValueError, match="at least 0, got -1"):
+        harmonics.evaluate(direction, degree=-1)
+    with pytest.raises(ValueError, match="at least 0, got -1"):
+        harmonics.project(jnp.zeros((6, 2, 2)), degree=-1)
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        harmonics.project(jnp.zeros((6, 0, 0)), degree=1)
+    with pytest.raises(ValueError, match="square number, got 7"):
+        harmonics.reconstruct(jnp.zeros((7, 3)), direction)
+    with pytest.raises(ValueError, match="square number, got 7"):
+        harmonics.convolve(jnp.zeros((7, 3)), jnp.ones(3))
+    with pytest.raises(ValueError, match="each of the 3 bands, got 4"):
+        harmonics.convolve(jnp.zeros((9, 3)), jnp.ones(4))
+    with pytest.raises(ValueError, match="at least 0, got -1"):
+        harmonics.disc(direction, jnp.array(0.1), degree=-1)
