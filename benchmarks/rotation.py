@@ -64,11 +64,8 @@ def rotating(coefficient: jax.Array, matrix: jax.Array, exact: np.ndarray, repea
     def call():
         return rotation.rotate_each(coefficient, matrix)
 
-    if peer:
-        theirs = e3nn_rotation(coefficient, matrix)
-        mine, other = harness.compare(call, theirs, repeats=repeats)
-    else:
-        mine = harness.measure(call, repeats=repeats)
+    theirs = e3nn_rotation(coefficient, matrix) if peer else call
+    mine, other = harness.compare(call, theirs, repeats=repeats)
     line = {
         "benchmark": "rotation",
         "case": f"{matrix.shape[0]} rotations of 3 x {coefficient.shape[0]} coefficients",

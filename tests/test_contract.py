@@ -344,6 +344,7 @@ EXAMPLES = {
     # Frames have derivatives along rotations only; see sphere.rotation.
     "transport.harmonic.transfer": example(lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2),
     "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
+    "transport.harmonic.right_handed": example(lambda draw: call(draw.rotation(4))),
     "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "transport.sparse.apply": example(lambda draw: call(draw.sparse(), draw.normal(96, 3))),
     "relight.reference.integrate": example(

@@ -210,12 +210,6 @@ def test_derivatives_under_vmap_are_those_of_finite_differences_along_rotations(
     gradient = jax.vmap(jax.grad(lambda r: jnp.sum(weight * rotation.rotate(coefficient, r))))(every)
     close((gradient * tangent).sum((1, 2)), np.sum(weight * expected, (1, 2)), tolerance=FIRST_DIFFERENCE)
 
-    # All in one call, vertices last.
-    def total(r):
-        return jnp.sum(weight[..., None] * rotation.rotate_each(coefficient, r))
-
-    close(jax.grad(total)(every), gradient)
-
 
 def test_second_derivatives_along_a_turn_are_those_of_finite_differences(x64, close):
     turn, coefficient, weight = np.array([0.3, -0.8, 0.5]), normal(17, 16, 2), normal(18, 16, 2)
