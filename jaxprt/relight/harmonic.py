@@ -14,7 +14,7 @@ from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics, rotation
-from jaxprt.transport.harmonic import TransferMatrix, TransferVector
+from jaxprt.transport.harmonic import TransferMatrix, TransferVector, right_handed
 
 
 def project(light: Environment, *, degree: int) -> Float[Array, "lm c"]:
@@ -117,14 +117,14 @@ def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) ->
     """Light turned to the frame of every vertex: the light side without transfer.
 
     Args:
-        frame: Rows are tangent, bitangent, normal.
+        frame: Rows are tangent, bitangent, normal; bitangents that point the other way count as turned around.
         light: Coefficients in the world: one set, or one for each vertex.
     """
-    return rotation.rotate_each(light, frame)
+    return rotation.rotate_each(light, right_handed(frame))
 
 
 @jax.jit
-def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
+def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm _ v"]:
     """Light that arrives at every vertex in its own frame: the light side with transfer.
 
     Args:
@@ -136,8 +136,9 @@ def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"])
     """
     count, colors, terms, _ = transport.matrix.shape
     _check_degree(light.shape[0], terms, "the light", "the transport")
+    several_colors = _colors(light.shape[1], colors)
     if light.ndim == 3:
-        several = jnp.broadcast_to(light, (terms, max(colors, light.shape[1]), count))
+        several = jnp.broadcast_to(light, (terms, several_colors, light.shape[2]))
         return jnp.einsum(
             "vcoi,icv->ocv", jnp.broadcast_to(transport.matrix, (count, several.shape[1], terms, terms)), several
         )
@@ -155,7 +156,7 @@ def view_coefficients(
     eye: Float[Array, "3"],
 ) -> Float[Array, "lm c v"]:
     """The BRDF's coefficients for every vertex's view, in its frame: the view side; zero below the horizon."""
-    offset = directions.normalize(eye - position)
+    offset, frame = directions.normalize(eye - position), right_handed(frame)
     wo = jnp.stack([sum(frame[:, i, j] * offset[:, j] for j in range(3)) for i in range(3)], -1)
     return brdf.coefficients(wo, *parameter)
 
@@ -163,7 +164,7 @@ def view_coefficients(
 @jax.jit
 def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Float[Array, "lm c v"]:
     """`view_coefficients` turned to the world, so that all vertices meet the same light: for a fixed view."""
-    return rotation.rotate_each(view, frame.swapaxes(1, 2))
+    return rotation.rotate_each(view, right_handed(frame).swapaxes(1, 2))
 
 
 @jax.jit
@@ -175,6 +176,7 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
     """
     count, colors, terms, _ = transport.matrix.shape
     _check_degree(view.shape[0], terms, "the BRDF", "the transport")
+    _colors(view.shape[1], colors)
     rows = view.transpose(2, 1, 0)
     if colors == 1:
         # Color by color, each a product of one vector and one matrix per vertex.
@@ -192,17 +194,24 @@ def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Flo
         view: Coefficients of the BRDF, or transfer vectors.
 
     Raises:
-        ValueError: The two differ in degree.
+        ValueError: The two differ in degree, or in colors and neither is gray.
 
     Reference: Kautz, Sloan, Snyder 2002, equation 1.
     """
     _check_degree(light.shape[0], view.shape[0], "the light", "the BRDF or transport")
-    colors = max(light.shape[1], view.shape[1])
+    colors = _colors(light.shape[1], view.shape[1])
     part = [
         sum(light[i, _color(c, light.shape[1])] * view[i, _color(c, view.shape[1])] for i in range(len(light)))
         for c in range(colors)
     ]
     return jnp.stack(part, -1)
+
+
+def _colors(mine: int, other: int) -> int:
+    """Number of colors of a product."""
+    if mine != other and 1 not in (mine, other):
+        raise ValueError(f"both factors must have as many colors, or one, got {mine} and {other}")
+    return max(mine, other)
 
 
 def _color(number: int, colors: int) -> int:

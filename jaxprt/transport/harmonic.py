@@ -127,7 +127,7 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
 
     Args:
         seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
+        frame: Rows are tangent, bitangent, normal; see `right_handed`.
         degree: Highest degree of the harmonics.
 
     Raises:
@@ -143,7 +143,7 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ visible)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
-    return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), frame), -1, 0)
+    return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
 
 
 @partial(jax.jit, static_argnames="degree")
@@ -163,6 +163,16 @@ def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *,
     size = haar.face_edge(seen.shape[1])
     cosine = _flux(seen, frame) / cubemap.solid_angle(size=size).reshape(-1)
     return _project(seen.astype(frame.dtype) * (cosine / (visibility.LEVELS * np.pi)), degree=degree)
+
+
+@jax.jit
+def right_handed(frame: Float[Array, "v 3 3"]) -> Float[Array, "v 3 3"]:
+    """Frames with the bitangent that belongs to their tangent and normal: a proper rotation whatever it was.
+
+    Frames that the package makes are so already. Those made by hand may have mirrored bitangents, as texture
+    coordinates have, of which rotations of harmonics would make nonsense.
+    """
+    return jnp.stack([frame[:, 0], jnp.cross(frame[:, 2], frame[:, 0]), frame[:, 2]], 1)
 
 
 def _flux(seen: Array, frame: Array) -> Float[Array, "b d"]:
