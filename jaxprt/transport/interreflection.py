@@ -4,6 +4,7 @@ Each bounce sends a ray through every texel above a vertex's horizon; where it m
 shade the light of the bounce before towards it. Sloan, Kautz and Snyder 2002, section 5.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ def interreflect(
     *,
     bounces: int = 1,
     size: int = 16,
+    path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferMatrix:
@@ -43,6 +45,7 @@ def interreflect(
         brdf: The BRDF of each region of the mesh, of the transport's degree.
         bounces: How many times light is reflected before it arrives.
         size: Edge of the cubemap's faces through which rays are sent.
+        path: Folder that keeps the finished blocks of every bounce; a call that was stopped goes on from there.
         executor: As of `precompute`.
         progress: As of `precompute`.
 
@@ -66,7 +69,8 @@ def interreflect(
     for number in range(bounces):
         job = _BounceJob.make(mesh, None, None, size, brdf=tuple(brdf), rows=np.ascontiguousarray(last))
         label = f"bounce {number + 1}"
-        last = blocks.compute(job, executor=executor, progress=progress, label=label)["matrix"]
+        store = None if path is None else os.path.join(path, f"bounce_{number + 1}")
+        last = blocks.compute(job, path=store, executor=executor, progress=progress, label=label)["matrix"]
         total = total + last
     return TransferMatrix(jnp.asarray(total), transport.position, transport.frame)
 
@@ -78,6 +82,7 @@ def interreflect_diffuse(
     *,
     bounces: int = 1,
     size: int = 16,
+    path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferVector:
@@ -89,6 +94,7 @@ def interreflect_diffuse(
         albedo: Albedo of each region of the mesh.
         bounces: How many times light is reflected before it arrives.
         size: Edge of the cubemap's faces through which rays are sent.
+        path: Folder that keeps the finished blocks of every bounce; a call that was stopped goes on from there.
         executor: As of `precompute`.
         progress: As of `precompute`.
 
@@ -111,7 +117,8 @@ def interreflect_diffuse(
         rows = np.ascontiguousarray((last * albedo[np.asarray(mesh.region)].T).transpose(2, 1, 0))
         job = _DiffuseBounceJob.make(mesh, None, None, size, rows=rows)
         label = f"bounce {number + 1}"
-        last = blocks.compute(job, executor=executor, progress=progress, label=label)["vector"]
+        store = None if path is None else os.path.join(path, f"bounce_{number + 1}")
+        last = blocks.compute(job, path=store, executor=executor, progress=progress, label=label)["vector"]
         total = total + last
     return TransferVector(jnp.asarray(total), transport.position)
 
@@ -168,7 +175,9 @@ class _BounceJob(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"mesh": self.mesh_key, "size": self.size, "rows": blocks.fingerprint(self.rows)}
+        tables = blocks.fingerprint(*(each.table for each in self.brdf), self.occluder.region)
+        rows = blocks.fingerprint(self.rows)
+        return {"system": "bounce", "mesh": self.mesh_key, "size": self.size, "brdf": tables, "rows": rows}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -196,7 +205,8 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"mesh": self.mesh_key, "size": self.size, "rows": blocks.fingerprint(self.rows)}
+        rows = blocks.fingerprint(self.rows)
+        return {"system": "diffuse bounce", "mesh": self.mesh_key, "size": self.size, "rows": rows}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

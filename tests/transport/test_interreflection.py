@@ -1,5 +1,7 @@
 """Bounces: form factors and radiosity in closed form, the white furnace, and agreement of matrices with vectors."""
 
+import shutil
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -279,3 +281,20 @@ def test_bounces_and_sizes_out_of_range_are_refused(mesh, matrix, vector, lamber
 def test_albedos_that_are_not_finite_are_refused(mesh, vector, albedo):
     with pytest.raises(ValueError, match="albedos must be finite"):
         interreflect_diffuse(mesh, vector, np.full((2, 1), albedo), progress=False)
+
+
+def test_bounces_go_on_from_their_folders_which_know_what_they_are_of(mesh, matrix, vector, lambert, tmp_path, close):
+    options = {"bounces": 2, "size": 4, "progress": False}
+    for number in (1, 2):
+        found = interreflect(mesh, matrix, lambert, path=tmp_path / "matrix", **options).matrix
+        shutil.rmtree(tmp_path / "matrix" / "bounce_2")
+        if number == 1:
+            first = found
+    close(found, first)
+    albedo = np.array([[0.5], [0.25]])
+    kept = interreflect_diffuse(mesh, vector, albedo, path=tmp_path / "vector", **options).vector
+    close(kept, interreflect_diffuse(mesh, vector, albedo, **options).vector)
+    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*brdf"):
+        interreflect(mesh, matrix, lambert[::-1], path=tmp_path / "matrix", **options)
+    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*rows"):
+        interreflect_diffuse(mesh, vector, albedo / 2, path=tmp_path / "vector", **options)
