@@ -99,26 +99,29 @@ def test_radiance_and_gradients_are_finite_for_polar_views_and_normals(mirror):
         assert np.isfinite(np.asarray(gradient)).all()
 
 
-@pytest.mark.parametrize("turn", HALF_TURNS)
-def test_gradients_by_frames_are_those_of_turns_at_half_turns(turn):
+def test_gradients_by_frames_are_those_of_turns_at_half_turns():
     light = jnp.asarray(np.random.default_rng(3).normal(size=(25, 1)), jnp.float32)
-    axis = jnp.array([0.3, -0.5, 0.8])
+    frame = jnp.asarray(np.stack(TURNS), jnp.float32)
+    axis = jnp.array([0.3, -0.5, 0.8]) / jnp.sqrt(0.98)
     cross = jnp.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
 
-    def value(angle):
-        frame = jax.scipy.linalg.expm(angle * cross) @ jnp.asarray(turn, jnp.float32)
-        return harmonic.local_light(frame[None], light)[..., 0]
+    @jax.jit
+    def value(angle):  # Rodrigues' formula.
+        turn = jnp.eye(3) + jnp.sin(angle) * cross + 2 * jnp.sin(angle / 2) ** 2 * cross @ cross
+        return harmonic.local_light(turn @ frame, light)[:, 0]
 
     _, tangent = jax.jvp(value, (jnp.zeros(()),), (jnp.ones(()),))
     step = 1e-2
     numeric = (8 * (value(step) - value(-step)) - value(2 * step) + value(-2 * step)) / (12 * step)
-    assert np.linalg.norm(tangent - numeric) < 2e-3 * np.linalg.norm(numeric)
+    error = np.linalg.norm(tangent - numeric, axis=0) / np.linalg.norm(numeric, axis=0)
+    assert error.max() < 2e-3
 
 
-@pytest.mark.parametrize("degree", [4, 9])
-def test_constant_light_through_the_whole_system_is_the_albedo(degree):
+@pytest.mark.parametrize("degree", [1, 4])
+def test_constant_light_through_the_whole_system_is_the_albedo(lambert, degree):
     mesh, albedo = sphere(), np.array([1.0, 0.5, 0.0])
-    table = tabulate(Lambert(albedo), degree=degree, resolution=8)
+    table = lambert.truncate(degree=degree)
+    table = HarmonicBrdf(table.table * albedo.astype(np.float32)[:, None, None], (), table.error)
     light = harmonic.project(WHITE, degree=degree)
     color = np.asarray(harmonic.unshadowed_radiance(mesh, table, light, eye=EYE))
     seen = color[:, 0] != 0

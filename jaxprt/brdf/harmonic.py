@@ -225,7 +225,7 @@ def _choose_rule(brdfs: Sequence[Callable], degree: int, error: float) -> tuple[
             float(jnp.linalg.norm(a - b) / jnp.maximum(jnp.linalg.norm(b), jnp.finfo(b.dtype).tiny))
             for a, b in zip(coarse, fine, strict=True)
         )
-        if reached <= error or finer == _RULES[-1]:
+        if not reached > error or finer == _RULES[-1]:  # No rule helps what is NaN.
             break
         rule, coarse = finer, fine
     return *rule, reached

@@ -81,7 +81,7 @@ def normal(random, *shape):
 
 @pytest.mark.parametrize("transported", [1, 3])
 @pytest.mark.parametrize("colors", [1, 3])
-@pytest.mark.parametrize("lights", [(1,), (3,), (1, 5), (3, 5)])
+@pytest.mark.parametrize("lights", [(3,), (1, 5)])
 def test_all_ways_with_transfer_give_the_same_radiance(random, close, transported, colors, lights):
     matrix, brdf = made(random, transported=transported, colors=colors)
     light = normal(random, 9, *lights)
@@ -132,23 +132,21 @@ def test_unshadowed_radiance_is_the_integral_of_light_times_table(random):
     arriving = np.asarray(harmonics.reconstruct(light, jnp.asarray(wi, jnp.float32)))
     wo = directions.normalize(EYE - mesh.position)
     wo = jnp.einsum("vij,vj->vi", matrix.frame, wo)
+    color = harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE)
     for vertex in range(5):
         local = jnp.asarray(wi @ np.asarray(matrix.frame[vertex]).T, jnp.float32)
         value = brdf(local, jnp.broadcast_to(wo[vertex], local.shape))
         expected = (np.repeat(weight, 9) * 2 * np.pi / 9) @ (arriving * value)
-        actual = harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE)[vertex]
-        np.testing.assert_allclose(actual, expected, atol=1e-4)
+        np.testing.assert_allclose(color[vertex], expected, atol=1e-4)
 
 
-def test_one_light_for_all_is_the_same_light_at_each_vertex(transport, glossy, coefficient, mesh, close):
-    each = jnp.broadcast_to(coefficient[..., None], (*coefficient.shape, len(mesh.position)))
-    close(
-        harmonic.radiance(transport, glossy, each, eye=EYE), harmonic.radiance(transport, glossy, coefficient, eye=EYE)
-    )
-    close(
-        harmonic.unshadowed_radiance(mesh, glossy, each, eye=EYE),
-        harmonic.unshadowed_radiance(mesh, glossy, coefficient, eye=EYE),
-    )
+def test_one_light_for_all_is_the_same_light_at_each_vertex(random, close):
+    matrix, brdf = made(random)
+    mesh = make_mesh(matrix.position, np.array([[0, 1, 2]]), normal=matrix.frame[:, 2], tangent=matrix.frame[:, 0])
+    light = normal(random, 9, 3)
+    each = jnp.broadcast_to(light[..., None], (9, 3, 5))
+    for made_of, relight in ((matrix, harmonic.radiance), (mesh, harmonic.unshadowed_radiance)):
+        close(relight(made_of, brdf, each, eye=EYE), relight(made_of, brdf, light, eye=EYE))
 
 
 def test_each_vertex_meets_its_own_light(random, close):
@@ -214,12 +212,14 @@ def test_diffuse_radiance_is_that_of_the_reference(mesh, light, coefficient):
 def test_varying_brdfs_have_the_table_of_each_vertex_parameter(random, coefficient, close):
     mesh = builtin.sphere(rings=4, sectors=6)
     knot = np.array([0.0, 0.5, 1.0])
-    varying = tabulate(lambda specular: Phong(specular=specular, exponent=6.0), resolution=8, knot=(knot,))
+    varying = tabulate(lambda specular: Phong(specular=specular, exponent=6.0), degree=1, resolution=8, knot=(knot,))
     choice = random.integers(3, size=len(mesh.position))
-    actual = harmonic.unshadowed_radiance(mesh, varying, coefficient, jnp.asarray(knot[choice], jnp.float32), eye=EYE)
+    actual = harmonic.unshadowed_radiance(
+        mesh, varying, coefficient[:4], jnp.asarray(knot[choice], jnp.float32), eye=EYE
+    )
     for number in range(3):
         single = HarmonicBrdf(varying.table[:, :, number], (), varying.error)
-        expected = harmonic.unshadowed_radiance(mesh, single, coefficient, eye=EYE)
+        expected = harmonic.unshadowed_radiance(mesh, single, coefficient[:4], eye=EYE)
         close(actual[choice == number], expected[choice == number])
 
 

@@ -10,9 +10,7 @@ from scipy.special import eval_legendre, sph_harm_y
 from jaxprt.sphere import cubemap, harmonics
 
 DEGREE = 50
-# SciPy's own distance from orthonormality at degree 50 by quadrature is of this size, and so is that of the angles.
-SCIPY = 1e-11
-TEXEL = 5e-4  # A harmonic of degree 4 or less, constant on texels of 1/32 of a face: second order in their width.
+TEXEL = 3e-3  # A harmonic constant on texels of 1/32 of a face is off by the square of their width: 2e-3 at degree 4.
 POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
 
 
@@ -62,7 +60,7 @@ def test_the_basis_is_orthonormal_and_scipys_in_real_form_without_its_phase(degr
     inside, outside = np.split(basis, [len(direction)])
     some = np.unique(np.random.default_rng(1).integers(0, (degree + 1) ** 2, 200))
     close((inside[:, some] * weight[:, None]).T @ inside, np.eye((degree + 1) ** 2)[some])
-    close(outside, scipy_basis(others, degree), tolerance=SCIPY)
+    close(outside, scipy_basis(others, degree))
 
 
 def test_degree_50_evaluates_in_float32(x64, close):
@@ -105,7 +103,7 @@ def test_the_gradient_at_the_poles_is_that_along_great_circles(pole, x64, close)
 
 
 def test_gradients_of_high_degree_in_float32_are_those_of_finite_differences(x64, close):
-    degree = 20  # Derivatives of degree 50 take half a minute to compile.
+    degree = 20  # Derivatives of degree 50 take tens of seconds to compile.
     direction = np.concatenate([unit(3, 20), POLES, np.eye(3)])
     weight = normal(4, (degree + 1) ** 2)
     _, pull = jax.vjp(lambda s: harmonics.evaluate(s, degree=degree), jnp.asarray(direction, jnp.float32))
@@ -116,8 +114,7 @@ def test_gradients_of_high_degree_in_float32_are_those_of_finite_differences(x64
 
     h = 1e-4
     expected = [(8 * (along(i, h) - along(i, -h)) - (along(i, 2 * h) - along(i, -2 * h))) / (12 * h) for i in range(3)]
-    # Directions are rounded to 6e-8, and the polynomial's slope changes degree times as quickly as its value.
-    close(gradient, np.stack(expected, -1), tolerance=degree * 1e-6)
+    close(gradient, np.stack(expected, -1))
 
 
 @pytest.mark.parametrize("l", [0, 1, 2, 4])
@@ -125,7 +122,7 @@ def test_a_cubemap_that_holds_one_harmonic_projects_to_it(l, close):
     basis = np.asarray(harmonics.evaluate(cubemap.direction(size=32), degree=4))
     rows = np.arange(l * l, (l + 1) ** 2)
     coefficient = harmonics.project(jnp.asarray(basis[..., rows]), degree=4)
-    close(coefficient, np.eye(25, dtype=np.float32)[:, rows], tolerance=TEXEL * np.sqrt(len(rows)) * 2)
+    close(coefficient, np.eye(25, dtype=np.float32)[:, rows], tolerance=TEXEL)
 
 
 def test_the_error_of_projected_harmonics_falls_with_the_square_of_the_texels(x64):

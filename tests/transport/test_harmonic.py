@@ -55,7 +55,7 @@ def grid(function, *, above):
     return np.tensordot(np.outer(weight / 2, weight * np.pi / 2).ravel(), function(wi), 1)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 4, 7])
+@pytest.mark.parametrize("degree", [1, 4])
 def test_open_vertices_have_the_rotation_to_their_frame(random, close, degree):
     frame = frames(random, 4)
     expected = open_matrices(frame, degree)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import Lambert, Phong
+from jaxprt.brdf import HarmonicBrdf, Lambert
 from jaxprt.brdf.harmonic import tabulate
 from jaxprt.relight import harmonic as relight
 from jaxprt.scene import builtin
@@ -163,7 +163,7 @@ def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow(mesh, vector):
 
 
 def test_a_white_furnace_is_as_white_through_matrices(mesh, matrix, vector):
-    white = [tabulate(Lambert(1.0), resolution=8)] * 2
+    white = [tabulate(Lambert([1.0, 1, 1]), resolution=8)] * 2
     total = interreflect(mesh, matrix, white, bounces=3, size=SIZE, progress=False)
     first, color = (np.asarray(relight.radiance(each, white[0], WHITE, eye=EYE))[:, 0] for each in (matrix, total))
     expected = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=3, size=SIZE, progress=False)
@@ -219,7 +219,7 @@ def test_diffuse_matrices_agree_with_vectors(mesh, matrix, vector, lambert):
 
 
 def test_every_region_sends_what_its_own_brdf_reflects(mesh, matrix, lambert):
-    gray = tabulate(Phong(diffuse=0.1, specular=0.7, exponent=8.0), resolution=8)
+    gray = HarmonicBrdf(lambert[0].table[:, :1], (), lambert[0].error)
     mixed, only, other = (
         np.asarray(interreflect(mesh, matrix, brdf, size=SIZE, progress=False).matrix)
         for brdf in ([gray, lambert[1]], [gray, gray], [lambert[1], lambert[1]])
@@ -262,7 +262,7 @@ def test_tables_of_another_degree_or_with_parameters_are_refused(mesh, matrix, l
     low = lambert[0].truncate(degree=2)
     with pytest.raises(ValueError, match=r"must have the transport's degree 4 and no parameters, got degrees \[2\]"):
         interreflect(mesh, matrix, [lambert[0], low], progress=False)
-    varying = tabulate(Lambert, resolution=2, knot=(np.array([0.1, 0.9]),))
+    varying = HarmonicBrdf(jnp.zeros((25, 1, 2, 4, 4)), (jnp.array([0.1, 0.9]),), jnp.zeros(()))
     with pytest.raises(ValueError, match="no parameters"):
         interreflect(mesh, matrix, [lambert[0], varying], progress=False)
 
