@@ -42,7 +42,7 @@ def direction(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: The size is below 1.
     """
-    return jnp.asarray(_direction(size))
+    return jnp.asarray(_direction(size), jnp.result_type(float))
 
 
 def point(*, size: int) -> Float[Array, "6 n n 3"]:
@@ -57,7 +57,7 @@ def point(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: The size is below 1.
     """
-    return jnp.asarray(_point(size))
+    return jnp.asarray(_point(size), jnp.result_type(float))
 
 
 def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
@@ -74,7 +74,7 @@ def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
     Raises:
         ValueError: The size is below 1.
     """
-    return jnp.asarray(_solid_angle(size))
+    return jnp.asarray(_solid_angle(size), jnp.result_type(float))
 
 
 def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
@@ -93,7 +93,7 @@ def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: The size is below 1.
     """
-    return jnp.asarray(_vector_area(size))
+    return jnp.asarray(_vector_area(size), jnp.result_type(float))
 
 
 @jax.jit
