@@ -3,8 +3,8 @@
     python -m benchmarks.relight_separable [--quick] [--output FILE]
 
 Kept coefficients lie anywhere among all 24,576, which is harder on caches than real transport. The light change is
-`sparse.apply` on the light's coefficients and is measured against scipy's CSR product on the same numbers and against
-reading the arrays once on two threads; the view change against the light change; both at growing mesh sizes.
+`SparseTransport.apply` on the light's coefficients and is measured against scipy's CSR product on the same numbers and
+against reading the arrays once on two threads; the view change against the light change; both at growing mesh sizes.
 """
 
 import jax
@@ -16,7 +16,7 @@ from benchmarks import harness
 from jaxprt.brdf import AshikhminShirley, separable
 from jaxprt.relight.separable import combine, view_tuple
 from jaxprt.sphere import directions
-from jaxprt.transport import SparseTransport, sparse
+from jaxprt.transport import SparseTransport
 
 SIZE = 64
 TERMS = 4
@@ -53,7 +53,7 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
     matrix = as_csr(transport)
     dense_light = np.asarray(light)
     exact = (matrix.astype(np.float64) @ dense_light.astype(np.float64)).reshape(vertices, TERMS, 3)
-    mine = sparse.apply(transport, light)
+    mine = transport.apply(light)
     common = {
         "benchmark": "relight_separable",
         "error": float(np.linalg.norm(mine - exact) / np.linalg.norm(exact)),
@@ -66,7 +66,7 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
         "memory-read": harness.reader([np.asarray(x) for x in (transport.index, transport.value)]),
     }
     for name, peer in peers.items():
-        first, second = harness.compare(lambda: sparse.apply(transport, light), peer, repeats=repeats)
+        first, second = harness.compare(lambda: transport.apply(light), peer, repeats=repeats)
         wrong = (
             0.0 if name == "memory-read" else float(np.linalg.norm((matrix @ dense_light).reshape(exact.shape) - exact))
         )
@@ -75,7 +75,7 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
         lines.append({**common, **case, **first.line(), **peer_line})
     eye = jnp.array([3.0, 1.0, 2.0])
     view, change = harness.compare(
-        lambda: combine(mine, view_tuple(transport, brdf, eye)), lambda: sparse.apply(transport, light), repeats=repeats
+        lambda: combine(mine, view_tuple(transport, brdf, eye)), lambda: transport.apply(light), repeats=repeats
     )
     case = {"case": f"view change, {vertices} vertices", "nanoseconds_per_vertex": view.seconds / vertices * 1e9}
     lines.append(

@@ -346,7 +346,6 @@ EXAMPLES = {
     "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "transport.harmonic.right_handed": example(lambda draw: call(draw.rotation(4))),
     "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
-    "transport.sparse.apply": example(lambda draw: call(draw.sparse(), draw.normal(96, 3))),
     "relight.reference.integrate": example(
         lambda draw: call(
             draw.seen(2),

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
-from jaxprt.transport import sparse
 from jaxprt.transport.sparse import SparseTransport
 
 _STEPS = (1 << 15) - 1  # signed 16 bits
@@ -112,7 +111,7 @@ def light_tuple(
     coefficient = project(light)
     if light_keep is not None:
         coefficient = choose_by_transport(coefficient, transport.rms, count=light_keep)
-    return sparse.apply(transport, coefficient)
+    return transport.apply(coefficient)
 
 
 @jax.jit

@@ -33,6 +33,32 @@ class SparseTransport(eqx.Module):
         index, value = self.index[:count, :, :terms], self.value[:count, :, :terms]
         return SparseTransport(index, value, self.position, self.frame, rms(index, value, self.rms.shape[0]))
 
+    @jax.jit
+    def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
+        """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
+
+        The kept-coefficient axis comes first, so one step reads contiguous rows of all vertices.
+
+        Args:
+            coefficient: Coefficients of the light.
+
+        Returns:
+            The light-modulated tuple of Wang et al., in the light's units.
+        """
+        kept, vertices, terms = self.index.shape
+        index, value = self.index.reshape(kept, -1), self.value.reshape(kept, vertices * terms, -1)
+        # A gray value is broadcast by hand: a trailing axis of 1 in the loop costs XLA's CPU code twice the time.
+        gray = value.shape[-1] == 1
+        value = value[..., 0] if gray else value
+
+        def step(total, row):
+            number, weight = row
+            light = coefficient.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
+            return total + (weight[:, None] if gray else weight) * light, None
+
+        start = jnp.zeros((vertices * terms, coefficient.shape[1]), jnp.result_type(coefficient, value))
+        return jax.lax.scan(step, start, (index, value))[0].reshape(vertices, terms, -1)
+
     @property
     def nbytes(self) -> int:
         """Bytes of the coefficients."""
@@ -68,34 +94,6 @@ def largest(
     index = jnp.where(jnp.any(value != 0, -1), index, 0)
     small = jnp.uint16 if count <= 1 << 16 else jnp.uint32
     return jnp.moveaxis(index, 2, 0).astype(small), jnp.moveaxis(value, 2, 0)
-
-
-@jax.jit
-def apply(transport: SparseTransport, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
-    """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
-
-    The kept-coefficient axis comes first, so one step reads contiguous rows of all vertices.
-
-    Args:
-        transport: The transport.
-        coefficient: Coefficients of the light.
-
-    Returns:
-        The light-modulated tuple of Wang et al., in the light's units.
-    """
-    kept, vertices, terms = transport.index.shape
-    index, value = transport.index.reshape(kept, -1), transport.value.reshape(kept, vertices * terms, -1)
-    # A gray value is broadcast by hand: a trailing axis of 1 in the loop costs XLA's CPU code twice the time.
-    gray = value.shape[-1] == 1
-    value = value[..., 0] if gray else value
-
-    def step(total, row):
-        number, weight = row
-        light = coefficient.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
-        return total + (weight[:, None] if gray else weight) * light, None
-
-    start = jnp.zeros((vertices * terms, coefficient.shape[1]), jnp.result_type(coefficient, value))
-    return jax.lax.scan(step, start, (index, value))[0].reshape(vertices, terms, -1)
 
 
 def rms(index: Array | np.ndarray, value: Array | np.ndarray, size: int) -> Array:

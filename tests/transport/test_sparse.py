@@ -82,7 +82,7 @@ def test_apply_is_the_dense_product(random, close, colors, light_colors):
     transport = make(random.normal(size=(6, 24, 3, colors)), 9)
     light = random.normal(size=(24, light_colors)).astype(np.float32)
     expected = np.einsum("vdrc,dc->vrc", np.broadcast_to(dense(transport), (6, 24, 3, light_colors)), light)
-    close(sparse.apply(transport, jnp.asarray(light)), expected)
+    close(transport.apply(jnp.asarray(light)), expected)
 
 
 def test_kept_prefixes_are_what_the_smaller_number_would_have_kept(random):
