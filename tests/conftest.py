@@ -4,6 +4,12 @@ import os
 import pathlib
 from collections.abc import Callable, Iterator
 
+# Most of a run is compiling. Both test processes, notebooks and programs started by tests share what is compiled, and
+# a later run finds it; `make clean` removes it. Set before jax is imported, and inherited by what the tests start.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
 import jax
 import jaxtyping
 import numpy as np
