@@ -5,6 +5,7 @@
 Kept coefficients lie anywhere among all 24,576, which is harder on caches than real transport. The light change is
 `SparseTransport.apply` on the light's coefficients and is measured against scipy's CSR product on the same numbers and
 against reading the arrays once on two threads; the view change against the light change; both at growing mesh sizes.
+Transport in whole numbers, gray and in color, is measured against the same transport in floating point.
 """
 
 import jax
@@ -17,10 +18,12 @@ from jaxprt.brdf import AshikhminShirley, separable
 from jaxprt.relight.separable import combine, view_tuple
 from jaxprt.sphere import directions
 from jaxprt.transport import SparseTransport
+from jaxprt.transport.quantized import quantize
 
 SIZE = 64
 TERMS = 4
 KEEP = 96
+MOST_IN_COLOR = 36_000  # 200 MB in floating point.
 
 
 def main() -> None:
@@ -32,16 +35,21 @@ def main() -> None:
     for vertices in sizes:
         transport = synthetic(vertices)
         light = jax.random.normal(jax.random.key(1), (6 * SIZE * SIZE, 3))
-        for line in measure(transport, brdf, light, repeats if vertices < 100_000 else max(5, repeats // 3)):
+        fewer = repeats if vertices < 100_000 else max(5, repeats // 3)
+        lines = measure(transport, brdf, light, fewer)
+        lines.append(measure_quantized(transport, light, fewer))
+        if vertices <= MOST_IN_COLOR:
+            lines.append(measure_quantized(synthetic(vertices, colors=3), light, fewer))
+        for line in lines:
             harness.report(line, arguments.output)
 
 
-def synthetic(vertices: int) -> SparseTransport:
+def synthetic(vertices: int, *, colors: int = 1) -> SparseTransport:
     """Transport with random coefficients, on the vertices of a sphere."""
     rng = np.random.default_rng(0)
     shape = (KEEP, vertices, TERMS)
     index = rng.integers(0, 6 * SIZE * SIZE, shape, dtype=np.uint16)
-    value = rng.standard_normal((*shape, 1), dtype=np.float32)
+    value = rng.standard_normal((*shape, colors), dtype=np.float32)
     normal = directions.normalize(jnp.asarray(rng.standard_normal((vertices, 3), dtype=np.float32)))
     frame = directions.frame(normal, directions.tangent(normal))
     return SparseTransport(jnp.asarray(index), jnp.asarray(value), normal, frame, jnp.ones(6 * SIZE * SIZE))
@@ -82,6 +90,27 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
         {**common, **case, **view.line(), "peer": "light change", "peer_seconds": change.seconds, "peer_error": 0.0}
     )
     return lines
+
+
+def measure_quantized(transport: SparseTransport, light: jax.Array, repeats: int) -> dict:
+    """The line of one transport in whole numbers."""
+    _, vertices, _, colors = transport.value.shape
+    quantized = quantize(transport)
+    mine, theirs = harness.compare(lambda: quantized.apply(light), lambda: transport.apply(light), repeats=repeats)
+    exact = transport.apply(light)
+    return {
+        "benchmark": "relight_separable",
+        "case": f"light change, {vertices} vertices, quantized {'gray' if colors == 1 else 'color'}",
+        **mine.line(),
+        "nanoseconds_per_vertex": mine.seconds / vertices * 1e9,
+        "error": float(jnp.linalg.norm(quantized.apply(light) - exact) / jnp.linalg.norm(exact)),
+        "bytes": quantized.nbytes,
+        "vertices": vertices,
+        "peer": "floating point",
+        "peer_seconds": theirs.seconds,
+        "peer_error": 0.0,
+        "peer_bytes": transport.nbytes,
+    }
 
 
 def as_csr(transport: SparseTransport) -> scipy.sparse.csr_matrix:

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
 ROOMS = ["__main__", "report", "inverse", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere", "files"]
-SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "reference"}
+SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.
 SIDEWAYS = {
@@ -32,6 +32,13 @@ SIDEWAYS = {
     ("scene", "mesh", "mesh_file"),
     ("sphere", "harmonics", "cubemap"),
     ("sphere", "rotation", "harmonics"),
+    ("scene", "occluder", "mesh"),
+    ("transport", "clustered", "blocks"),
+    ("transport", "clustered", "direct"),
+    ("transport", "clustered", "separable"),
+    ("transport", "direct", "blocks"),
+    ("transport", "direct", "visibility"),
+    ("transport", "quantized", "sparse"),
     ("transport", "visibility", "blocks"),
     ("transport", "interreflection", "blocks"),
     ("transport", "interreflection", "harmonic"),
@@ -45,6 +52,7 @@ ONLY_IN = {
     "OpenImageIO": "jaxprt.files",
     "zarr": "jaxprt.files",
     "jaxopt": "jaxprt.inverse",
+    "fast_simplification": "jaxprt.scene.occluder",
 }
 
 MOST_LINES = 400

@@ -345,7 +345,14 @@ EXAMPLES = {
     "transport.harmonic.transfer": example(lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2),
     "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "transport.harmonic.right_handed": example(lambda draw: call(draw.rotation(4))),
+    # Rounding is constant; what it is relative to is differentiable in dequantize.
+    "transport.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),
+    "transport.quantized.dequantize": example(lambda draw: call(transport.quantized.quantize(draw.sparse()))),
     "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
+    "scene.texture.lookup": example(lambda draw: call(draw.normal(3, 4, 2), draw.normal(5, 2))),
+    # Rounding is constant but for the largest coefficient, which makes steps of all others.
+    "relight.separable.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
+    "relight.separable.modulate": example(lambda draw: call(draw.normal(4, 3, 1), draw.normal(4, 2, 3)), terms=(1, 2)),
     "relight.reference.integrate": example(
         lambda draw: call(
             draw.seen(2),

@@ -13,6 +13,7 @@ from jaxprt.relight import reference, separable
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.environment import environment_from_image
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.transport.quantized import quantize
 from jaxprt.transport.separable import precompute
 
 SIZE = 8
@@ -190,6 +191,25 @@ def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
     near = np.flatnonzero(np.abs(np.asarray(mesh.position)).max(1) < 3)
     assert not relight(mesh, lambert, below, vertex=near, eye=jnp.array([0.0, -5, 1])).any()
     assert not relight(mesh, lambert, below, vertex=near).any()
+
+
+def test_one_huge_coefficient_erases_no_others_when_quantized(glossy, light, close):
+    mesh = sphere()
+    transport = precompute(mesh, glossy, keep=24, size=SIZE, progress=False)
+    spoiled = eqx.tree_at(lambda t: t.value, transport, transport.value.at[0, 5, 1].multiply(1e6))
+    color, expected = (separable.radiance(quantize(each), glossy, light, eye=EYE) for each in (spoiled, transport))
+    assert np.isfinite(np.asarray(color)).all()
+    others = np.arange(len(mesh.position)) != 5
+    np.testing.assert_array_equal(color[others], expected[others])
+    # 32,767 levels for each vertex and term.
+    close(expected, separable.radiance(transport, glossy, light, eye=EYE), tolerance=1e-4)
+    close(color[5], separable.radiance(spoiled, glossy, light, eye=EYE)[5], tolerance=1e-4)
+
+
+def test_transport_of_zeros_is_quantized_to_zeros(lambert, light):
+    transport = precompute(sphere(), lambert, keep=24, size=SIZE, progress=False)
+    dark = eqx.tree_at(lambda t: t.value, transport, 0 * transport.value)
+    assert not np.asarray(separable.radiance(quantize(dark), lambert, light, eye=EYE)).any()
 
 
 AWKWARD = [

@@ -3,18 +3,48 @@
 Turning the light redoes only `light_tuple`, moving the eye only `view_tuple`; the caller keeps the other.
 """
 
-from functools import partial
+from collections.abc import Sequence
+from functools import partial, reduce
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
-from jaxprt.transport.sparse import SparseTransport
 
 _STEPS = (1 << 15) - 1  # signed 16 bits
+
+
+@runtime_checkable
+class Transport(Protocol):
+    """What relighting asks of precomputed transport, however it is stored.
+
+    Attributes:
+        position: Vertex positions in world units. Clustered transport has vertices in an order of its own.
+        frame: Rows are tangent, bitangent, normal.
+        rms: Root mean square over vertices and terms of each coefficient.
+    """
+
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    rms: Float[Array, " b"]
+
+    @property
+    def terms(self) -> int:
+        """Number of BRDF terms."""
+        ...
+
+    def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
+        """Transport times light coefficients, per vertex, term and color."""
+        ...
+
+    def ordered(self, value: Float[Array, "v *c"]) -> Float[Array, "w *c"]:
+        """What was computed by the transport's rows, in the order of the vertices."""
+        ...
 
 
 @jax.jit
@@ -35,20 +65,46 @@ def project(light: Environment) -> Float[Array, "b c"]:
 
 @partial(jax.jit, static_argnames=("threshold",))
 def choose_by_magnitude(coefficient: Float[Array, "b c"], *, threshold: int = 1024) -> Float[Array, "b c"]:
-    """Quantizes to signed 16 bits per color and drops what is below the threshold, as published.
+    """Drops what is below the threshold in signed 16 bits per color, as published.
+
+    It keeps 691 of the 24,576 coefficients of Grace, 878 of Eucalyptus and 372 of St Peter's, in one color or more;
+    the published count is 200 to 600. Radiance of the bunny and its ground is then off by 5.2, 1.2 and 8.4 %, and with
+    200 coefficients by `choose_by_transport` by 0.5, 0.3 and 0.5 %.
 
     Args:
         coefficient: Coefficients of the light.
         threshold: Smallest magnitude kept, in steps of the largest coefficient of each color / 32767.
 
     Returns:
-        Coefficients with zeros where dropped; kept ones are not rounded.
+        Coefficients with zeros where dropped; kept ones are not rounded, which is for `quantize`.
 
     Reference: Wang, Tran, Luebke 2004, section 3.4.
     """
+    return jnp.where(jnp.abs(_level(coefficient)) >= threshold, coefficient, 0)
+
+
+@jax.jit
+def quantize(coefficient: Float[Array, "b c"]) -> Float[Array, "b c"]:
+    """Rounds to signed 16 bits: multiples of the largest coefficient of each color / 32767.
+
+    That changes the radiance of the bunny under Grace by 3e-5, under St Peter's by 8e-5 of its norm.
+
+    Args:
+        coefficient: Coefficients of the light.
+
+    Returns:
+        Rounded coefficients, in the same units. Derivatives are those of the largest alone: the rest are steps.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.4.
+    """
+    return _level(coefficient) * (jnp.max(jnp.abs(coefficient), 0) / _STEPS)
+
+
+def _level(coefficient: Array) -> Array:
+    """Whole multiples of the largest coefficient of each color / 32767."""
     largest = jnp.max(jnp.abs(coefficient), 0)
     quantum = jnp.where(largest > 0, largest, 1) / _STEPS
-    return jnp.where(jnp.round(jnp.abs(coefficient) / quantum) >= threshold, coefficient, 0)
+    return jnp.round(coefficient / quantum)
 
 
 @partial(jax.jit, static_argnames=("count",))
@@ -72,7 +128,7 @@ def choose_by_transport(
 
     Args:
         coefficient: Coefficients of the light.
-        rms: `SparseTransport.rms`.
+        rms: `Transport.rms`.
         count: How many to keep.
 
     Returns:
@@ -88,9 +144,7 @@ def _choose(coefficient: Array, weight: Array, count: int) -> Array:
     return jnp.zeros_like(coefficient).at[index].set(coefficient[index])
 
 
-def light_tuple(
-    transport: SparseTransport, light: Environment, *, light_keep: int | None = None
-) -> Float[Array, "v r c"]:
+def light_tuple(transport: Transport, light: Environment, *, light_keep: int | None = None) -> Float[Array, "v r c"]:
     """The light side: what changes when the light turns.
 
     Args:
@@ -115,7 +169,7 @@ def light_tuple(
 
 
 @jax.jit
-def view_tuple(transport: SparseTransport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
+def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
     """The view side: view maps looked up at each vertex's direction to the eye; zero where it looks away.
 
     Args:
@@ -132,6 +186,63 @@ def view_tuple(transport: SparseTransport, brdf: SeparableBrdf, eye: Float[Array
     return brdf.view(directions.normalize(local))
 
 
+def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
+    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them; see `modulate`.
+
+    Args:
+        brdfs: One or more, on maps of one kind and size; those with one color serve as gray beside those with more.
+
+    Returns:
+        The sum of the BRDFs, with the terms of the first, then those of the next. Its error is not known and reads NaN.
+
+    Raises:
+        ValueError: There are no BRDFs, or their maps differ in coordinates or resolution.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.1, which names linear combinations of basic BRDFs.
+    """
+    kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
+    if len(kinds) != 1:
+        raise ValueError(f"brdfs must be at least one, on maps of one kind, got {', '.join(kinds) or 'none'}")
+
+    def side_by_side(maps):
+        colors = max(each.shape[-1] for each in maps)
+        return jnp.concatenate([jnp.broadcast_to(each, (*each.shape[:-1], colors)) for each in maps])
+
+    light_map, view_map = (side_by_side([getattr(b, name) for b in brdfs]) for name in ("light_map", "view_map"))
+    return SeparableBrdf(light_map, view_map, jnp.full_like(brdfs[0].error, jnp.nan), brdfs[0].coordinates)
+
+
+@partial(jax.jit, static_argnames=("terms",))
+def modulate(
+    view: Float[Array, "v r d"], weight: Float[Array, "v n w"], *, terms: tuple[int, ...]
+) -> Float[Array, "v r e"]:
+    """Gives every vertex a BRDF of its own: the view tuple with the terms of n basis BRDFs weighted.
+
+    A texture over all of one BRDF is n = 1; a texture on its diffuse part is `join` of that part and the rest, with
+    weight 1 for the rest. Neither transport nor the light tuple depends on the weights, so new ones cost no more than
+    a view change. Linear in the weights, and differentiable in them.
+
+    Args:
+        view: `view_tuple` of the joined BRDF.
+        weight: Of each row of the transport (its vertices), basis BRDF, and color or all colors alike.
+        terms: Number of terms of each basis BRDF, in the order of `join`.
+
+    Returns:
+        The view tuple for `combine`, in the colors of the BRDF or of the weights, whichever are more.
+
+    Raises:
+        ValueError: The weights' n or the tuple's r do not fit the terms.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.1.
+    """
+    if weight.shape[1] != len(terms) or view.shape[1] != sum(terms):
+        raise ValueError(
+            f"terms must be one number for each of {weight.shape[1]} weights that add up to the tuple's "
+            f"{view.shape[1]}, got {terms}"
+        )
+    return view * weight[:, np.repeat(np.arange(len(terms)), terms)]
+
+
 @jax.jit
 def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
     """Dot product of the two tuples: outgoing radiance per vertex and color.
@@ -143,11 +254,12 @@ def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[
     Returns:
         Linear radiance in e colors, the larger of c and d: a gray side serves all colors of the other.
     """
-    return jnp.sum(light * view, 1)
+    # Written out term by term: a reduction over the middle axis costs XLA's CPU code ten times as much.
+    return reduce(jnp.add, (light[:, term] * view[:, term] for term in range(light.shape[1])))
 
 
 def radiance(
-    transport: SparseTransport,
+    transport: Transport,
     brdf: SeparableBrdf,
     light: Environment,
     *,
@@ -176,6 +288,7 @@ def radiance(
 
     Reference: Wang, Tran, Luebke 2004, equation 6.
     """
-    if brdf.terms != transport.index.shape[2]:
-        raise ValueError(f"the BRDF must have the transport's {transport.index.shape[2]} terms, got {brdf.terms}")
-    return combine(light_tuple(transport, light, light_keep=light_keep), view_tuple(transport, brdf, eye))
+    if brdf.terms != transport.terms:
+        raise ValueError(f"the BRDF must have the transport's {transport.terms} terms, got {brdf.terms}")
+    lit = light_tuple(transport, light, light_keep=light_keep)
+    return transport.ordered(combine(lit, view_tuple(transport, brdf, eye)))

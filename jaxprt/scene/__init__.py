@@ -1,8 +1,20 @@
 """What is looked at: meshes, environments, cameras, embedded scenes."""
 
-from jaxprt.scene import builtin, camera, environment, mesh
+from jaxprt.scene import builtin, camera, environment, mesh, occluder, texture
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
 from jaxprt.scene.mesh import Mesh, load_mesh
 
-__all__ = ["Camera", "Environment", "Mesh", "builtin", "camera", "environment", "load_environment", "load_mesh", "mesh"]
+__all__ = [
+    "Camera",
+    "Environment",
+    "Mesh",
+    "builtin",
+    "camera",
+    "environment",
+    "load_environment",
+    "load_mesh",
+    "mesh",
+    "occluder",
+    "texture",
+]

@@ -4,12 +4,10 @@ import pathlib
 from collections.abc import Sequence
 
 import equinox as eqx
-import fast_simplification
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
-from scipy import sparse, spatial
 
 from jaxprt.scene import mesh_file
 from jaxprt.sphere import directions
@@ -18,7 +16,6 @@ _CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alo
 _GAP = 5e-4  # Of the diagonal, between a mesh and the ground: more than rays start off a surface.
 _BLOCK = 8192
 _ORTHOGONAL = 1e-4  # What rounding may do to R R^T of a rotation made in float32.
-_UNIT = 1000.0  # Diagonal of what is simplified: thresholds of its error are absolute, and begin 2e-6 of this apart.
 _DENSE = 0.4  # Spacing of the ground's vertices in its center, over that of a uniform grid.
 
 
@@ -224,56 +221,6 @@ def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> M
     height = np.full_like(x, low[1] - _GAP * diagonal)
     position = np.stack([center[0] + x, height, center[2] + z], -1).reshape(-1, 3)
     return make_mesh(position, grid_face(rows=n, columns=n), name="ground plane")
-
-
-def simplify(mesh: Mesh, *, faces: int) -> Mesh:
-    """The mesh with fewer faces, to cast shadows in its place: edges collapsed by their quadric error.
-
-    Vertices at one place and in one region count as one, so that seams of texture coordinates do not matter.
-    Boundaries stay as they are, those between regions too: a ground of two triangles remains, a plane of many keeps
-    its rim and little else, and the faces go where the mesh is curved. The result is the same in every run, and for
-    every size of the mesh but for rounding.
-
-    With faces of 16 % of the bunny and its ground, vertices of the bunny lie within 0.1 % of its diagonal of the
-    result, 0.02 % in the root mean square.
-
-    Args:
-        mesh: What casts shadows. Faces without area cast none and are left out, as are vertices without faces.
-        faces: How many to come down to. More are left where boundaries need them.
-
-    Returns:
-        A mesh with normals of its own and the regions of the original; the mesh itself where it has no more faces.
-
-    Raises:
-        ValueError: Fewer than 4 faces are asked for, or no face has an area.
-
-    Reference: Garland, Heckbert 1997, by fast-simplification, which takes edges below a rising threshold in the order
-    of their faces instead of the least one; Wang, Tran, Luebke 2004, section 4.2, for the use.
-    """
-    if faces < 4:
-        raise ValueError(f"faces must be at least 4, got {faces}")
-    if len(mesh.face) <= faces:
-        return mesh
-    low, high = bounds(mesh)
-    unit = _UNIT / (float(np.linalg.norm(high - low)) or 1.0)
-    place = np.column_stack([(np.asarray(mesh.position, np.float64) - low) * unit, mesh.region])
-    place, index = np.unique(place, axis=0, return_inverse=True)
-    face = index.reshape(-1)[np.asarray(mesh.face)]
-    edge = place[face[:, 1:], :3] - place[face[:, :1], :3]
-    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
-    face = np.ascontiguousarray(face[area > 0], np.int32)
-    if not len(face):
-        raise ValueError(f"mesh must have faces with an area, got {len(area)} without")
-    position, face = fast_simplification.simplify(
-        place[:, :3].copy(), face, target_count=min(faces, len(face)), preserve_border=True
-    )
-    # No face joins regions, so that each piece has the region which most of its vertices are nearest to.
-    graph = sparse.coo_array((np.ones(face.size), (face.ravel(), np.roll(face, 1, 1).ravel())), (len(position),) * 2)
-    _, piece = sparse.csgraph.connected_components(graph, directed=False)
-    nearest = place[spatial.KDTree(place[:, :3]).query(position)[1], 3].astype(np.int32)
-    votes = np.zeros((piece.max() + 1, nearest.max() + 1), np.int32)
-    np.add.at(votes, (piece, nearest), 1)
-    return make_mesh(position / unit + low, face, region=votes.argmax(1)[piece], name="simplified mesh")
 
 
 def bounds(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

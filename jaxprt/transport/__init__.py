@@ -1,16 +1,35 @@
 """From visibility to coefficients, per block of vertices."""
 
-from jaxprt.transport import blocks, harmonic, interreflection, separable, sparse, visibility
+from jaxprt.transport import (
+    blocks,
+    clustered,
+    direct,
+    harmonic,
+    interreflection,
+    quantized,
+    separable,
+    sparse,
+    visibility,
+)
+from jaxprt.transport.clustered import ClusteredTransport
+from jaxprt.transport.direct import DirectTransport
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector
+from jaxprt.transport.quantized import QuantizedTransport
 from jaxprt.transport.sparse import SparseTransport
 
 __all__ = [
+    "ClusteredTransport",
+    "DirectTransport",
+    "QuantizedTransport",
     "SparseTransport",
     "TransferMatrix",
     "TransferVector",
     "blocks",
+    "clustered",
+    "direct",
     "harmonic",
     "interreflection",
+    "quantized",
     "separable",
     "sparse",
     "visibility",

@@ -31,6 +31,12 @@ class Job(abc.ABC):
     def vertices(self) -> int:
         """Number of vertices; the last block is padded beyond them."""
 
+    @property
+    def step(self) -> int:
+        """Vertices in a block: the extent of the first result array along its axis, unless a job says otherwise."""
+        at = next(iter(self.layout.values()))
+        return at.shape[at.axis]
+
     @abc.abstractmethod
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block of every result array, and the number of rays that it took."""
@@ -54,15 +60,14 @@ def compute(
         label: Its text.
 
     Returns:
-        The result arrays, cut to the number of vertices.
+        The result arrays; those that have a place for each vertex are cut to the number of vertices.
 
     Raises:
         ValueError: The store at `path` was made from something else.
         BlockingIOError: Another process is writing to it.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
-    size = _block_size(job)
-    blocks = -(-job.vertices // size)
+    blocks = -(-job.vertices // job.step)
     store = None if path is None else BlockStore(path, job.header, job.layout, blocks)
     result = {name: np.zeros(_whole(at, blocks), at.dtype) for name, at in job.layout.items()}
     with tqdm.tqdm(total=job.vertices, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
@@ -75,10 +80,7 @@ def compute(
         elif todo:
             _run(job, todo, store, executor, result, bar)
         bar.update(bar.total - bar.n)
-    return {
-        name: np.take(array, np.arange(job.vertices), at.axis) if array.shape[at.axis] != job.vertices else array
-        for (name, array), at in zip(result.items(), job.layout.values(), strict=True)
-    }
+    return {name: _cut(result[name], at, job) for name, at in job.layout.items()}
 
 
 def fingerprint(*array: Any) -> str:
@@ -153,14 +155,13 @@ def _place(result: dict[str, np.ndarray], block: int, array: Mapping[str, np.nda
         result[name][place] = array[name]
 
 
-def _block_size(job: Job) -> int:
-    at = next(iter(job.layout.values()))
-    return at.shape[at.axis]
+def _cut(array: np.ndarray, at: Layout, job: Job) -> np.ndarray:
+    whole = at.shape[at.axis] != job.step or array.shape[at.axis] == job.vertices
+    return array if whole else np.take(array, np.arange(job.vertices), at.axis)
 
 
 def _count(job: Job, block: int) -> int:
-    size = _block_size(job)
-    return min(size, job.vertices - block * size)
+    return min(job.step, job.vertices - block * job.step)
 
 
 def _whole(at: Layout, blocks: int) -> tuple[int, ...]:

@@ -56,8 +56,18 @@ class SparseTransport(eqx.Module):
             light = coefficient.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
             return total + (weight[:, None] if gray else weight) * light, None
 
-        start = jnp.zeros((vertices * terms, coefficient.shape[1]), jnp.result_type(coefficient, value))
+        colors = max(coefficient.shape[1], self.value.shape[3])
+        start = jnp.zeros((vertices * terms, colors), jnp.result_type(coefficient, value))
         return jax.lax.scan(step, start, (index, value))[0].reshape(vertices, terms, -1)
+
+    def ordered(self, value: Float[Array, "v *c"]) -> Float[Array, "v *c"]:
+        """The same: rows are in the order of the vertices."""
+        return value
+
+    @property
+    def terms(self) -> int:
+        """Number of BRDF terms r."""
+        return self.index.shape[2]
 
     @property
     def nbytes(self) -> int:

@@ -94,7 +94,7 @@ def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
     out = _outward(mesh)
     nudge = np.float32(occluder.nudge)
     start = position + nudge * out
-    foreign = ~np.isin(_rows(position), _rows(occluder.position))
+    foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
     if foreign.any():
         start[foreign] = _surface(occluder, position[foreign], out[foreign])
     own = ~foreign

@@ -8,12 +8,13 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.brdf.separable import factor
-from jaxprt.relight import separable
+from jaxprt.brdf.separable import SeparableBrdf, factor
+from jaxprt.relight import reference, separable
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import directions, haar
 from jaxprt.transport import SparseTransport, sparse
+from jaxprt.transport.quantized import quantize
 from jaxprt.transport.separable import compress, precompute
 
 SIZE = 8
@@ -21,6 +22,7 @@ EYE = jnp.array([2.0, 3.0, 4.0])
 # The horizon cuts texels of 8 x 8 faces coarsely: measured .7 % at worst.
 HORIZON = 1e-2
 TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
+RIM = 1e-4  # A texel's center may lie below the horizon where its mean direction does not: .00002 in all.
 COLORED = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=[0.2, 0.3, 0.7], nu=20, nv=60)
 
 
@@ -196,6 +198,21 @@ def test_choosing_by_magnitude_drops_each_color_below_the_threshold(random):
     np.testing.assert_array_equal(separable.choose_by_magnitude(coefficient * 1024, threshold=1024), chosen * 1024)
 
 
+def test_quantizing_rounds_each_color_to_multiples_of_its_largest(random, close):
+    coefficient = coefficients(random) * jnp.array([1.0, 1e6, 0.0])
+    wide = np.asarray(coefficient, np.float64)
+    quantum = np.abs(wide).max(0) / 32767
+    rounded = np.asarray(separable.quantize(coefficient), np.float64)
+    level = rounded[:, :2] / quantum[:2]
+    np.testing.assert_allclose(level, np.round(level), atol=0.004)
+    assert np.all(np.abs(rounded - wide)[:, :2].max(0) > 0.4 * quantum[:2])
+    assert np.all(np.abs(rounded - wide) <= 0.504 * quantum)
+    assert not rounded[:, 2].any()
+    close(separable.quantize(rounded.astype(np.float32)), rounded)
+    # Twice the light is twice the levels' worth: a quantum is relative.
+    np.testing.assert_array_equal(separable.quantize(coefficient * 1024), separable.quantize(coefficient) * 1024)
+
+
 def test_choosing_as_many_as_there_are_drops_none(transport, factored, close, random):
     light = some_light(random)
     expected = relight(transport, factored, light)
@@ -236,6 +253,112 @@ def test_lights_of_another_size_are_refused(transport, factored):
 def test_only_one_light_of_six_square_faces_is_taken(transport, factored, shape):
     with pytest.raises(ValueError, match=r"the light must be one environment \[6, 8, 8, c\], got"):
         relight(transport, factored, Environment(jnp.ones(shape)))
+
+
+def test_transport_in_whole_numbers_relights_like_transport_in_floating_point(transport, factored, close, random):
+    light, whole = some_light(random), quantize(transport)
+    # Rounding to 32,767 levels of the largest coefficient of each row.
+    close(relight(whole, factored, light), relight(transport, factored, light), tolerance=1e-4)
+    close(
+        relight(whole, factored, light, light_keep=30),
+        relight(transport, factored, light, light_keep=30),
+        tolerance=1e-4,
+    )
+    with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
+        relight(whole, factored.keep(2), light)
+
+
+@pytest.fixture(scope="module")
+def basis():
+    """Three BRDFs on maps of one kind, of 1, 3 and 2 terms."""
+    sharp = AshikhminShirley(diffuse=0.0, specular=0.4, nu=30, nv=30)
+    models = ((Lambert(1.0), 1), (COLORED, 3), (sharp, 2))
+    return [factor(model, terms=terms, resolution=12) for model, terms in models]
+
+
+TERMS = (1, 3, 2)
+
+
+def test_joined_brdfs_are_the_sum_of_their_parts(basis, random, close):
+    wi, wo = (directions.normalize(jnp.asarray(random.normal(size=(40, 3)), jnp.float32)) for _ in range(2))
+    joined = separable.join(basis)
+    assert joined.terms == sum(TERMS)
+    assert joined.coordinates is basis[0].coordinates
+    close(joined(wi, wo), sum(each(wi, wo) for each in basis))
+    close(separable.join(basis[1:2])(wi, wo), basis[1](wi, wo))
+
+
+def test_two_lamberts_joined_are_the_lambert_of_their_summed_albedos(random, close):
+    wi, wo = (directions.normalize(jnp.asarray(random.normal(size=(40, 3)), jnp.float32)) for _ in range(2))
+    parts = [factor(Lambert(albedo), terms=1, resolution=12) for albedo in ([0.1, 0.2, 0.3], [0.25] * 3)]
+    expected = np.array([0.35, 0.45, 0.55]) / np.pi * ((wi[:, 2:] > 0) & (wo[:, 2:] > 0))
+    close(separable.join(parts)(wi, wo), expected, tolerance=1e-4)  # One term of a factorization in float32.
+
+
+def test_brdfs_on_other_maps_are_not_joined(basis):
+    maps = basis[1].light_map, basis[1].view_map
+    smaller = (each[:, :10, :10] for each in maps)
+    for other in (SeparableBrdf(*smaller, jnp.zeros(())), SeparableBrdf(*maps, jnp.zeros(()))):
+        with pytest.raises(ValueError, match="brdfs must be at least one, on maps of one kind, got"):
+            separable.join([basis[0], other])
+    with pytest.raises(ValueError, match="got none"):
+        separable.join([])
+
+
+@pytest.fixture(scope="module")
+def spotted(basis):
+    """A mesh that shadows itself, its vertices' own weights of the basis, and their radiance by the reference."""
+    ground = prt.scene.builtin.plane(cells=2)
+    mesh = prt.scene.mesh.join(
+        [
+            prt.scene.builtin.sphere(rings=3, sectors=5),
+            eqx.tree_at(lambda m: m.position, ground, 2 * ground.position - 1),
+        ]
+    )
+    random = np.random.default_rng(8)
+    weight = jnp.asarray(random.uniform(0, 1, size=(len(mesh.position), 3, 3)), jnp.float32)
+    light = some_light(random)
+    part = [np.asarray(reference.radiance(mesh, each, light, eye=EYE), np.float64) for each in basis]
+    return mesh, weight, light, sum(weight[:, n] * each for n, each in enumerate(part))
+
+
+def modulated(transport, brdf, light, weight, terms=TERMS):
+    view = separable.modulate(separable.view_tuple(transport, brdf, EYE), weight, terms=terms)
+    return separable.combine(separable.light_tuple(transport, light), view)
+
+
+def test_weights_per_vertex_give_every_vertex_its_own_brdf(basis, spotted, close):
+    mesh, weight, light, expected = spotted
+    joined = separable.join(basis)
+    transport = precompute(mesh, joined, keep=6 * SIZE**2, size=SIZE, progress=False)
+    assert np.count_nonzero(expected.any(1)) > 9
+    close(modulated(transport, joined, light, weight), expected, tolerance=RIM)
+    # Equal weights are a BRDF for all; a single one is that BRDF alone.
+    close(modulated(transport, joined, light, jnp.ones_like(weight)), relight(transport, joined, light))
+    one = precompute(mesh, basis[1], keep=6 * SIZE**2, size=SIZE, progress=False)
+    alone = jnp.zeros_like(weight).at[:, 1].set(1)
+    close(modulated(transport, joined, light, alone), relight(one, basis[1], light))
+    # Linear, hence the derivative along any change is the radiance of that change.
+    change = jnp.asarray(np.random.default_rng(3).normal(size=weight.shape), jnp.float32)
+    _, slope = jax.jvp(lambda w: modulated(transport, joined, light, w), (weight,), (change,))
+    close(slope, modulated(transport, joined, light, change))
+
+
+def test_a_texture_on_one_brdf_multiplies_the_radiance(transport, factored, close, random):
+    light, texture = some_light(random), jnp.asarray(random.uniform(size=(7, 1, 3)), jnp.float32)
+    plain = relight(transport, factored, light)
+    close(modulated(transport, factored, light, texture, (3,)), plain * texture[:, 0])
+    # A gray texture, and gray view maps under a texture in color.
+    gray = texture[..., :1]
+    close(modulated(transport, factored, light, gray, (3,)), plain * gray[:, 0])
+    single = eqx.tree_at(lambda b: b.view_map, factored, factored.view_map[..., :1])
+    close(modulated(transport, single, light, texture, (3,)), relight(transport, single, light) * texture[:, 0])
+
+
+@pytest.mark.parametrize("terms", [(3,), (1, 1), (2, 2), (1, 1, 1)])
+def test_weights_that_do_not_fit_the_terms_are_refused(terms):
+    with pytest.raises(ValueError, match="terms must be one number for each of 2 weights that add up to the tuple's 3"):
+        separable.modulate(jnp.ones((7, 3, 3)), jnp.ones((7, 2, 1)), terms=terms)
 
 
 def test_brdfs_with_another_number_of_terms_are_refused(transport, factored):
