@@ -67,14 +67,20 @@ def radiance(
     direction = cubemap.direction(size=size).reshape(-1, 3)[texel]
     area = cubemap.vector_area(size=size).reshape(-1, 3)[texel]
     wo = directions.normalize(jnp.einsum("vij,vj->vi", transport.frame, eye - transport.position))
-    colors = jax.eval_shape(brdf, wo, wo).shape[-1]
-    start = jnp.zeros((len(wo), max(colors, excess.shape[-1])), wo.dtype)
+    # Vertices last, which XLA's CPU code turns into vectors of them.
+    value = jax.vmap(brdf, in_axes=1, out_axes=1)
+    frame, wo = jnp.moveaxis(transport.frame, 0, 2), wo.T
+    colors = max(jax.eval_shape(value, wo, wo).shape[0], excess.shape[1])
 
     def step(total, argument):
-        direction, area, excess, number = argument
-        visible = transport.visible(number[None])[0]
-        cosine = jnp.maximum(transport.frame[:, 2] @ area, 0) * visible
-        wi = transport.frame @ direction
-        return total + brdf(wi, wo) * cosine[:, None] * excess, None
+        direction, area, excess, visible = argument
+        cosine = jnp.maximum(_along(frame[2], area), 0) * visible
+        wi = jnp.stack([_along(axis, direction) for axis in frame])
+        return total + value(wi, wo) * cosine * excess[:, None], None
 
-    return jax.lax.scan(step, start, (direction, area, excess, texel))[0]
+    start = jnp.zeros((colors, wo.shape[1]), wo.dtype)
+    return jax.lax.scan(step, start, (direction, area, excess, transport.visible(texel)))[0].T
+
+
+def _along(axis: Float[Array, "3 v"], direction: Float[Array, "3"]) -> Float[Array, " v"]:
+    return axis[0] * direction[0] + axis[1] * direction[1] + axis[2] * direction[2]

@@ -1,8 +1,9 @@
 """Transport as clustered principal components: a few dense products per cluster of vertices instead of sparse sums.
 
 Vertices that lie and face alike have transport alike. In each cluster the matrices of its vertices, all terms
-together, are combinations of a few; only these meet the light. So the cost of a term falls from `keep` sparse
-coefficients a vertex to as many numbers as there are vectors, and thirty-two to a hundred terms become affordable.
+together, are combinations of a few vectors, and these distinguish a few modes of the light. Only the modes meet the
+light. So the cost of a term falls from `keep` sparse coefficients a vertex to as many numbers as there are vectors,
+and thirty-two to a hundred terms become affordable.
 """
 
 import os
@@ -20,7 +21,7 @@ from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.files.arrays import Layout
-from jaxprt.linalg import clustering
+from jaxprt.linalg import clustering, eigen
 from jaxprt.sphere import haar
 from jaxprt.transport import blocks, separable
 from jaxprt.transport.direct import DirectTransport
@@ -37,8 +38,9 @@ class ClusteredTransport(eqx.Module):
 
     Attributes:
         index: Numbers of the coefficients among the 6 n n that each cluster keeps, the most important first.
-        basis: Its n vectors on those coefficients, the leading first, times its terms.
-        weight: What each vertex takes of each vector.
+        mode: Its l modes of the light on those coefficients, the leading first.
+        core: What each mode gives to each of n vectors and each term.
+        weight: What each vertex takes of each vector, the leading first.
         position: Positions of the rows in world units.
         frame: Their tangents, bitangents and normals.
         vertex: Vertex of each row.
@@ -47,7 +49,8 @@ class ClusteredTransport(eqx.Module):
     """
 
     index: UInt[Array, "p k"]
-    basis: Float16[Array, "p k n r"]
+    mode: Float16[Array, "p k l"]
+    core: Float16[Array, "p l n r"]
     weight: Float[Array, "p m n"]
     position: Float[Array, "q 3"]
     frame: Float[Array, "q 3 3"]
@@ -58,33 +61,35 @@ class ClusteredTransport(eqx.Module):
     @property
     def terms(self) -> int:
         """Number of BRDF terms r."""
-        return self.basis.shape[3]
+        return self.core.shape[3]
 
     @property
     def nbytes(self) -> int:
-        """Bytes of bases and weights."""
-        return self.index.nbytes + self.basis.nbytes + self.weight.nbytes
+        """Bytes of modes, cores and weights."""
+        return self.index.nbytes + self.mode.nbytes + self.core.nbytes + self.weight.nbytes
 
     def keep(
-        self, count: int | None = None, *, vectors: int | None = None, terms: int | None = None
+        self,
+        count: int | None = None,
+        *,
+        modes: int | None = None,
+        vectors: int | None = None,
+        terms: int | None = None,
     ) -> "ClusteredTransport":
-        """The first `count` coefficients, vectors and terms (all of them if None)."""
-        for name, value, most in zip(
-            ("count", "vectors", "terms"), (count, vectors, terms), self.basis.shape[1:], strict=True
-        ):
-            if value is not None and not 1 <= value <= most:
-                raise ValueError(f"{name} must be between 1 and {most}, got {value}")
-        index, basis, weight = (
-            self.index[:, :count],
-            self.basis[:, :count, :vectors, :terms],
-            self.weight[:, :, :vectors],
-        )
-        rms = _rms(index, basis, weight, size=self.rms.shape[0])
-        return ClusteredTransport(index, basis, weight, self.position, self.frame, self.vertex, self.place, rms)
+        """The first `count` coefficients, modes, vectors and terms (all of them if None)."""
+        most = (self.index.shape[1], *self.core.shape[1:])
+        asked = {"count": count, "modes": modes, "vectors": vectors, "terms": terms}
+        for (name, value), limit in zip(asked.items(), most, strict=True):
+            if value is not None and not 1 <= value <= limit:
+                raise ValueError(f"{name} must be between 1 and {limit}, got {value}")
+        index, mode = self.index[:, :count], self.mode[:, :count, :modes]
+        core, weight = self.core[:, :modes, :vectors, :terms], self.weight[:, :, :vectors]
+        rms = _rms(index, mode, core, weight, size=self.rms.shape[0])
+        return ClusteredTransport(index, mode, core, weight, self.position, self.frame, self.vertex, self.place, rms)
 
     @jax.jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "q r c"]:
-        """Transport times light coefficients, by row: each cluster's vectors meet the light once.
+        """Transport times light coefficients, by row: each cluster's modes meet the light once.
 
         Args:
             coefficient: Coefficients of the light.
@@ -92,16 +97,17 @@ class ClusteredTransport(eqx.Module):
         Returns:
             The light-modulated tuple of Wang et al., in the light's units.
         """
-        _, kept, vectors, terms = self.basis.shape
+        _, modes, vectors, terms = self.core.shape
         light = coefficient[self.index.astype(jnp.int32)]
         dtype = light.dtype
 
         def one(argument):
-            basis, weight, light = argument
-            vector = basis.reshape(kept, vectors * terms).astype(dtype).T @ light
+            mode, core, weight, light = argument
+            met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
+            vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
             return weight.astype(dtype) @ vector.reshape(vectors, -1)
 
-        return jax.lax.map(one, (self.basis, self.weight, light)).reshape(len(self.position), terms, -1)
+        return jax.lax.map(one, (self.mode, self.core, self.weight, light)).reshape(len(self.position), terms, -1)
 
     def ordered(self, value: Float[Array, "q *c"]) -> Float[Array, "v *c"]:
         """What was computed by row, in the order of the vertices."""
@@ -114,7 +120,8 @@ def precompute(
     *,
     clusters: int = 160,
     vectors: int = 16,
-    keep: int = 512,
+    modes: int = 128,
+    keep: int = 1024,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -128,7 +135,8 @@ def precompute(
         direct: Visibility of the vertices.
         brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.brdf.separable.factor` makes them.
         clusters: Number of clusters; a few hundred vertices in each pay best.
-        vectors: Principal components per cluster.
+        vectors: Principal components of the vertices of a cluster.
+        modes: Principal components of the light that it meets.
         keep: Wavelet coefficients kept per cluster.
         path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
         executor: Where clusters are computed; this machine's cores if None.
@@ -155,17 +163,23 @@ def precompute(
         raise ValueError(f"vectors must be between 1 and the {member.shape[1]} vertices of a cluster, got {vectors}")
     if not 1 <= keep <= direct.level.shape[0]:
         raise ValueError(f"keep must be between 1 and {direct.level.shape[0]}, got {keep}")
-    job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, vectors, keep)
+    if not 1 <= modes <= min(keep, vectors * brdf.terms):
+        raise ValueError(
+            f"modes must be between 1 and the smaller of keep and vectors x terms, {min(keep, vectors * brdf.terms)}, "
+            f"got {modes}"
+        )
+    job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, vectors, modes, keep)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
-    index, weight = jnp.asarray(result["index"]), jnp.asarray(result["weight"]).reshape(*member.shape, vectors)
-    basis = jnp.asarray(result["basis"]).reshape(clusters, keep, vectors, brdf.terms)
+    index, mode, core = (jnp.asarray(result[name]) for name in ("index", "mode", "core"))
+    weight = jnp.asarray(result["weight"]).reshape(*member.shape, vectors)
     row = member.ravel()
     place = np.zeros(len(direct.position), np.int32)
     place[row] = np.arange(row.size)
-    rms = _rms(index, basis, weight, size=direct.level.shape[0])
+    rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
     return ClusteredTransport(
         index,
-        basis,
+        mode,
+        core,
         weight,
         direct.position[row],
         direct.frame[row],
@@ -183,23 +197,30 @@ def cluster(direct: DirectTransport, *, clusters: int) -> Int[np.ndarray, "p m"]
     return clustering.bisect(point, clusters=clusters)
 
 
-@partial(jax.jit, static_argnames=("vectors", "keep"))
+@partial(jax.jit, static_argnames=("vectors", "modes", "keep"))
 def compress(
-    seen: UInt8[Array, "m d"], frame: Float[Array, "m 3 3"], brdf: SeparableBrdf, *, vectors: int, keep: int
-) -> tuple[UInt[Array, " k"], Float16[Array, "k n r"], Float[Array, "m n"], Float[Array, " m"]]:
-    """Principal components of one cluster.
+    seen: UInt8[Array, "m d"],
+    frame: Float[Array, "m 3 3"],
+    brdf: SeparableBrdf,
+    *,
+    vectors: int,
+    modes: int,
+    keep: int,
+) -> tuple[UInt[Array, " k"], Float16[Array, "k l"], Float16[Array, "l n r"], Float[Array, "m n"], Array, Array]:
+    """Principal components of one cluster, along its vertices and then along the light.
 
     Args:
         seen: Visibility of each cubemap texel in sixteenths.
         frame: Rows are tangent, bitangent, normal.
         brdf: The factored BRDF, of which only the light maps matter.
-        vectors: How many components.
+        vectors: How many components along the vertices.
+        modes: How many along the light.
         keep: How many coefficients.
 
     Returns:
-        Numbers of the coefficients; the components on them, scaled to a largest entry of 1 so that half precision
-        holds them; weights; and the squared error that remains, under light of natural spectrum, relative to the
-        whole, after 0, 1, ... components.
+        Numbers of the coefficients; modes on them and cores, scaled to largest entries of 1 so that half precision
+        holds them; weights; and the squared errors that remain, under light of natural spectrum and relative to the
+        whole, after 0, 1, ... vectors, and after all vectors and 0, 1, ... modes.
     """
     size = haar.face_edge(seen.shape[1])
     importance = jnp.tile(haar.area(size=size).ravel(), 6) ** _SPECTRUM
@@ -211,27 +232,46 @@ def compress(
     stride = max(1, len(seen) // _SAMPLE)
     sample = jax.lax.map(lambda a: jnp.sum(transport(a) ** 2, 1), (seen[::stride], frame[::stride]))
     _, index = jax.lax.top_k(jnp.sqrt(jnp.sum(sample, 0)) * importance, keep)
-    kept = jax.lax.map(lambda a: transport(a)[index], (seen, frame))
-    weighted = (kept * importance[index, None]).reshape(len(seen), -1)
-    value, vector = jnp.linalg.eigh(weighted @ weighted.T)
+    importance = importance[index, None]
+    kept = jax.lax.map(lambda a: transport(a)[index] * importance, (seen, frame)).reshape(len(seen), -1)
+    value, vector = jnp.linalg.eigh(kept @ kept.T)
     value, vector = jnp.maximum(value[::-1], 0), vector[:, ::-1][:, :vectors]
-    basis = jnp.einsum("mn,mkr->knr", vector, kept)
-    scale = jnp.max(jnp.abs(basis), (0, 2))
-    scale = jnp.where(scale > 0, scale, 1)
-    total = jnp.sum(value)
-    remainder = jnp.maximum(total - jnp.cumsum(value) + value, 0) / jnp.where(total > 0, total, 1)
+    basis = jnp.moveaxis((vector.T @ kept).reshape(vectors, keep, -1), 0, 1).reshape(keep, -1)
+    strength, mode, _ = eigen.left_singular(basis, terms=modes)
+    core = mode.T @ basis
+    mode = mode / importance
+    # Scales go from modes to cores and from cores to weights.
+    scale = _largest(mode, 0)
+    mode, core = mode / scale, (core * scale[:, None]).reshape(modes, vectors, -1)
+    scale = _largest(core, (0, 2))
+    core, weight = core / scale[:, None], vector * scale
     small = jnp.uint16 if seen.shape[1] <= 1 << 16 else jnp.uint32
-    return index.astype(small), (basis / scale[:, None]).astype(jnp.float16), vector * scale, remainder
+    total = jnp.sum(value)
+    half = (mode.astype(jnp.float16), core.astype(jnp.float16))
+    return index.astype(small), *half, weight, _remainder(value, total), _remainder(strength, total)
+
+
+def _largest(array: Array, axis) -> Array:
+    size = jnp.max(jnp.abs(array), axis)
+    return jnp.where(size > 0, size, 1)
+
+
+def _remainder(value: Array, total: Array) -> Array:
+    """Share of the whole that is left before the first value, and after each."""
+    left = jnp.maximum(total - jnp.cumsum(value), 0)
+    return jnp.concatenate([total[None], left]) / jnp.where(total > 0, total, 1)
 
 
 @partial(jax.jit, static_argnames=("size",))
-def _rms(index: Array, basis: Array, weight: Array, *, size: int) -> Array:
-    energy = jnp.einsum("pmn,pmo->pno", weight, weight)
-    total = jax.lax.map(
-        lambda a: jnp.einsum("knr,no,kor->k", a[0].astype(a[1].dtype), a[1], a[0].astype(a[1].dtype)), (basis, energy)
-    )
-    count = weight.shape[0] * weight.shape[1] * basis.shape[3]
-    return jnp.sqrt(jnp.zeros(size, total.dtype).at[index.astype(jnp.int32)].add(jnp.maximum(total, 0)) / count)
+def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) -> Array:
+    def energy(argument):
+        mode, core, weight = (each.astype(weight.dtype) for each in argument)
+        along = jnp.einsum("lnr,no,jor->lj", core, weight.T @ weight, core)
+        return jnp.sum((mode @ along) * mode, 1)
+
+    total = jnp.maximum(jax.lax.map(energy, (mode, core, weight)), 0)
+    count = weight.shape[0] * weight.shape[1] * core.shape[3]
+    return jnp.sqrt(jnp.zeros(size, total.dtype).at[index.astype(jnp.int32)].add(total) / count)
 
 
 @dataclass(frozen=True)
@@ -242,20 +282,22 @@ class _Job(blocks.Job):
     brdf: SeparableBrdf
     member: np.ndarray
     vectors: int
+    modes: int
     count: int
 
     @property
     def header(self) -> Mapping[str, Any]:
         brdf = f"{self.brdf.coordinates.__name__} {blocks.fingerprint(self.brdf.light_map)}"
         direct = blocks.fingerprint(self.direct.level, self.direct.frame, self.member)
-        return {"system": "clustered", "direct": direct, "brdf": brdf, "vectors": self.vectors, "keep": self.count}
+        return {"system": "clustered", "direct": direct, "brdf": brdf, **self._shape}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
         return {
             "weight": Layout((self.step, self.vectors), 0, "float32"),
             "index": Layout((1, self.count), 0, "uint16" if self.direct.level.shape[0] <= 1 << 16 else "uint32"),
-            "basis": Layout((1, self.count, self.vectors, self.brdf.terms), 0, "float16"),
+            "mode": Layout((1, self.count, self.modes), 0, "float16"),
+            "core": Layout((1, self.modes, self.vectors, self.brdf.terms), 0, "float16"),
         }
 
     @property
@@ -268,8 +310,12 @@ class _Job(blocks.Job):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         member = self.member[block]
-        frame = self.direct.frame[member]
-        index, basis, weight, _ = compress(
-            self.direct.seen(member), frame, self.brdf, vectors=self.vectors, keep=self.count
+        index, mode, core, weight, _, _ = compress(
+            self.direct.seen(member), self.direct.frame[member], self.brdf, **self._shape
         )
-        return {"weight": np.asarray(weight), "index": np.asarray(index)[None], "basis": np.asarray(basis)[None]}, 0
+        cluster = {"index": index, "mode": mode, "core": core}
+        return {"weight": np.asarray(weight), **{name: np.asarray(x)[None] for name, x in cluster.items()}}, 0
+
+    @property
+    def _shape(self) -> Mapping[str, int]:
+        return {"vectors": self.vectors, "modes": self.modes, "keep": self.count}
