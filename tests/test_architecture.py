@@ -18,7 +18,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "report", "inverse", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere", "files"]
+ROOMS = ["__main__", "report", "inverse", "plan", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere", "files"]
 SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.

@@ -119,6 +119,7 @@ def precompute(
     brdf: SeparableBrdf,
     *,
     clusters: int = 160,
+    member: Int[np.ndarray, "p m"] | None = None,
     vectors: int = 16,
     modes: int = 128,
     keep: int = 1024,
@@ -134,7 +135,8 @@ def precompute(
     Args:
         direct: Visibility of the vertices.
         brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.brdf.separable.factor` makes them.
-        clusters: Number of clusters; a few hundred vertices in each pay best.
+        clusters: Number of clusters, made by `cluster`; a few hundred vertices in each pay best.
+        member: Vertices of each cluster, in place of `clusters`; a vertex may be in one cluster several times.
         vectors: Principal components of the vertices of a cluster.
         modes: Principal components of the light that it meets.
         keep: Wavelet coefficients kept per cluster.
@@ -158,7 +160,11 @@ def precompute(
         raise TypeError(f"brdf must be factored, by jaxprt.brdf.separable.factor, got {type(brdf).__name__}")
     if brdf.light_map.shape[-1] != 1:
         raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
-    member = cluster(direct, clusters=clusters)
+    if member is None:
+        member = cluster(direct.position, direct.frame[:, 2], clusters=clusters)
+    missing = np.setdiff1d(np.arange(len(direct.position)), member).size
+    if missing or member.min() < 0 or member.max() >= len(direct.position):
+        raise ValueError(f"member must name every vertex and no others, got {missing} missing, up to {member.max()}")
     if not 1 <= vectors <= member.shape[1]:
         raise ValueError(f"vectors must be between 1 and the {member.shape[1]} vertices of a cluster, got {vectors}")
     if not 1 <= keep <= direct.level.shape[0]:
@@ -189,12 +195,13 @@ def precompute(
     )
 
 
-def cluster(direct: DirectTransport, *, clusters: int) -> Int[np.ndarray, "p m"]:
+def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:
     """Vertices of each cluster, alike in position and normal, by `jaxprt.linalg.clustering.bisect`."""
-    position, normal = np.asarray(direct.position, np.float64), np.asarray(direct.frame[:, 2], np.float64)
-    spread = [np.sqrt(np.mean((x - x.mean(0)) ** 2)) or 1.0 for x in (position, normal)]
-    point = np.concatenate([(position - position.mean(0)) / spread[0], normal / spread[1]], 1)
-    return clustering.bisect(point, clusters=clusters)
+    coordinate = []
+    for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
+        offset = each - each.mean(0)
+        coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
+    return clustering.bisect(np.concatenate(coordinate, 1), clusters=clusters)
 
 
 @partial(jax.jit, static_argnames=("vectors", "modes", "keep"))
@@ -265,7 +272,8 @@ def _remainder(value: Array, total: Array) -> Array:
 @partial(jax.jit, static_argnames=("size",))
 def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) -> Array:
     def energy(argument):
-        mode, core, weight = (each.astype(weight.dtype) for each in argument)
+        dtype = argument[2].dtype
+        mode, core, weight = (each.astype(dtype) for each in argument)
         along = jnp.einsum("lnr,no,jor->lj", core, weight.T @ weight, core)
         return jnp.sum((mode @ along) * mode, 1)
 

@@ -1,0 +1,282 @@
+"""How much error for how much time: all-frequency relighting of a glossy object and its ground, the whole front.
+
+    python -m benchmarks.compression [--quick] [--output FILE] [--plot FILE] [--store FOLDER]
+
+The bunny with Ashikhmin-Shirley (10, 100) on a diffuse ground (from JAXPRT_DATA; a sphere on its ground where that is
+not set, and with --quick), under each light and from every view against the sum over all texels. A configuration is the
+number of terms, vectors, modes and coefficients of the clustered transport, and of texels summed one by one; the
+published configuration, four sparse terms with 96 coefficients, stands beside. One line for each light: `seconds` is a
+light change (environment to radiance of all vertices), `view_seconds` a view change. The peer is the other way to make
+the picture anew: a light change by the published configuration.
+"""
+
+import pathlib
+import time
+import warnings
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness
+from jaxprt.brdf import AshikhminShirley, Lambert, published, separable
+from jaxprt.relight import direct as texels
+from jaxprt.relight import reference
+from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt.scene import Environment, builtin, load_environment, load_mesh
+from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
+from jaxprt.transport import ClusteredTransport, DirectTransport, clustered, direct
+from jaxprt.transport import separable as transports
+
+LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
+BRDF = AshikhminShirley()
+GROUND = Lambert(0.5)
+# Terms, vectors, modes, coefficients, texels.
+FRONT = [
+    (16, 12, 48, 512, 4),
+    (32, 12, 64, 512, 8),
+    (48, 16, 96, 768, 16),
+    (64, 16, 96, 1024, 16),
+    (64, 24, 128, 1024, 32),
+    (96, 24, 160, 1024, 32),
+    (96, 32, 192, 1536, 64),
+    (128, 32, 224, 1536, 64),
+    (128, 48, 256, 1536, 128),
+]
+CLUSTERS = 160
+GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
+
+
+class Part:
+    """One object: its visibility, BRDF, factored BRDF and transport."""
+
+    def __init__(self, visible: DirectTransport, brdf, factored, transport: ClusteredTransport):
+        self.visible, self.brdf, self.factored, self.transport = visible, brdf, factored, transport
+
+
+def main() -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--plot", type=pathlib.Path, metavar="FILE", help="draw the front")
+    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
+    arguments = parser.parse_args()
+    lines = [harness.report(line, arguments.output) for line in measure(arguments.quick, arguments.store)]
+    if arguments.plot:
+        plot(lines, arguments.plot)
+
+
+def measure(quick: bool, store: pathlib.Path | None):
+    """Lines of all configurations."""
+    glossy, ground, lights = scene(quick)
+    size = lights[0].radiance.shape[-2]
+    whole = join([glossy, ground])
+    count = len(glossy.position)
+    views = eyes(glossy, 3 if quick else 20)
+    front = [(4, 4, 16, 96, 2), (8, 8, 32, 192, 4)] if quick else FRONT
+    clusters = 4 if quick else CLUSTERS
+    repeats = 3 if quick else 15
+
+    start = time.perf_counter()
+    visible = [
+        direct.precompute(whole, size=size, vertex=vertex, path=store and store / f"{name}.prt", progress=False)
+        for name, vertex in (("glossy", np.arange(count)), ("ground", np.arange(count, len(whole.position))))
+    ]
+    rays = time.perf_counter() - start
+    exact = [exact_radiance(part, brdf, lights, views) for part, brdf in zip(visible, (BRDF, GROUND), strict=True)]
+
+    start = time.perf_counter()
+    most = np.max(front, 0)
+    factored = separable.factor(BRDF, terms=int(most[0]), resolution=24 if quick else 96)
+    limit = (int(most[1]), int(most[2]), int(most[3]))
+    parts = [compressed(visible[0], BRDF, factored, clusters, limit, store and store / "glossy-terms.prt")]
+    limit = (4, 4, 96) if quick else GROUND_KEEP
+    plain = separable.factor(GROUND, terms=1, resolution=8)
+    parts.append(compressed(visible[1], GROUND, plain, clusters, limit, store and store / "ground-terms.prt"))
+    seconds = rays + time.perf_counter() - start
+
+    published_line, peer = measure_published(glossy, whole, exact, lights, views, quick)
+    yield from published_line
+    for terms, vectors, modes, keep, sun in front:
+        cut = parts[0].transport.keep(keep, modes=modes, vectors=vectors, terms=terms)
+        case = [Part(parts[0].visible, BRDF, factored.keep(terms), cut), parts[1]]
+        name = f"{terms} terms, {vectors} vectors, {modes} modes, {keep} coefficients, {sun} texels"
+        stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in visible)
+        yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
+
+
+def scene(quick: bool) -> tuple[Mesh, Mesh, list[Environment]]:
+    """The glossy object, its ground and the lights."""
+    data = harness.data()
+    if quick or not data.is_dir():
+        ball = builtin.sphere(rings=12, sectors=16)
+        return ball, ground_plane(ball, vertices=144), [builtin.daylight(size=16), builtin.studio(size=16)]
+    bunny = load_mesh(data / "meshes" / "stanford_bunny.ply")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # negative pixels of lossy files
+        return bunny, ground_plane(bunny), [load_environment(data / "env" / name) for name in LIGHTS.values()]
+
+
+def eyes(mesh: Mesh, count: int) -> np.ndarray:
+    """Viewers around an object, at four heights above the ground."""
+    low, high = bounds(mesh)
+    center, reach = (low + high) / 2, 1.6 * np.linalg.norm(high - low)
+    turn = 2 * np.pi * np.arange(count) / count + 0.3
+    rise = np.resize([0.15, 0.5, 0.3, 0.8], count)
+    around = np.stack([np.sin(turn) * np.cos(rise), np.sin(rise), np.cos(turn) * np.cos(rise)], -1)
+    return (center + reach * around).astype(np.float32)
+
+
+def exact_radiance(visible: DirectTransport, brdf, lights: list[Environment], views: np.ndarray) -> np.ndarray:
+    """Radiance [light, view, vertex, color] by summing all texels."""
+    batch = Environment(jnp.stack([light.radiance for light in lights]))
+    result = np.zeros((len(lights), len(views), len(visible.position), 3), np.float32)
+    for first in range(0, len(visible.position), 1024):
+        part = np.arange(first, min(first + 1024, len(visible.position)))
+        seen = jnp.asarray(visible.seen(part))
+        for number, eye in enumerate(views):
+            place, frame = visible.position[part], visible.frame[part]
+            result[:, number, part] = reference.integrate(seen, place, frame, brdf, batch, jnp.asarray(eye))
+    return result
+
+
+def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, int], path) -> Part:
+    """Clustered transport of one object."""
+    vectors, modes, keep = limit
+    vectors = min(vectors, -(-len(visible.position) // clusters))
+    modes = min(modes, vectors * factored.terms, keep)
+    transport = clustered.precompute(
+        visible, factored, clusters=clusters, vectors=vectors, modes=modes, keep=keep, path=path, progress=False
+    )
+    return Part(visible, brdf, factored, transport)
+
+
+@partial(jax.jit, static_argnames=("sun",))
+def change_light(transport, visible, brdf, light, view, eye, *, sun: int):
+    """Radiance of one object after a change of light: the view tuple is kept."""
+    texel, excess, rest = texels.split(light, count=sun)
+    smooth = transport.ordered(combine(light_tuple(transport, rest), view))
+    return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
+
+
+@jax.jit
+def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
+    """Radiance of one object after a change of view: the light tuple is kept."""
+    smooth = transport.ordered(combine(lit, view_tuple(transport, factored, eye)))
+    return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
+
+
+def report_case(name, parts: list[Part], sun, exact, lights, views, stored, precompute, repeats, peer):
+    """One line for each light."""
+    vertices = sum(part.visible.position.shape[0] for part in parts)
+    names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
+    for number, light in enumerate(lights):
+        texel, excess, rest = texels.split(light, count=sun)
+        lit = [light_tuple(part.transport, rest) for part in parts]
+        wrong = whole = 0.0
+        for place, eye in enumerate(jnp.asarray(views)):
+            for at, part in enumerate(parts):
+                now = change_view(part.transport, part.visible, part.brdf, part.factored, lit[at], texel, excess, eye)
+                wrong += np.sum((np.asarray(now) - exact[at][number, place]) ** 2, dtype=np.float64)
+                whole += np.sum(exact[at][number, place] ** 2, dtype=np.float64)
+        eye = jnp.asarray(views[0])
+        view = [view_tuple(part.transport, part.factored, eye) for part in parts]
+
+        def lighten(light=light, view=view, eye=eye):
+            return [
+                change_light(part.transport, part.visible, part.brdf, light, each, eye, sun=sun)
+                for part, each in zip(parts, view, strict=True)
+            ]
+
+        def turn(lit=lit, texel=texel, excess=excess, eye=eye):
+            return [
+                change_view(part.transport, part.visible, part.brdf, part.factored, each, texel, excess, eye)
+                for part, each in zip(parts, lit, strict=True)
+            ]
+
+        timing, other = harness.compare(lighten, peer[number], repeats=repeats)
+        yield {
+            **{"benchmark": "compression", "case": f"{name}, {names[number]}", "light": names[number]},
+            **timing.line(),
+            "view_seconds": harness.measure(turn, repeats=repeats).seconds,
+            "error": float(np.sqrt(wrong / whole)),
+            "bytes": stored,
+            "bytes_per_vertex": stored / vertices,
+            "precompute_seconds": precompute,
+            **{"peer": "published", "peer_seconds": other.seconds, "peer_error": 1.0},
+        }
+
+
+def measure_published(glossy, whole, exact, lights, views, quick: bool):
+    """The published configuration: its lines, and for each light the change that others are timed against."""
+    count = len(glossy.position)
+    size = lights[0].radiance.shape[-2]
+    start = time.perf_counter()
+    factored = [published.factor_symmetric(BRDF, terms=4, resolution=24 if quick else 48)]
+    factored.append(separable.factor(GROUND, terms=1, resolution=8))
+    vertex = [np.arange(count), np.arange(count, len(whole.position))]
+    parts = [
+        transports.precompute(whole, brdf, size=size, vertex=part, progress=False)
+        for brdf, part in zip(factored, vertex, strict=True)
+    ]
+    seconds = time.perf_counter() - start
+    eye = jnp.asarray(views[0])
+    view = [view_tuple(part, brdf, eye) for part, brdf in zip(parts, factored, strict=True)]
+    changes = []
+    lines = []
+    for number, light in enumerate(lights):
+
+        def lighten(light=light):
+            return [combine(light_tuple(part, light), each) for part, each in zip(parts, view, strict=True)]
+
+        lit = [light_tuple(part, light) for part in parts]
+
+        def turn(eye=eye, lit=lit):
+            pairs = zip(parts, factored, lit, strict=True)
+            return [combine(each, view_tuple(part, brdf, eye)) for part, brdf, each in pairs]
+
+        wrong = whole_square = 0.0
+        for place, each in enumerate(jnp.asarray(views)):
+            for at, now in enumerate(turn(eye=each)):
+                wrong += np.sum((np.asarray(now) - exact[at][number, place]) ** 2, dtype=np.float64)
+                whole_square += np.sum(exact[at][number, place] ** 2, dtype=np.float64)
+        names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
+        stored = sum(part.nbytes for part in parts)
+        changes.append(lighten)
+        lines.append(
+            {
+                **{"benchmark": "compression", "case": f"published, {names[number]}", "light": names[number]},
+                **harness.measure(lighten, repeats=5).line(),
+                "view_seconds": harness.measure(turn, repeats=5).seconds,
+                "error": float(np.sqrt(wrong / whole_square)),
+                "bytes": stored,
+                "bytes_per_vertex": stored / len(whole.position),
+                "precompute_seconds": seconds,
+            }
+        )
+    return lines, changes
+
+
+def plot(lines: list[dict], path: pathlib.Path) -> None:
+    """Error against milliseconds of a light change, one panel for each light."""
+    from matplotlib import pyplot
+
+    names = list(dict.fromkeys(line["light"] for line in lines))
+    figure, axes = pyplot.subplots(1, len(names), figsize=(4.5 * len(names), 4), sharey=True, squeeze=False)
+    for panel, light in zip(axes[0], names, strict=True):
+        row = [line for line in lines if line["light"] == light]
+        for label, chosen in (
+            ("clustered, texels apart", [x for x in row if "peer" in x]),
+            ("published: 4 terms of 96", [x for x in row if "peer" not in x]),
+        ):
+            panel.loglog([1e3 * x["seconds"] for x in chosen], [x["error"] for x in chosen], "o-", label=label)
+        for rate in (60, 30, 10):
+            panel.axvline(1e3 / rate, color="gray", linewidth=0.5)
+            panel.text(1e3 / rate, 1, f"{rate}/s", fontsize=7, rotation=90, va="top")
+        panel.set(title=light, xlabel="milliseconds per light change")
+    axes[0, 0].set_ylabel("relative L2 error of radiance")
+    axes[0, -1].legend(fontsize=7)
+    figure.savefig(path, dpi=120, bbox_inches="tight")
+
+
+if __name__ == "__main__":
+    main()

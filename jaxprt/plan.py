@@ -1,0 +1,265 @@
+"""An error in, a plan out: what precomputed transport an error needs, and what that costs, before it is made.
+
+wanted = prt.plan.separable(mesh, brdf, [light], error=0.05)
+ready = prt.plan.precompute(mesh, brdf, wanted, path="bunny")
+color = prt.plan.radiance(ready, light, eye=eye)
+"""
+
+import math
+import os
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tqdm
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import separable as brdfs
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.relight import direct as texels
+from jaxprt.relight import reference
+from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.mesh import Mesh, bounds
+from jaxprt.transport import ClusteredTransport, DirectTransport, clustered, direct
+
+MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
+_MEMBERS = 225  # vertices in a cluster
+_SAMPLE = 6  # clusters that are measured
+_RESOLUTION = 64
+# Terms, vectors, modes, coefficients, texels: each row a step up, about in balance.
+_LADDER = (
+    (2, 4, 8, 192, 2),
+    (4, 8, 24, 256, 4),
+    (8, 8, 32, 384, 4),
+    (16, 12, 48, 512, 8),
+    (32, 16, 80, 768, 16),
+    (48, 16, 96, 1024, 16),
+    (64, 24, 128, 1024, 32),
+    (96, 32, 192, 1536, 64),
+)
+
+
+class Plan(eqx.Module):
+    """Sizes of precomputed transport, and what they are predicted to bring and to cost.
+
+    Attributes:
+        clusters: Clusters of vertices.
+        terms: BRDF terms.
+        vectors: Vectors of each cluster.
+        modes: Modes of the light of each cluster.
+        keep: Wavelet coefficients of each cluster.
+        texels: Brightest texels that are summed one by one.
+        error: Relative L2 error of radiance, of the worst of the lights that the plan was made with.
+        seconds: Of a light change on this machine.
+        nbytes: Of transport and visibility.
+        precompute_seconds: On this machine.
+    """
+
+    clusters: int
+    terms: int
+    vectors: int
+    modes: int
+    keep: int
+    texels: int
+    error: float
+    seconds: float
+    nbytes: int
+    precompute_seconds: float
+
+
+class Ready(eqx.Module):
+    """What `radiance` needs.
+
+    Attributes:
+        visible: Visibility of every vertex.
+        brdf: The BRDF itself, for single texels.
+        factored: Its terms, for the rest of the light.
+        transport: Transport of the terms.
+        texels: Number of single texels.
+    """
+
+    visible: DirectTransport
+    brdf: Callable
+    factored: SeparableBrdf
+    transport: ClusteredTransport
+    texels: int = eqx.field(static=True)
+
+
+def separable(
+    mesh: Mesh,
+    brdf: Callable,
+    environments: Sequence[Environment],
+    *,
+    error: float = 0.05,
+    occluder: Mesh | None = None,
+    progress: bool = True,
+) -> Plan:
+    """Finds the cheapest sizes that meet an error, by measuring all of them on a few clusters of the mesh.
+
+    Every step of a ladder of sizes is made for the sampled clusters and judged from eight views by summing all texels
+    with the BRDF itself. The plan is the first step whose error under each light is below `error` / 1.25. On lights
+    and views that the plan did not see the error is then below `error` if they are of the same kind: a plan made
+    under an overcast sky promises nothing for a sun.
+
+    Args:
+        mesh: The vertices to light.
+        brdf: A model, (wi, wo) -> value [*b c] in 1/sr on local directions.
+        environments: Lights that the error must hold for, of one size.
+        error: Relative L2 error of the radiance of all vertices.
+        occluder: What casts shadows; the mesh itself if None.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The plan.
+
+    Raises:
+        ValueError: No lights, lights of different sizes, an error that is not positive, or one that no step reaches.
+    """
+    if not environments:
+        raise ValueError("environments must be at least one, got none")
+    shapes = sorted({str(list(light.radiance.shape)) for light in environments})
+    if len(shapes) != 1 or environments[0].radiance.ndim != 4:
+        raise ValueError(f"environments must be of one size [6, n, n, c], got {', '.join(shapes)}")
+    if not error > 0:
+        raise ValueError(f"error must be positive, got {error}")
+    size = environments[0].radiance.shape[1]
+    clusters = max(1, round(len(mesh.position) / _MEMBERS))
+    member = clustered.cluster(mesh.position, mesh.normal, clusters=clusters)
+    chosen = member[np.random.default_rng(0).permutation(clusters)[:_SAMPLE]]
+    start = time.perf_counter()
+    visible = direct.precompute(mesh, size=size, occluder=occluder, vertex=chosen.ravel(), progress=False)
+    rays = time.perf_counter() - start
+    views = _views(mesh)
+    exact = _exact(visible, brdf, environments, views)
+    reached = math.inf
+    for step in tqdm.tqdm(_LADDER, desc="plan", disable=not progress):
+        sizes = _fitted(step, chosen.shape[1], size)
+        start = time.perf_counter()
+        ready = _sample(visible, brdf, chosen, sizes)
+        seconds = (rays + time.perf_counter() - start) * clusters / len(chosen)
+        wrong = max(_error(ready, light, views, at) for light, at in zip(environments, exact, strict=True))
+        reached = min(reached, wrong)
+        if wrong * MARGIN > error:
+            continue
+        share = clusters / len(chosen)
+        nbytes = int((ready.transport.nbytes + visible.nbytes) * share)
+        terms, vectors, modes, keep, count = sizes
+        once = share * _seconds(lambda ready=ready: radiance(ready, environments[0], eye=jnp.asarray(views[0])))
+        return Plan(clusters, terms, vectors, modes, keep, count, wrong, once, nbytes, seconds)
+    raise ValueError(f"error must be at least {reached * MARGIN:.3g}, which the largest sizes reach; got {error}")
+
+
+def precompute(
+    mesh: Mesh,
+    brdf: Callable,
+    plan: Plan,
+    *,
+    size: int = 64,
+    occluder: Mesh | None = None,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Ready:
+    """Carries out a plan.
+
+    Args:
+        mesh: The vertices to light, as in the plan.
+        brdf: Their BRDF, as in the plan.
+        plan: The plan.
+        size: Edge of the light's cubemap faces in texels, as in the plan.
+        occluder: What casts shadows; the mesh itself if None.
+        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed; this machine's cores if None.
+        progress: Whether to show progress bars.
+
+    Returns:
+        What `radiance` needs.
+
+    Raises:
+        ValueError: As in `jaxprt.transport.direct.precompute` and `jaxprt.transport.clustered.precompute`.
+    """
+    folder = None if path is None else pathlib.Path(path)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    run = {"executor": executor, "progress": progress}
+    at = folder and folder / "visibility.prt"
+    visible = direct.precompute(mesh, size=size, occluder=occluder, path=at, **run)
+    factored = brdfs.factor(brdf, terms=plan.terms, resolution=_RESOLUTION)
+    sizes = {name: getattr(plan, name) for name in ("clusters", "vectors", "modes", "keep")}
+    transport = clustered.precompute(visible, factored, **sizes, path=folder and folder / "clusters.prt", **run)
+    return Ready(visible, brdf, factored, transport, plan.texels)
+
+
+@jax.jit
+def radiance(ready: Ready, light: Environment, *, eye: Float[Array, "3"]) -> Float[Array, "v c"]:
+    """Radiance that each vertex sends to the eye: the brightest texels exactly, the rest through the terms.
+
+    Args:
+        ready: From `precompute`.
+        light: The environment.
+        eye: Position of the viewer in world units.
+
+    Returns:
+        Linear radiance per vertex, in the light's units. Differentiable in the light and the eye.
+    """
+    texel, excess, rest = texels.split(light, count=ready.texels)
+    smooth = combine(light_tuple(ready.transport, rest), view_tuple(ready.transport, ready.factored, eye))
+    return ready.transport.ordered(smooth) + texels.radiance(ready.visible, ready.brdf, texel, excess, eye=eye)
+
+
+def _views(mesh: Mesh) -> np.ndarray:
+    """Eight viewers around the mesh, at two heights."""
+    low, high = bounds(mesh)
+    turn, rise = np.pi / 4 * np.arange(8), np.resize([0.2, 0.7], 8)
+    around = np.stack([np.sin(turn) * np.cos(rise), np.sin(rise), np.cos(turn) * np.cos(rise)], -1)
+    return ((low + high) / 2 + 1.6 * np.linalg.norm(high - low) * around).astype(np.float32)
+
+
+def _exact(visible: DirectTransport, brdf, environments, views) -> np.ndarray:
+    """Radiance [light, view, vertex, color] by all texels."""
+    batch = Environment(jnp.stack([light.radiance for light in environments]))
+    seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
+    each = [reference.integrate(seen, visible.position, visible.frame, brdf, batch, jnp.asarray(e)) for e in views]
+    return np.stack(each, 1)
+
+
+def _fitted(step: tuple[int, ...], members: int, size: int) -> tuple[int, ...]:
+    """A step of the ladder, cut to what clusters and lights of this size have."""
+    terms, vectors, modes, keep, count = step
+    vectors, keep = min(vectors, members), min(keep, 6 * size * size)
+    return terms, vectors, min(modes, keep, vectors * terms), keep, min(count, 6 * size * size - 1)
+
+
+def _sample(visible: DirectTransport, brdf, chosen: np.ndarray, sizes: tuple[int, ...]) -> Ready:
+    """Transport of the sampled clusters only."""
+    terms, vectors, modes, keep, count = sizes
+    factored = brdfs.factor(brdf, terms=terms, resolution=_RESOLUTION)
+    member = np.arange(chosen.size).reshape(chosen.shape)
+    transport = clustered.precompute(
+        visible, factored, member=member, vectors=vectors, modes=modes, keep=keep, progress=False
+    )
+    return Ready(visible, brdf, factored, transport, count)
+
+
+def _error(ready: Ready, light: Environment, views: np.ndarray, exact: np.ndarray) -> float:
+    """Relative L2 error over all views."""
+    now = np.stack([radiance(ready, light, eye=jnp.asarray(eye)) for eye in views])
+    whole = float(np.linalg.norm(exact))
+    return float(np.linalg.norm(now - exact)) / whole if whole > 0 else 0.0
+
+
+def _seconds(function: Callable) -> float:
+    """Median of five calls, compiled before."""
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
