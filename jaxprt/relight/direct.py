@@ -11,6 +11,8 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport.direct import DirectTransport
 
+_GROUP = 16  # texels at once: what is held for each vertex meanwhile
+
 
 @partial(jax.jit, static_argnames=("count",))
 def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
@@ -47,7 +49,7 @@ def radiance(
     excess: Float[Array, "t c"],
     *,
     eye: Float[Array, "3"],
-) -> Float[Array, "v c"]:
+) -> Float[Array, "v e"]:
     """Radiance that vertices send to the eye, of light from some texels.
 
     Args:
@@ -64,23 +66,30 @@ def radiance(
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     size = haar.face_edge(transport.level.shape[0])
-    direction = cubemap.direction(size=size).reshape(-1, 3)[texel]
-    area = cubemap.vector_area(size=size).reshape(-1, 3)[texel]
-    wo = directions.normalize(jnp.einsum("vij,vj->vi", transport.frame, eye - transport.position))
+    frame = jnp.moveaxis(transport.frame, 0, 2)
+    wo = directions.normalize(jnp.stack([_along(axis, eye - transport.position) for axis in frame], -1)).T
     # Vertices last, which XLA's CPU code turns into vectors of them.
-    value = jax.vmap(brdf, in_axes=1, out_axes=1)
-    frame, wo = jnp.moveaxis(transport.frame, 0, 2), wo.T
-    colors = max(jax.eval_shape(value, wo, wo).shape[0], excess.shape[1])
+    value = jax.vmap(jax.vmap(brdf, in_axes=(1, 1), out_axes=1), in_axes=(1, None), out_axes=1)
 
-    def step(total, argument):
-        direction, area, excess, visible = argument
-        cosine = jnp.maximum(_along(frame[2], area), 0) * visible
-        wi = jnp.stack([_along(axis, direction) for axis in frame])
-        return total + value(wi, wo) * cosine * excess[:, None], None
+    def group(argument):
+        texel, excess, visible = argument
+        direction, area = (table(size=size).reshape(-1, 3)[texel] for table in (cubemap.direction, cubemap.vector_area))
+        wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
+        flux = jnp.maximum(_along(frame[2], area[:, None]), 0) * visible
+        sent = value(wi, wo) * flux
+        return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
-    start = jnp.zeros((colors, wo.shape[1]), wo.dtype)
-    return jax.lax.scan(step, start, (direction, area, excess, transport.visible(texel)))[0].T
+    spare = -len(texel) % _GROUP
+    texel, excess = jnp.pad(texel, (0, spare)), jnp.pad(excess, ((0, spare), (0, 0)))
+    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), (texel, excess, transport.visible(texel)))
+    return jnp.sum(jax.lax.map(group, groups), 0).T
 
 
-def _along(axis: Float[Array, "3 v"], direction: Float[Array, "3"]) -> Float[Array, " v"]:
-    return axis[0] * direction[0] + axis[1] * direction[1] + axis[2] * direction[2]
+def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
+    """Components along an axis of each vertex."""
+    return axis[0] * direction[..., 0] + axis[1] * direction[..., 1] + axis[2] * direction[..., 2]
+
+
+def _alike(sent: Array, excess: Array) -> tuple[Array, Array]:
+    """A gray light in as many colors as the BRDF."""
+    return sent, jnp.broadcast_to(excess, (len(excess), len(sent)))

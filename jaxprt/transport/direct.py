@@ -21,6 +21,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.transport import blocks, visibility
 
+_HALF = visibility.BLOCK // 2
 _MIDDLE = 8  # sixteen of the seventeen levels fit four bits: 9 becomes 8
 
 
@@ -28,7 +29,8 @@ class DirectTransport(eqx.Module):
     """Visibility of every texel from every vertex, in four bits.
 
     Attributes:
-        level: Two vertices to a byte, the even one in the low bits; texels first, so that one texel's are contiguous.
+        level: Two vertices to a byte: of every 64 vertices the first half in the low bits, the second in the high ones.
+            Texels first, so that one texel's are contiguous.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
     """
@@ -54,8 +56,9 @@ class DirectTransport(eqx.Module):
 
     def seen(self, vertex: Int[np.ndarray, " b"]) -> UInt8[np.ndarray, "b d"]:
         """Visibility of all texels from some vertices, in sixteenths, on the host."""
-        pair = np.asarray(self.level)[:, vertex // 2]
-        level = np.where(vertex % 2, pair >> 4, pair & 15)
+        block, place = np.divmod(vertex, visibility.BLOCK)
+        pair = np.asarray(self.level)[:, block * _HALF + place % _HALF]
+        level = np.where(place < _HALF, pair & 15, pair >> 4)
         return np.ascontiguousarray((level + (level > _MIDDLE)).astype(np.uint8).T)
 
 
@@ -101,7 +104,8 @@ def precompute(
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:
     """Levels in sixteenths, two to each byte."""
-    level = jnp.stack([pair & 15, pair >> 4], -1).reshape(len(pair), -1)
+    pair = pair.reshape(len(pair), -1, 1, _HALF)
+    level = jnp.concatenate([pair & 15, pair >> 4], 2).reshape(len(pair), -1)
     return level + (level > _MIDDLE)
 
 
@@ -115,7 +119,7 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def layout(self) -> Mapping[str, Layout]:
-        return {"level": Layout((6 * self.size**2, visibility.BLOCK // 2), 1, "uint8")}
+        return {"level": Layout((6 * self.size**2, _HALF), 1, "uint8")}
 
     @property
     def step(self) -> int:
@@ -124,4 +128,4 @@ class _Job(visibility.VisibilityJob):
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         level = (seen - (seen > _MIDDLE)).T
-        return {"level": np.ascontiguousarray(level[:, ::2] | level[:, 1::2] << 4)}, count.rays
+        return {"level": np.ascontiguousarray(level[:, :_HALF] | level[:, _HALF:] << 4)}, count.rays

@@ -1,0 +1,223 @@
+"""Bright texels one by one: what is taken out of a light, and that it lights as the light did."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.relight import direct, reference
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import join
+from jaxprt.sphere import cubemap
+from jaxprt.transport.direct import precompute
+
+SIZE = 8
+ALL = 6 * SIZE**2
+COUNT = 6
+SLOPE = 1e-4  # Derivatives in float32 of a lobe of exponent 80.
+EYE = jnp.array([1.0, 2.0, 3.0])
+GLOSSY = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=[0.2, 0.4, 0.5], nu=20.0, nv=80.0)
+GRAY = AshikhminShirley(diffuse=0.3, specular=0.4, nu=20.0, nv=80.0)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(11)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return join([builtin.sphere(rings=5, sectors=7), builtin.plane(cells=2)])
+
+
+@pytest.fixture(scope="module")
+def transport(mesh):
+    return precompute(mesh, size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    """Daylight, whose sun is some hundred times as bright as the rest."""
+    return builtin.daylight(size=SIZE)
+
+
+def flux(radiance):
+    """Flux of each texel, all colors together, in float64."""
+    radiance = np.asarray(radiance, np.float64).reshape(ALL, -1)
+    return radiance.sum(1) * np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
+
+
+def whole(texel, excess):
+    """An environment of nothing but the excess."""
+    radiance = jnp.zeros((ALL, excess.shape[1])).at[texel].set(excess)
+    return Environment(radiance.reshape(6, SIZE, SIZE, -1))
+
+
+def exact(transport, brdf, light, eye=EYE):
+    """Every texel summed, with the same stored visibility."""
+    seen = jnp.asarray(transport.seen(np.arange(len(transport.position))))
+    return reference.integrate(seen, transport.position, transport.frame, brdf, light, eye)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e30])
+def test_excess_and_rest_are_the_light(random, colors, strength):
+    radiance = strength * random.exponential(size=(6, SIZE, SIZE, colors)).astype(np.float32) ** 3
+    texel, excess, rest = direct.split(Environment(jnp.asarray(radiance, jnp.float32)), count=COUNT)
+    order = np.argsort(-flux(radiance))
+    np.testing.assert_array_equal(texel, order[:COUNT])
+    np.testing.assert_allclose(whole(texel, excess).radiance + rest.radiance, radiance, rtol=1e-6)
+    assert np.all(np.asarray(excess) > 0)
+    assert np.all(np.asarray(rest.radiance) >= 0)
+    # What is left is level with the brightest that was not taken, and all others are as they were.
+    np.testing.assert_allclose(flux(rest.radiance)[order[:COUNT]], flux(radiance)[order[COUNT]], rtol=1e-5)
+    untouched = np.asarray(rest.radiance).reshape(ALL, -1)[order[COUNT:]]
+    np.testing.assert_array_equal(untouched, radiance.reshape(ALL, -1)[order[COUNT:]])
+
+
+def test_a_texel_keeps_its_color(random):
+    radiance = jnp.asarray(random.uniform(0.1, 3, size=(6, SIZE, SIZE, 3)), jnp.float32)
+    texel, excess, rest = direct.split(Environment(radiance), count=COUNT)
+    before = np.asarray(radiance).reshape(ALL, 3)[texel]
+    for part in (np.asarray(excess)[:-1], np.asarray(rest.radiance).reshape(ALL, 3)[texel[:-1]]):
+        part = part / part.sum(1, keepdims=True)
+        np.testing.assert_allclose(part, before[:-1] / before[:-1].sum(1, keepdims=True), rtol=1e-3)
+
+
+def test_no_light_has_no_excess():
+    black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
+    _, excess, rest = direct.split(black, count=COUNT)
+    assert not np.asarray(excess).any()
+    assert not np.asarray(rest.radiance).any()
+
+
+def test_texels_of_equal_flux_have_no_excess():
+    solid_angle = cubemap.solid_angle(size=SIZE)[..., None]
+    flat = Environment(1 / solid_angle)
+    _, excess, rest = direct.split(flat, count=COUNT)
+    np.testing.assert_allclose(excess * solid_angle.max(), 0, atol=1e-6)
+    np.testing.assert_allclose(rest.radiance, flat.radiance, rtol=1e-6)
+    constant = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+    _, excess, rest = direct.split(constant, count=COUNT)
+    # Four texels around each of six face centers are alike and the largest.
+    np.testing.assert_allclose(excess, 0, atol=1e-6)
+    np.testing.assert_allclose(rest.radiance, 1, rtol=1e-6)
+
+
+def test_fewer_bright_texels_than_asked_for_are_taken_whole():
+    radiance = jnp.zeros((6, SIZE, SIZE, 3)).at[2, 3, 4].set(jnp.array([5.0, 3, 0])).at[0, 0, 0].set(1.0)
+    texel, excess, rest = direct.split(Environment(radiance), count=COUNT)
+    np.testing.assert_array_equal(texel[:2], [2 * 64 + 3 * 8 + 4, 0])
+    np.testing.assert_array_equal(excess[:3], [[5, 3, 0], [1, 1, 1], [0, 0, 0]])
+    assert not np.asarray(rest.radiance).any()
+
+
+def test_all_but_one_texel_can_be_taken(random):
+    radiance = random.uniform(1, 2, size=(6, SIZE, SIZE, 3)).astype(np.float32)
+    texel, excess, rest = direct.split(Environment(jnp.asarray(radiance)), count=ALL - 1)
+    np.testing.assert_allclose(flux(rest.radiance), flux(radiance).min(), rtol=1e-5)
+    np.testing.assert_allclose(whole(texel, excess).radiance + rest.radiance, radiance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, -1, ALL])
+def test_an_impossible_number_of_texels_is_refused(sky, count):
+    with pytest.raises(ValueError, match=f"count must be between 1 and {ALL - 1}, got {count}"):
+        direct.split(sky, count=count)
+
+
+def test_the_excess_has_finite_slopes_even_in_the_dark(random):
+    """As an inverse problem meets them: a light that starts black."""
+
+    def energy(radiance):
+        _, excess, rest = direct.split(Environment(radiance), count=COUNT)
+        return jnp.sum(jnp.sin(excess)) + jnp.sum(rest.radiance**2)
+
+    for radiance in (jnp.zeros((6, SIZE, SIZE, 3)), jnp.ones((6, SIZE, SIZE, 3))):
+        assert np.isfinite(np.asarray(jax.grad(energy)(radiance))).all()
+
+
+@pytest.mark.parametrize("colored", ["both", "light", "brdf", "neither"])
+def test_excess_and_rest_light_as_the_light_did(transport, sky, close, colored):
+    brdf = GLOSSY if colored in ("both", "brdf") else GRAY
+    light = sky if colored in ("both", "light") else Environment(sky.radiance[..., :1])
+    texel, excess, rest = direct.split(light, count=COUNT)
+    bright = direct.radiance(transport, brdf, texel, excess, eye=EYE)
+    assert bright.shape == (39, 1 if colored == "neither" else 3)
+    close(bright, exact(transport, brdf, whole(texel, excess)))
+    close(bright + exact(transport, brdf, rest), exact(transport, brdf, light))
+    assert np.count_nonzero(np.asarray(bright).any(1)) > 10
+
+
+@pytest.mark.parametrize("brdf", [GLOSSY, Lambert([0.8, 0.5, 0.2])], ids=["glossy", "Lambert"])
+def test_a_sun_in_one_texel_is_that_of_the_reference(mesh, transport, brdf):
+    place = (2, 3, 5)
+    texel = np.ravel_multi_index(place, (6, SIZE, SIZE))
+    light = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[place].set(jnp.array([300.0, 200, 100])))
+    found, excess, _ = direct.split(light, count=COUNT)
+    assert found[0] == texel
+    color = np.asarray(direct.radiance(transport, brdf, found, excess, eye=EYE))
+    expected = np.asarray(reference.radiance(mesh, brdf, light, eye=EYE))
+    # Nine sixteenths are kept as eight; no vertex here sees that much of this texel.
+    assert 0.5 not in np.asarray(transport.visible(jnp.array([texel])))
+    np.testing.assert_allclose(color, expected, atol=1e-5 * expected.max())
+    assert np.count_nonzero(expected.any(1)) > 5
+
+
+def test_radiance_is_linear_in_the_excess(transport, sky, random, close):
+    texel, excess, _ = direct.split(sky, count=COUNT)
+    other = jnp.asarray(random.normal(size=excess.shape), jnp.float32)
+    first, second = (direct.radiance(transport, GLOSSY, texel, each, eye=EYE) for each in (excess, other))
+    close(direct.radiance(transport, GLOSSY, texel, 2 * excess - other, eye=EYE), 2 * first - second)
+
+
+def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
+    texel, excess, _ = direct.split(sky, count=COUNT)
+    color = direct.radiance(transport, GLOSSY, texel, excess, eye=EYE)
+    close(direct.radiance(transport, GLOSSY, texel[::-1], excess[::-1], eye=EYE), color)
+    same = jnp.full(COUNT, texel[0])
+    once = direct.radiance(transport, GLOSSY, same, excess * jnp.eye(COUNT)[0][:, None], eye=EYE)
+    close(direct.radiance(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
+
+
+def test_what_looks_away_from_the_eye_is_black(transport, sky):
+    texel, excess, _ = direct.split(sky, count=COUNT)
+    color = np.asarray(direct.radiance(transport, GLOSSY, texel, excess, eye=-EYE))
+    away = np.einsum("vi,vi->v", transport.frame[:, 2], -EYE - transport.position) < 0
+    assert not color[away].any()
+    assert away.sum() > 10
+    assert color[~away].any()
+
+
+@pytest.mark.parametrize("place", ["on a vertex", "far away", "in the plane"])
+def test_eyes_in_odd_places_have_finite_radiance_and_slopes(transport, sky, place):
+    texel, excess, _ = direct.split(sky, count=COUNT)
+    eye = {
+        "on a vertex": transport.position[7],
+        "far away": jnp.array([1e15, 1e15, -1e15]),
+        "in the plane": jnp.array([5.0, 0, 2]),
+    }[place]
+
+    def mean(brdf, excess, eye):
+        return jnp.mean(direct.radiance(transport, brdf, texel, excess, eye=eye))
+
+    value, slope = jax.value_and_grad(mean, (0, 1, 2))(GLOSSY, excess, eye)
+    assert np.isfinite(value)
+    assert all(np.isfinite(np.asarray(each)).all() for each in jax.tree.leaves(slope))
+
+
+def test_slopes_are_those_of_the_reference(transport, sky, random, close):
+    """Of the BRDF's parameters, the excess and the eye."""
+    texel, excess, _ = direct.split(sky, count=COUNT)
+    weight = jnp.asarray(random.normal(size=(39, 3)), jnp.float32)
+
+    def ours(brdf, excess, eye):
+        return jnp.vdot(weight, direct.radiance(transport, brdf, texel, excess, eye=eye))
+
+    def theirs(brdf, excess, eye):
+        return jnp.vdot(weight, exact(transport, brdf, whole(texel, excess), eye))
+
+    found, expected = (jax.grad(each, (0, 1, 2))(GLOSSY, excess, EYE) for each in (ours, theirs))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert np.any(other)
+        close(one, other, tolerance=SLOPE)
