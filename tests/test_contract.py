@@ -42,12 +42,17 @@ HOST = {
     "transport.visibility": "traces rays",
     "transport.blocks": "runs workers and writes files",
     "transport.separable.precompute": "traces rays",
+    "transport.direct.precompute": "traces rays",
+    "transport.clustered.cluster": "sorts on the host, where data enters",
+    "transport.clustered.precompute": "runs workers and writes files",
+    "transport.clustered.compress": "gives half precision, and vectors of either sign: no one dtype, no one answer",
     "transport.sparse.rms": "counts on the host, after precomputation",
     "transport.interreflection": "traces rays",
     "transport.harmonic.precompute": "traces rays",
     "transport.harmonic.precompute_diffuse": "traces rays",
     "transport.harmonic.check": "checks values",
     "relight.reference.radiance": "traces rays; its pure part is integrate",
+    "linalg.clustering": "sorts on the host, where data enters",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
@@ -58,9 +63,14 @@ HOST = {
     "brdf.measured.load_lafortune": "reads a file",
     "brdf.harmonic.tabulate": "checks values, and chooses the quadrature by them",
     "brdf.separable.factor": "checks values, and chooses the number of terms by them",
-    "brdf.separable.factor_symmetric": "checks values",
+    "brdf.published": "checks values",
+    "brdf.separable.sample_error": "draws its own directions",
+    "brdf.separable.tabulate": "checks values",
+    "plan": "measures",
+    "relight.separable.join": "puts arrays side by side, and makes an error that is NaN",
     "scene.mesh": "loads, checks and builds meshes",
     "scene.mesh_file": "reads files",
+    "scene.occluder": "simplifies meshes on the host",
     "scene.builtin": "builds meshes and lights",
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",
@@ -146,6 +156,11 @@ class Draw:
         position, frame = self.normal(vertices, 3), self.rotation(vertices)
         return transport.SparseTransport(index, value, position, frame, self.uniform(6 * size * size))
 
+    def direct(self, size=4, *, vertices=3):
+        """Visibility for ``light``, in bytes for two vertices each."""
+        level = self.integer(256, 6 * size * size, transport.visibility.BLOCK // 2, dtype=jnp.uint8)
+        return transport.DirectTransport(level, self.normal(vertices, 3), self.rotation(vertices))
+
     def harmonic(self):
         """A BRDF in four harmonics."""
         return brdf.HarmonicBrdf(self.normal(4, 3, 5, 5), (), self.uniform())
@@ -222,6 +237,9 @@ EXAMPLES = {
     "sphere.hemisphere.texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.parabolic_texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.texel_area": example(nothing, resolution=5),
+    "sphere.hemisphere.polar_lookup": example(lambda draw: call(draw.normal(4, 4, 2), draw.uniform(5, 2))),
+    "sphere.hemisphere.polar_texel_direction": example(nothing, resolution=5),
+    "sphere.hemisphere.polar_texel_area": example(nothing, resolution=5),
     "sphere.harmonics.evaluate": example(lambda draw: call(draw.unit(5)), degree=4),
     "sphere.harmonics.reconstruct": example(lambda draw: call(draw.normal(9, 3), draw.unit(5))),
     "sphere.harmonics.project": example(lambda draw: call(draw.normal(6, 3, 3, 2)), degree=3),
@@ -244,8 +262,10 @@ EXAMPLES = {
     "sphere.haar.area": example(nothing, size=4),
     # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
     "linalg.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
+    # One vector at a time amplifies rounding where eigenvalues are alike.
+    "linalg.eigen.power": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=1, steps=40),
     "linalg.eigen.left_singular": example(
-        lambda draw: call(draw.symmetric(12)[:9], jnp.eye(12)), gradient=(), terms=3, steps=12
+        lambda draw: call(draw.symmetric(12)[:9], metric=jnp.eye(12)), gradient=(), terms=3, steps=12
     ),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
@@ -362,6 +382,18 @@ EXAMPLES = {
             draw.light(),
             frame.T @ (3 * draw.upper()),
         )
+    ),
+    "relight.direct.split": example(lambda draw: call(draw.light()), count=5),
+    "relight.direct.radiance": example(
+        lambda draw: call(
+            each := draw.direct(),
+            brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0),
+            draw.integer(96, 5),
+            draw.uniform(5, 3),
+            eye=draw.above(each),
+        ),
+        # Frames have derivatives along rotations only; see sphere.rotation.
+        gradient=("brdf", "excess", "eye"),
     ),
     "relight.harmonic.project": example(lambda draw: call(draw.light()), degree=2),
     "relight.harmonic.radiance": example(

@@ -9,10 +9,12 @@ import trimesh
 import jaxprt as prt
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.separable import factor
-from jaxprt.relight import reference, separable
+from jaxprt.relight import direct, reference, separable
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.environment import environment_from_image
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.transport import clustered
+from jaxprt.transport.direct import precompute as see
 from jaxprt.transport.quantized import quantize
 from jaxprt.transport.separable import precompute
 
@@ -210,6 +212,98 @@ def test_transport_of_zeros_is_quantized_to_zeros(lambert, light):
     transport = precompute(sphere(), lambert, keep=24, size=SIZE, progress=False)
     dark = eqx.tree_at(lambda t: t.value, transport, 0 * transport.value)
     assert not np.asarray(separable.radiance(quantize(dark), lambert, light, eye=EYE)).any()
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Visibility from the 38 vertices of a sphere that lies on a ground."""
+    return see(join([moved(sphere(), shift=[0, 1, 0]), builtin.plane(cells=1)]), size=SIZE, progress=False)
+
+
+# Two clusters of ten vertices, two of nine. All is kept, so that what is left is the rounding of half precision.
+KEPT = {"clusters": 4, "vectors": 10, "modes": 30, "keep": ALL}
+HALF = 2e-3
+
+
+def clustered_radiance(seen, brdf, light, **options):
+    """Radiance by clustered transport, every number of which is checked to be finite."""
+    transport = clustered.precompute(seen, brdf, progress=False, **KEPT | options)
+    for name in ("mode", "core", "weight", "rms"):
+        assert np.isfinite(np.asarray(getattr(transport, name), np.float64)).all(), name
+    color = np.asarray(separable.radiance(transport, brdf, light, eye=EYE))
+    assert np.isfinite(color).all()
+    return color
+
+
+def all_texels(seen, brdf, light):
+    """Radiance of a BRDF, factored or not, with the same visibility and no compression."""
+    level = jnp.asarray(seen.seen(np.arange(len(seen.position))))
+    return np.asarray(reference.integrate(level, seen.position, seen.frame, brdf, light, EYE))
+
+
+def blind(seen, vertex):
+    """The same where some vertices see nothing."""
+    level = np.asarray(seen.level).copy()
+    for each in vertex:
+        block, place = divmod(int(each), 64)
+        level[:, block * 32 + place % 32] &= 0xF0 if place < 32 else 0x0F
+    dark = eqx.tree_at(lambda t: t.level, seen, jnp.asarray(level))
+    assert not dark.seen(np.asarray(vertex)).any()
+    return dark
+
+
+@pytest.mark.parametrize("exponents", [(0, 0), (1, 1000), (1000, 1), (1000, 1000)])
+def test_clusters_hold_dull_sharp_and_brushed_brdfs(seen, light, close, exponents):
+    brdf = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5, nu=exponents[0], nv=exponents[1])
+    factored = factor(brdf, terms=3, resolution=12)
+    expected = all_texels(seen, factored, light)
+    close(clustered_radiance(seen, factored, light), expected, tolerance=HALF)
+    assert expected.any()
+
+
+def test_clusters_hold_more_terms_than_the_brdf_has(seen, light, close):
+    brdf = Lambert([0.8, 0.5, 0.2])
+    close(
+        clustered_radiance(seen, factor(brdf, terms=3, resolution=12), light),
+        all_texels(seen, brdf, light),
+        tolerance=HALF,
+    )
+
+
+def test_clusters_of_a_black_brdf_are_black(seen, light):
+    assert not clustered_radiance(seen, factor(Lambert([0.0, 0, 0]), terms=3, resolution=12), light).any()
+
+
+def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
+    count = len(seen.position)
+    color = clustered_radiance(seen, glossy, light, clusters=count, vectors=1, modes=4)
+    close(color, all_texels(seen, glossy, light), tolerance=HALF)
+
+
+@pytest.mark.parametrize("which", ["one vertex", "a cluster", "all"])
+def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, light, close, which):
+    brdf = factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5), terms=3, resolution=12)
+    member = clustered.cluster(seen.position, seen.frame[:, 2], clusters=4)
+    vertex = {"one vertex": member[1, :1], "a cluster": member[1], "all": np.arange(len(seen.position))}[which]
+    color = clustered_radiance(blind(seen, vertex), brdf, light)
+    expected = all_texels(seen, brdf, light).copy()
+    expected[vertex] = 0
+    close(color, expected, tolerance=HALF)
+    if which != "one vertex":  # Alone in its cluster it is as black as half precision has it.
+        assert not color[vertex].any()
+
+
+@pytest.mark.parametrize("strength", [384.0, 1e6])
+def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, close, strength):
+    brdf, light = Lambert([0.8, 0.5, 0.2]), sun(strength)
+    texel, excess, rest = direct.split(light, count=1)
+    assert np.asarray(rest.radiance).max() < 3
+    bright = np.asarray(direct.radiance(seen, brdf, texel, excess, eye=EYE))
+    color = bright + clustered_radiance(seen, factor(brdf, terms=3, resolution=12), rest)
+    expected = all_texels(seen, brdf, light)
+    # What is compressed is off by half precision, the sun is not.
+    close(color, expected, tolerance=HALF * np.linalg.norm(expected - bright) / np.linalg.norm(expected) + 1e-5)
+    assert bright.any()
 
 
 AWKWARD = [

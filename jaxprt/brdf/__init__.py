@@ -1,6 +1,6 @@
 """BRDFs: analytic models, and the form that each system gives them."""
 
-from jaxprt.brdf import cylinders, harmonic, measured, models, scattered, separable
+from jaxprt.brdf import cylinders, harmonic, measured, models, published, scattered, separable
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
 from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
@@ -36,6 +36,7 @@ __all__ = [
     "load_scattered",
     "measured",
     "models",
+    "published",
     "scattered",
     "separable",
 ]

@@ -1,8 +1,9 @@
-"""Leading eigenvectors and singular vectors by block subspace iteration.
+"""Leading eigenvectors and singular vectors by block Krylov iteration, and one by one by power iteration.
 
-A block of `terms + oversample` vectors is multiplied, orthonormalized and rotated (Rayleigh-Ritz) a fixed number of
-times. One vector at a time with deflation, as Wang et al. print it, does not converge where eigenvalues of opposite
-sign are nearly equal, as they are in BRDF matrices; the block does.
+A block of `terms` + 8 vectors is multiplied a few times; the span of all the products is searched for the block that
+is best in it (Rayleigh-Ritz), and the search starts again from there. One vector at a time with deflation, as Wang et
+al. print it, does not converge where eigenvalues of opposite sign are nearly equal, as they are in BRDF matrices; the
+block does.
 """
 
 from collections.abc import Callable
@@ -13,31 +14,60 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _OVERSAMPLE = 8
+_DEPTH = 5  # Blocks in the span, at most; one block alone needs five times as many products on BRDF matrices.
+_WIDTH = 512  # Vectors in the span, about at most: its own eigenvectors must not cost more than the products.
 
 
 def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple[Array, Array, Array]:
-    """Subspace iteration for a symmetric operator; eigenpairs by falling magnitude and residuals per step."""
+    """Block Krylov iteration for a symmetric operator; eigenpairs by falling magnitude and residuals per step."""
     block = min(terms + _OVERSAMPLE, size)
-    start = jax.random.normal(jax.random.key(0), (size, block), dtype)
+    depth = max(2, min(_DEPTH, _WIDTH // block))
+    draw = jax.random.normal(jax.random.key(0), (depth, size, block), dtype)
+    if depth * block >= size:  # The whole space, in any basis.
+        block, depth, draw = size, 1, jnp.eye(size, dtype=dtype)[None]
 
-    def step(carry, _):
-        vector, _ = jnp.linalg.qr(carry[0])
-        image = apply(vector)
-        ritz = vector.T @ image
+    def grow(carry, item):
+        basis, image, fresh = carry
+        place, noise = item
+        # Random vectors stand in where a product adds nothing to the span. Projecting twice is then enough.
+        fresh = _normalized(fresh) + 10 * jnp.finfo(dtype).eps * _normalized(noise)
+        for _ in range(2):
+            fresh = _orthonormal(fresh - basis @ (basis.T @ fresh))
+        product = apply(fresh)
+        basis, image = (
+            jax.lax.dynamic_update_slice(every, each, (0, place)) for every, each in ((basis, fresh), (image, product))
+        )
+        return (basis, image, product), None
+
+    def step(carry, sweep):
+        fresh = _orthonormal(carry[0])
+        product = apply(fresh)
+        basis, image = (jnp.pad(each, ((0, 0), (0, (depth - 1) * block))) for each in (fresh, product))
+        # Others in each sweep, which keeps the random vectors of the last one in its own.
+        items = block * jnp.arange(1, depth), jnp.roll(draw[1:], sweep, 1)
+        (basis, image, _), _ = jax.lax.scan(grow, (basis, image, product), items)
+        ritz = basis.T @ image
         value, rotation = jnp.linalg.eigh((ritz + ritz.T) / 2)
-        order = jnp.argsort(-jnp.abs(value))
+        order = jnp.argsort(-jnp.abs(value))[:block]
         value, rotation = value[order], rotation[:, order]
-        vector, image = vector @ rotation, image @ rotation
+        vector, image = basis @ rotation, image @ rotation
         error = jnp.linalg.norm((image - vector * value)[:, :terms])
         scale = jnp.linalg.norm(value[:terms])
         residual = jnp.where(scale > 0, error / jnp.where(scale > 0, scale, 1), 0)
-        # Where the operator gives nothing the old vectors stand in, so that QR never meets a zero column.
-        alive = jnp.linalg.norm(image, axis=0) > 0
-        return (jnp.where(alive, image, vector), vector, value), residual
+        return (vector, value), residual
 
-    empty = (start, jnp.zeros_like(start), jnp.zeros(block, dtype))
-    (_, vector, value), residual = jax.lax.scan(step, empty, None, length=steps)
+    (vector, value), residual = jax.lax.scan(step, (draw[0], jnp.zeros(block, dtype)), jnp.arange(steps))
     return value[:terms], vector[:, :terms], residual
+
+
+def _orthonormal(vector: Array) -> Array:
+    """Householder's QR: orthonormal columns whatever the rank."""
+    return jnp.linalg.qr(vector)[0]
+
+
+def _normalized(vector: Array) -> Array:
+    length = jnp.linalg.norm(vector, axis=0)
+    return vector / jnp.where(length > 0, length, 1)
 
 
 def _check(terms: int, size: int) -> None:
@@ -47,14 +77,15 @@ def _check(terms: int, size: int) -> None:
 
 @partial(jax.jit, static_argnames=("terms", "steps"))
 def symmetric(
-    matrix: Float[Array, "n n"], *, terms: int, steps: int = 30
+    matrix: Float[Array, "n n"], *, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, " s"]]:
     """Eigenpairs of largest magnitude of a symmetric matrix, either sign.
 
     Args:
         matrix: A symmetric matrix.
         terms: How many pairs.
-        steps: Number of sweeps.
+        steps: Number of sweeps. A sweep is five products of the matrix with a block of `terms` + 8 vectors, fewer for
+            more than 94 terms.
 
     Returns:
         Eigenvalues by falling magnitude, unit eigenvectors as columns, and after each sweep the relative residual
@@ -63,7 +94,7 @@ def symmetric(
     Raises:
         ValueError: More terms than rows.
 
-    Reference: Halko, Martinsson, Tropp 2011, section 4.5; for the use, Wang, Tran, Luebke 2004, appendix.
+    Reference: Musco and Musco 2015, algorithm 2; for the use, Wang, Tran, Luebke 2004, appendix.
     """
     _check(terms, matrix.shape[0])
     return _iterate(lambda x: matrix @ x, matrix.shape[0], terms, steps, matrix.dtype)
@@ -71,7 +102,7 @@ def symmetric(
 
 @partial(jax.jit, static_argnames=("terms", "steps"))
 def left_singular(
-    matrix: Float[Array, "m n"], metric: Float[Array, "n n"], *, terms: int, steps: int = 30
+    matrix: Float[Array, "m n"], *, metric: Float[Array, "n n"] | None = None, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "m r"], Float[Array, " s"]]:
     """Leading left singular vectors of M C^(1/2), for a metric C that need not be factored.
 
@@ -80,9 +111,9 @@ def left_singular(
 
     Args:
         matrix: M.
-        metric: C, symmetric and positive semidefinite.
+        metric: C, symmetric and positive semidefinite; the identity if None.
         terms: How many vectors.
-        steps: Number of sweeps.
+        steps: Number of sweeps, as in `symmetric`.
 
     Returns:
         Squared singular values, falling; orthonormal vectors as columns; residuals as in `symmetric`.
@@ -91,7 +122,65 @@ def left_singular(
         ValueError: More terms than rows or columns.
     """
     _check(terms, min(matrix.shape))
-    value, vector, residual = _iterate(
-        lambda x: matrix @ (metric @ (matrix.T @ x)), matrix.shape[0], terms, steps, matrix.dtype
-    )
+
+    def apply(block):
+        image = matrix.T @ block
+        return matrix @ (image if metric is None else metric @ image)
+
+    value, vector, residual = _iterate(apply, matrix.shape[0], terms, steps, matrix.dtype)
     return jnp.maximum(value, 0), vector, residual
+
+
+@partial(jax.jit, static_argnames=("terms", "steps"))
+def power(
+    matrix: Float[Array, "n n"], *, terms: int, steps: int = 100
+) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, "r s"]]:
+    """Eigenpairs of a symmetric matrix one after the other, by power iteration with deflation, as published.
+
+    For each term a random vector is multiplied by what the terms before it leave of the matrix, and normalized, a fixed
+    number of times. Where two eigenvalues of largest magnitude are nearly equal and of opposite sign the vector stays a
+    mixture of both eigenvectors, whose Rayleigh quotient lies between the two and hardly moves: the published
+    criterion, that it converges, is met by a wrong term. The residual stays large, and so tells it. `symmetric` has no
+    such case.
+
+    Args:
+        matrix: A symmetric matrix.
+        terms: How many pairs.
+        steps: Sweeps of each term; a sweep is one product with the matrix.
+
+    Returns:
+        Eigenvalues in the order found, which is by falling magnitude where they have converged; unit vectors as
+        columns, orthogonal as far as they have converged; and after each sweep of each term the relative residual
+        |A v - value v| / |value|.
+
+    Raises:
+        ValueError: More terms than rows.
+
+    Reference: Wang, Tran, Luebke 2004, appendix.
+    """
+    size, dtype = matrix.shape[0], matrix.dtype
+    _check(terms, size)
+
+    def term(carry, item):
+        values, vectors = carry
+        index, key = item
+
+        def sweep(carry, _):
+            image = carry[0]
+            length = jnp.linalg.norm(image)
+            vector = jnp.where(length > 0, image / jnp.where(length > 0, length, 1), carry[1])
+            product = matrix @ vector
+            image = product - vectors @ (values * (vector @ vectors))
+            value = vector @ image
+            error, scale = jnp.linalg.norm(product - value * vector), jnp.abs(value)
+            return (image, vector, value), jnp.where(scale > 0, error / jnp.where(scale > 0, scale, 1), 0)
+
+        start = jax.random.normal(key, (size,), dtype)
+        empty = (start, jnp.zeros(size, dtype), jnp.zeros((), dtype))
+        (_, vector, value), residual = jax.lax.scan(sweep, empty, None, length=steps)
+        return (values.at[index].set(value), vectors.at[:, index].set(vector)), residual
+
+    empty = (jnp.zeros(terms, dtype), jnp.zeros((size, terms), dtype))
+    items = (jnp.arange(terms), jax.random.split(jax.random.key(0), terms))
+    (values, vectors), residual = jax.lax.scan(term, empty, items)
+    return values, vectors, residual

@@ -116,6 +116,28 @@ def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> 
     return top * (1 - y) + bottom * y
 
 
+@jax.jit
+def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
+    """Bilinear lookup in a polar map: periodic in the angle, and continued across the normal.
+
+    The row before the first is the first one half a turn on, which is where a path through the normal leads. Beyond
+    the last row, at the horizon, the map is constant.
+
+    Args:
+        texel: A map with any trailing axes.
+        coordinates: From `polar_coordinates`; the first in [0, 1].
+
+    Returns:
+        Interpolated values, [*b *c], in the map's units; differentiable in both arguments.
+    """
+    n = texel.shape[0]
+    # Half a turn is not a whole number of texels where n is odd.
+    opposite = (jnp.roll(texel[:1], n // 2, 1) + jnp.roll(texel[:1], n - n // 2, 1)) / 2
+    tall = jnp.concatenate([opposite, texel, texel[-1:]])
+    around = jnp.concatenate([tall[:, -1:], tall, tall[:, :1]], 1)
+    return lookup(around, (coordinates * n + 1) / (n + 2))
+
+
 def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     """Directions at which an n x n disk map is sampled: one per texel, outside the disk too.
 
@@ -141,6 +163,12 @@ def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return parabolic_direction((inner + 1) / 2)
 
 
+def polar_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
+    """Directions at the centers of the texels of an n x n polar map; all lie above the horizon."""
+    center = (jnp.arange(resolution) + 0.5) / resolution
+    return polar_direction(jnp.stack(jnp.meshgrid(center, center), -1))
+
+
 def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
 
@@ -149,3 +177,11 @@ def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
     inside = center[:, None] ** 2 + center[None, :] ** 2 < 1
     return jnp.where(inside, (2 / resolution) ** 2, 0.0)
+
+
+def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
+    """Integral of cos(theta) d omega over each texel of a polar map, as `texel_area` is for a disk map; exact."""
+    square = (jnp.arange(resolution + 1) / resolution) ** 2
+    # d omega = 2 y dy d phi and cos(theta) = 1 - y^2; y^2 - y^4 / 2 is the integral of 2 y (1 - y^2).
+    ring = jnp.diff(square - square**2 / 2) * (2 * jnp.pi / resolution)
+    return jnp.broadcast_to(ring[:, None], (resolution, resolution))

@@ -39,31 +39,15 @@ def _parabolic_texels(resolution):
     return direction[wi.ravel()], direction[wo.ravel()]
 
 
-@pytest.mark.parametrize(
-    ("factor", "texels"), [(separable.factor, _parabolic_texels), (separable.factor_symmetric, _texels)]
-)
-def test_all_terms_reproduce_every_texel(factor, texels):
+def test_all_terms_reproduce_every_texel():
     resolution = 8
-    wi, wo = texels(resolution)
+    wi, wo = _parabolic_texels(resolution)
     inside = int(jnp.sum(hemisphere.texel_area(resolution=resolution) > 0))
-    factored = factor(WANG, terms=inside, resolution=resolution)
+    factored = separable.factor(WANG, terms=inside, resolution=resolution)
     expected = WANG(wi, wo)
     # The last eigenvalues lie below single precision of the first, and with them their share of the norm.
     assert jnp.linalg.norm(factored(wi, wo) - expected) < 1e-2 * jnp.linalg.norm(expected)
     assert factored.error < 2e-3
-
-
-def test_published_spectrum_of_the_published_brdf():
-    factored = separable.factor_symmetric(WANG, terms=16)
-    # |light map inside the disk|^2 is the eigenvalue's magnitude; the errata's table.
-    area = hemisphere.texel_area(resolution=48)
-    value = jnp.sum(jnp.where(area > 0, factored.light_map[..., 0] ** 2, 0), (1, 2))
-    sign = jnp.sign(jnp.sum(factored.light_map * factored.view_map, (1, 2, 3)))
-    expected = [390.6, -311.3, 296.9, -281.1, 260.1, -242.0, 242.0, -239.8]
-    np.testing.assert_allclose(np.sort(value[:8]), np.sort(np.abs(expected)), atol=0.06)
-    np.testing.assert_array_equal(sign[:5], np.sign(expected[:5]))
-    errors = [float(separable.factor_symmetric(WANG, terms=k).error) for k in (1, 4, 16)]
-    np.testing.assert_allclose(errors, [0.96, 0.87, 0.64], atol=0.006)
 
 
 def test_error_falls_with_the_terms_and_names_them():
@@ -123,8 +107,6 @@ def test_bad_brdfs_are_refused():
         separable.factor(lambda wi, wo: jnp.full((*wi.shape[:-1], 1), jnp.nan), terms=1, resolution=8)
     with pytest.raises(ValueError, match=r"\[b 1\] or \[b 3\]"):
         separable.factor(lambda wi, wo: wi[..., 0], terms=1, resolution=8)
-    with pytest.raises(ValueError, match="must be reciprocal"):
-        separable.factor_symmetric(lambda wi, wo: wi[..., 2:] + 0 * wo[..., 2:], terms=1, resolution=8)
 
 
 def test_black_brdf_gives_zero_without_nan():
@@ -133,3 +115,27 @@ def test_black_brdf_gives_zero_without_nan():
     assert jnp.all(factored(wi, wo) == 0)
     assert factored.error == 0
     assert separable.factor(Lambert(0.0), error=0.1, resolution=8).error == 0
+
+
+def _constant(value):
+    return lambda wi, wo: jnp.full((*wi.shape[:-1], 1), value) * jnp.ones_like(wi)
+
+
+def test_sample_error_of_closed_forms():
+    error, relative = separable.sample_error(_constant(0.5), _constant(0.3))
+    np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
+    # sqrt(mean of cos_i^3 / mean of cos_i) = sqrt(1/2), and views weigh alike: sqrt(mean of cos_o^2) = sqrt(1/3).
+    samples = 5e-3
+    incident = separable.sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
+    assert incident[0] == pytest.approx(np.sqrt(0.5), rel=samples)
+    assert incident[1] == pytest.approx(1)
+    view = separable.sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
+    assert view[0] == pytest.approx(np.sqrt(1 / 3), rel=samples)
+
+
+def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
+    first, second = (separable.sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
+    assert first == second
+    assert separable.sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
+    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
+        separable.sample_error(WANG, WANG, samples=0)

@@ -55,7 +55,7 @@ def test_left_singular_vectors_equal_scipy_of_the_weighted_matrix():
     root = rng.standard_normal((25, 25))
     u, s, _ = scipy.linalg.svd(matrix @ root)
     value, vector, residual = eigen.left_singular(
-        jnp.asarray(matrix, jnp.float32), jnp.asarray(root @ root.T, jnp.float32), terms=5
+        jnp.asarray(matrix, jnp.float32), metric=jnp.asarray(root @ root.T, jnp.float32), terms=5
     )
     np.testing.assert_allclose(value, s[:5] ** 2, rtol=1e-4)
     np.testing.assert_allclose(np.abs(vector.T @ u[:, :5]), np.eye(5), atol=2e-3)
@@ -63,16 +63,62 @@ def test_left_singular_vectors_equal_scipy_of_the_weighted_matrix():
 
 
 def test_residual_falls_with_the_steps():
-    matrix, _ = _planted(0.9 ** np.arange(50))
-    _, _, residual = eigen.symmetric(matrix, terms=6, steps=40)
-    assert residual.shape == (40,)
-    assert residual[39] < residual[5] < residual[0]
+    matrix, basis = _planted(0.97 ** np.arange(200), 300)
+    value, vector, residual = eigen.symmetric(matrix, terms=2, steps=6)
+    assert residual.shape == (6,)
+    assert residual[5] < residual[1] < residual[0] / 10
+    np.testing.assert_allclose(value, [1, 0.97], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, :2]), np.eye(2), atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["zero", "identity", "few rows", "low rank"])
+def test_vectors_are_orthonormal_where_products_add_nothing_to_the_span(name):
+    size = 85  # The span of 60 vectors fills most of it.
+    corner = np.zeros((size, size))
+    corner[:4, :4] = np.asarray(_planted([4.0, -3.0, 2.0, 1.0], 4)[0])
+    low = _planted([5.0, -2.0], size)[0]
+    matrix = {"zero": 0 * corner, "identity": np.eye(size), "few rows": corner, "low rank": low}[name]
+    value, vector, _ = eigen.symmetric(jnp.asarray(matrix, jnp.float32), terms=4)
+    expected = {"zero": [0] * 4, "identity": [1] * 4, "few rows": [4, -3, 2, 1], "low rank": [5, -2, 0, 0]}
+    np.testing.assert_allclose(value, expected[name], atol=1e-4)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(4), atol=1e-4)
+
+
+def test_power_iteration_finds_well_separated_eigenvalues_in_order():
+    matrix, basis = _planted([1.0, -8.0, 4.0, -2.0, 0.5])
+    value, vector, residual = eigen.power(matrix, terms=3, steps=60)
+    assert residual.shape == (3, 60)
+    np.testing.assert_allclose(value, [-8, 4, -2], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, [1, 2, 3]]), np.eye(3), atol=1e-4)
+    assert jnp.all(residual[:, -1] < 1e-5)
+
+
+def test_power_iteration_stalls_between_eigenvalues_of_opposite_sign_and_its_residual_tells():
+    matrix, _ = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
+    value, vector, residual = eigen.power(matrix, terms=1, steps=60)
+    # The Rayleigh quotient has settled, as the published criterion asks, on no eigenvalue.
+    before, _, _ = eigen.power(matrix, terms=1, steps=58)
+    assert jnp.abs(value[0] - before[0]) < 1
+    assert jnp.abs(value[0]) < 230
+    assert residual[0, -1] > 0.3
+    assert jnp.linalg.norm(vector) == pytest.approx(1, abs=1e-5)
+    exact, _, residual = eigen.symmetric(matrix, terms=1)
+    assert exact[0] == pytest.approx(242, rel=1e-5)
+    assert residual[-1] < 1e-4
+
+
+def test_power_iteration_of_zero_is_zero():
+    value, vector, residual = eigen.power(jnp.zeros((60, 60)), terms=3, steps=60)
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(residual, 0)
+    np.testing.assert_allclose(jnp.linalg.norm(vector, axis=0), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("solve", [eigen.symmetric, eigen.power])
 @pytest.mark.parametrize("terms", [0, 21])
-def test_more_terms_than_rows_are_refused(terms):
+def test_more_terms_than_rows_are_refused(terms, solve):
     with pytest.raises(ValueError, match="terms must be between 1 and"):
-        eigen.symmetric(jnp.eye(20), terms=terms)
+        solve(jnp.eye(20), terms=terms)
 
 
 def test_identity_inside_a_jitted_function_gives_ones():

@@ -87,3 +87,41 @@ def test_texel_area_integrates_the_cosine():
     z = hemisphere.texel_direction(resolution=48)[..., 2]
     # The integral of cos^2 over the hemisphere.
     assert jnp.sum(weight * z) == pytest.approx(2 * np.pi / 3, rel=5e-3)
+
+
+def test_polar_texels_are_the_directions_that_their_centers_stand_for():
+    n = 9
+    direction = hemisphere.polar_texel_direction(resolution=n)
+    np.testing.assert_allclose(jnp.linalg.norm(direction, axis=-1), 1, rtol=1e-6)
+    center = (np.arange(n) + 0.5) / n
+    expected = np.stack(np.meshgrid(center, center), -1)
+    np.testing.assert_allclose(hemisphere.polar_coordinates(direction), expected, atol=1e-5)
+    assert jnp.all(direction[..., 2] > 0)
+
+
+def test_polar_texel_area_integrates_the_cosine():
+    weight = hemisphere.polar_texel_area(resolution=48)
+    assert jnp.sum(weight) == pytest.approx(np.pi, rel=1e-5)
+    z = hemisphere.polar_texel_direction(resolution=48)[..., 2]
+    assert jnp.sum(weight * z) == pytest.approx(2 * np.pi / 3, rel=1e-3)
+    # The integral of cos(theta) d omega up to the angle of the row's outer edge is pi sin^2(theta).
+    cosine = 1 - (np.arange(1, 49) / 48) ** 2
+    np.testing.assert_allclose(np.cumsum(np.sum(weight, 1)), np.pi * (1 - cosine**2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("n", [48, 49])
+def test_polar_lookup_is_right_across_the_seam_and_the_normal(n):
+    texel = hemisphere.polar_texel_direction(resolution=n)[..., :2]
+    height = jnp.array([0.0, 1e-3, 0.3 / n, 0.5, 0.9])
+    turn = jnp.array([0.0, 1e-4, 0.2 / n, 0.49 / n, 0.51 / n, 0.3, 1 - 0.3 / n, 1.0])
+    place = jnp.stack(jnp.meshgrid(turn, height), -1)
+    found = hemisphere.polar_lookup(texel, place)
+    np.testing.assert_allclose(found, hemisphere.polar_direction(place)[..., :2], atol=5e-3)
+    np.testing.assert_allclose(found[:, 0], found[:, -1], atol=1e-6)
+
+
+def test_polar_lookup_reproduces_texels_at_their_centers():
+    texel = jnp.asarray(np.random.default_rng(3).normal(size=(9, 9)), jnp.float32)
+    center = (jnp.arange(9) + 0.5) / 9
+    place = jnp.stack(jnp.meshgrid(center, center), -1)
+    np.testing.assert_allclose(hemisphere.polar_lookup(texel, place), texel, atol=1e-5)

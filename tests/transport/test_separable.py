@@ -6,7 +6,7 @@ import pytest
 import scipy.ndimage
 
 import jaxprt as prt
-from jaxprt.brdf import AshikhminShirley, Lambert, separable
+from jaxprt.brdf import AshikhminShirley, Lambert, published, separable
 from jaxprt.relight import reference
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, directions, haar
@@ -104,13 +104,13 @@ def test_six_means_carry_all_of_constant_light():
     np.testing.assert_array_equal(np.abs(light[:, 0]) > 1e-6, mean.ravel())
 
 
-@pytest.mark.parametrize("published", [False, True], ids=["joint colors", "published, per color"])
-def test_all_coefficients_equal_the_reference_with_the_factored_brdf(random, factored, close, published):
-    brdf = separable.factor_symmetric(COLORED, terms=3, resolution=12) if published else factored
+@pytest.mark.parametrize("per_color", [False, True], ids=["joint colors", "published, per color"])
+def test_all_coefficients_equal_the_reference_with_the_factored_brdf(random, factored, close, per_color):
+    brdf = published.factor_symmetric(COLORED, terms=3, resolution=12) if per_color else factored
     seen, frame = visible(random, 6, 8), frames(random, 6)
     position = jnp.asarray(random.normal(size=(6, 3)), jnp.float32)
     transport = transport_of(seen, frame, brdf, keep=384, position=position)
-    assert transport.value.shape == (384, 6, 3, 3 if published else 1)
+    assert transport.value.shape == (384, 6, 3, 3 if per_color else 1)
     light = Environment(jnp.asarray(random.uniform(size=(6, 8, 8, 3)), jnp.float32))
     eye = jnp.array([3.0, 5, -2])
     expected = reference.integrate(seen, position, frame, brdf, light, eye)
