@@ -34,15 +34,13 @@ BRDF = AshikhminShirley()
 GROUND = Lambert(0.5)
 # Terms, vectors, modes, coefficients, texels.
 FRONT = [
+    (8, 8, 32, 384, 4),
     (16, 12, 48, 512, 4),
-    (32, 12, 64, 512, 8),
+    (32, 16, 64, 768, 8),
     (48, 16, 96, 768, 16),
     (64, 16, 96, 1024, 16),
-    (64, 24, 128, 1024, 32),
-    (96, 24, 160, 1024, 32),
-    (96, 32, 192, 1536, 64),
-    (128, 32, 224, 1536, 64),
-    (128, 48, 256, 1536, 128),
+    (64, 24, 128, 1024, 16),
+    (64, 24, 128, 1024, 64),
 ]
 CLUSTERS = 160
 GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
@@ -86,7 +84,7 @@ def measure(quick: bool, store: pathlib.Path | None):
 
     start = time.perf_counter()
     most = np.max(front, 0)
-    factored = separable.factor(BRDF, terms=int(most[0]), resolution=24 if quick else 96)
+    factored = separable.factor(BRDF, terms=int(most[0]), resolution=24 if quick else 64)
     limit = (int(most[1]), int(most[2]), int(most[3]))
     parts = [compressed(visible[0], BRDF, factored, clusters, limit, store and store / "glossy-terms.prt")]
     limit = (4, 4, 96) if quick else GROUND_KEEP

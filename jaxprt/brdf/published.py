@@ -124,18 +124,18 @@ def factor_normalized(
     return SeparableBrdf(light_map.reshape(shape), view_map.T.reshape(shape), error, coordinates)
 
 
-def red_plastic() -> models.CookTorrance:
+def red_plastic() -> models.BlinnPhong:
     """A red plastic; Wang et al. show one and print no parameters, these are chosen here."""
-    return models.CookTorrance(diffuse=jnp.array([0.35, 0.03, 0.025]), specular=0.5, roughness=0.2, f0=0.06)
+    return models.BlinnPhong(diffuse=jnp.array([0.45, 0.05, 0.04]), specular=0.15, exponent=60.0)
 
 
-def brown_plastic() -> models.CookTorrance:
+def brown_plastic() -> models.BlinnPhong:
     """A light brown plastic; Wang et al. show one and print no parameters, these are chosen here.
 
     The other materials of their section 4.1 are `AshikhminShirley` as it stands, and clay and skin of Lafortune et al.,
     which `load_lafortune` reads.
     """
-    return models.CookTorrance(diffuse=jnp.array([0.36, 0.23, 0.12]), specular=0.5, roughness=0.25, f0=0.06)
+    return models.BlinnPhong(diffuse=jnp.array([0.45, 0.3, 0.17]), specular=0.12, exponent=40.0)
 
 
 def _texels(resolution: int, coordinates: Callable) -> tuple[Array, Array]:

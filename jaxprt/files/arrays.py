@@ -71,7 +71,8 @@ class BlockStore:
             ) from None
 
     def write(self, block: int, array: Mapping[str, np.ndarray]) -> None:
-        """Writes one block of every array, then its checksum."""
+        """Writes one block of every array, in the layout's types, then its checksum."""
+        array = {name: np.asarray(array[name], layout.dtype) for name, layout in self._layout.items()}
         for name, layout in self._layout.items():
             self._array(name)[_place(layout, block)] = array[name]
         self._array("checksum")[block] = _checksum(array)

@@ -27,16 +27,18 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         the flux of the brightest texel not taken; and the environment without that.
 
     Raises:
-        ValueError: As many texels as there are, or none.
+        ValueError: The light is a batch, or as many texels as there are are asked for, or none.
     """
     size, colors = light.radiance.shape[-2:]
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
     if not 1 <= count < 6 * size * size:
         raise ValueError(f"count must be between 1 and {6 * size * size - 1}, got {count}")
     radiance = light.radiance.reshape(-1, colors)
     flux = jnp.sum(radiance, -1) * cubemap.solid_angle(size=size).ravel()
     bright, texel = jax.lax.top_k(flux, count + 1)
-    share = 1 - bright[-1] / jnp.where(bright[:-1] > 0, bright[:-1], 1)
-    texel, excess = texel[:-1], radiance[texel[:-1]] * jnp.maximum(share, 0)[:, None]
+    share = jnp.maximum(1 - bright[-1] / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
+    texel, excess = texel[:-1], radiance[texel[:-1]] * share[:, None].astype(radiance.dtype)
     rest = radiance.at[texel].add(-excess).reshape(light.radiance.shape)
     return texel, excess, Environment(rest)
 
@@ -81,7 +83,9 @@ def radiance(
 
     spare = -len(texel) % _GROUP
     texel, excess = jnp.pad(texel, (0, spare)), jnp.pad(excess, ((0, spare), (0, 0)))
-    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), (texel, excess, transport.visible(texel)))
+    groups = jax.tree.map(
+        lambda x: x.reshape(len(x) // _GROUP, _GROUP, *x.shape[1:]), (texel, excess, transport.visible(texel))
+    )
     return jnp.sum(jax.lax.map(group, groups), 0).T
 
 

@@ -45,7 +45,7 @@ class ClusteredTransport(eqx.Module):
         frame: Their tangents, bitangents and normals.
         vertex: Vertex of each row.
         place: Row of each vertex.
-        rms: Root mean square over vertices and terms of each coefficient as kept.
+        rms: Root mean square over rows and terms of each coefficient as kept.
     """
 
     index: UInt[Array, "p k"]
@@ -164,7 +164,10 @@ def precompute(
         member = cluster(direct.position, direct.frame[:, 2], clusters=clusters)
     missing = np.setdiff1d(np.arange(len(direct.position)), member).size
     if missing or member.min() < 0 or member.max() >= len(direct.position):
-        raise ValueError(f"member must name every vertex and no others, got {missing} missing, up to {member.max()}")
+        raise ValueError(
+            f"member must name all {len(direct.position)} vertices and no others, got {missing} missing and "
+            f"numbers from {member.min()} to {member.max()}"
+        )
     if not 1 <= vectors <= member.shape[1]:
         raise ValueError(f"vectors must be between 1 and the {member.shape[1]} vertices of a cluster, got {vectors}")
     if not 1 <= keep <= direct.level.shape[0]:

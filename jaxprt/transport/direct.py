@@ -104,8 +104,9 @@ def precompute(
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:
     """Levels in sixteenths, two to each byte."""
-    pair = pair.reshape(len(pair), -1, 1, _HALF)
-    level = jnp.concatenate([pair & 15, pair >> 4], 2).reshape(len(pair), -1)
+    texels, width = pair.shape
+    pair = pair.reshape(texels, width // _HALF, 1, _HALF)
+    level = jnp.concatenate([pair & 15, pair >> 4], 2).reshape(texels, 2 * width)
     return level + (level > _MIDDLE)
 
 

@@ -60,6 +60,16 @@ def exact(transport, brdf, light, eye=EYE):
     return reference.integrate(seen, transport.position, transport.frame, brdf, light, eye)
 
 
+@jax.jit
+def weighed(brdf, excess, eye, texel, transport, weight):
+    """A sum over vertices and colors, with its slopes by the BRDF, the excess and the eye."""
+
+    def total(brdf, excess, eye):
+        return jnp.vdot(weight, direct.radiance(transport, brdf, texel, excess, eye=eye))
+
+    return jax.value_and_grad(total, (0, 1, 2))(brdf, excess, eye)
+
+
 @pytest.mark.parametrize("colors", [1, 3])
 @pytest.mark.parametrize("strength", [1e-20, 1.0, 1e30])
 def test_excess_and_rest_are_the_light(random, colors, strength):
@@ -118,6 +128,25 @@ def test_all_but_one_texel_can_be_taken(random):
     texel, excess, rest = direct.split(Environment(jnp.asarray(radiance)), count=ALL - 1)
     np.testing.assert_allclose(flux(rest.radiance), flux(radiance).min(), rtol=1e-5)
     np.testing.assert_allclose(whole(texel, excess).radiance + rest.radiance, radiance, rtol=1e-6)
+
+
+def test_a_batch_of_lights_is_refused(sky):
+    with pytest.raises(ValueError, match=r"the light must be one environment \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
+        direct.split(Environment(jnp.stack([sky.radiance] * 2)), count=COUNT)
+
+
+def test_a_light_of_float32_keeps_its_type_where_float64_is_enabled(sky, x64):
+    _, excess, rest = direct.split(sky, count=COUNT)
+    assert excess.dtype == rest.radiance.dtype == np.float32
+
+
+@pytest.mark.parametrize("part", ["vertices", "texels"])
+def test_none_have_no_radiance(mesh, transport, part):
+    count = 0 if part == "texels" else COUNT
+    lit = precompute(mesh, size=SIZE, vertex=np.zeros(0, int), progress=False) if part == "vertices" else transport
+    color = direct.radiance(lit, GLOSSY, jnp.zeros(count, int), jnp.ones((count, 3)), eye=EYE)
+    assert color.shape == (len(lit.position), 3)
+    assert not np.asarray(color).any()
 
 
 @pytest.mark.parametrize("count", [0, -1, ALL])
@@ -197,11 +226,7 @@ def test_eyes_in_odd_places_have_finite_radiance_and_slopes(transport, sky, plac
         "far away": jnp.array([1e15, 1e15, -1e15]),
         "in the plane": jnp.array([5.0, 0, 2]),
     }[place]
-
-    def mean(brdf, excess, eye):
-        return jnp.mean(direct.radiance(transport, brdf, texel, excess, eye=eye))
-
-    value, slope = jax.value_and_grad(mean, (0, 1, 2))(GLOSSY, excess, eye)
+    value, slope = weighed(GLOSSY, excess, eye, texel, transport, jnp.ones((39, 3)))
     assert np.isfinite(value)
     assert all(np.isfinite(np.asarray(each)).all() for each in jax.tree.leaves(slope))
 
@@ -211,13 +236,11 @@ def test_slopes_are_those_of_the_reference(transport, sky, random, close):
     texel, excess, _ = direct.split(sky, count=COUNT)
     weight = jnp.asarray(random.normal(size=(39, 3)), jnp.float32)
 
-    def ours(brdf, excess, eye):
-        return jnp.vdot(weight, direct.radiance(transport, brdf, texel, excess, eye=eye))
-
     def theirs(brdf, excess, eye):
         return jnp.vdot(weight, exact(transport, brdf, whole(texel, excess), eye))
 
-    found, expected = (jax.grad(each, (0, 1, 2))(GLOSSY, excess, EYE) for each in (ours, theirs))
+    _, found = weighed(GLOSSY, excess, EYE, texel, transport, weight)
+    expected = jax.jit(jax.grad(theirs, (0, 1, 2)))(GLOSSY, excess, EYE)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert np.any(other)
         close(one, other, tolerance=SLOPE)
