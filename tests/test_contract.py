@@ -67,7 +67,7 @@ HOST = {
     "brdf.separable.sample_error": "draws its own directions",
     "brdf.separable.tabulate": "checks values",
     "plan": "measures",
-    "relight.separable.join": "puts arrays side by side, and makes an error that is NaN",
+    "brdf.separable.join": "puts arrays side by side, and makes an error that is NaN",
     "scene.mesh": "loads, checks and builds meshes",
     "scene.mesh_file": "reads files",
     "scene.occluder": "simplifies meshes on the host",

@@ -1,7 +1,7 @@
 """BRDFs as sums of products of a light map and a view map: f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -128,6 +128,32 @@ def factor(
     shape = (terms, resolution, resolution)
     light_map, view_map = light_map.reshape(*shape, 1), view_map.reshape(*shape, color)
     return SeparableBrdf(light_map, view_map, remainder[terms - 1], hemisphere.parabolic_coordinates)
+
+
+def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
+    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them; see `jaxprt.relight.separable.modulate`.
+
+    Args:
+        brdfs: One or more, on maps of one kind and size; those with one color serve as gray beside those with more.
+
+    Returns:
+        The sum of the BRDFs, with the terms of the first, then those of the next. Its error is not known and reads NaN.
+
+    Raises:
+        ValueError: There are no BRDFs, or their maps differ in coordinates or resolution.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.1, which names linear combinations of basic BRDFs.
+    """
+    kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
+    if len(kinds) != 1:
+        raise ValueError(f"brdfs must be at least one, on maps of one kind, got {', '.join(kinds) or 'none'}")
+
+    def side_by_side(maps):
+        colors = max(each.shape[-1] for each in maps)
+        return jnp.concatenate([jnp.broadcast_to(each, (*each.shape[:-1], colors)) for each in maps])
+
+    light_map, view_map = (side_by_side([getattr(b, name) for b in brdfs]) for name in ("light_map", "view_map"))
+    return SeparableBrdf(light_map, view_map, jnp.full_like(brdfs[0].error, jnp.nan), brdfs[0].coordinates)
 
 
 def sample_error(

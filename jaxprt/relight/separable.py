@@ -3,7 +3,6 @@
 Turning the light redoes only `light_tuple`, moving the eye only `view_tuple`; the caller keeps the other.
 """
 
-from collections.abc import Sequence
 from functools import partial, reduce
 from typing import Protocol, runtime_checkable
 
@@ -186,46 +185,21 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
     return brdf.view(directions.normalize(local))
 
 
-def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
-    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them; see `modulate`.
-
-    Args:
-        brdfs: One or more, on maps of one kind and size; those with one color serve as gray beside those with more.
-
-    Returns:
-        The sum of the BRDFs, with the terms of the first, then those of the next. Its error is not known and reads NaN.
-
-    Raises:
-        ValueError: There are no BRDFs, or their maps differ in coordinates or resolution.
-
-    Reference: Wang, Tran, Luebke 2004, section 3.1, which names linear combinations of basic BRDFs.
-    """
-    kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
-    if len(kinds) != 1:
-        raise ValueError(f"brdfs must be at least one, on maps of one kind, got {', '.join(kinds) or 'none'}")
-
-    def side_by_side(maps):
-        colors = max(each.shape[-1] for each in maps)
-        return jnp.concatenate([jnp.broadcast_to(each, (*each.shape[:-1], colors)) for each in maps])
-
-    light_map, view_map = (side_by_side([getattr(b, name) for b in brdfs]) for name in ("light_map", "view_map"))
-    return SeparableBrdf(light_map, view_map, jnp.full_like(brdfs[0].error, jnp.nan), brdfs[0].coordinates)
-
-
 @partial(jax.jit, static_argnames=("terms",))
 def modulate(
     view: Float[Array, "v r d"], weight: Float[Array, "v n w"], *, terms: tuple[int, ...]
 ) -> Float[Array, "v r e"]:
     """Gives every vertex a BRDF of its own: the view tuple with the terms of n basis BRDFs weighted.
 
-    A texture over all of one BRDF is n = 1; a texture on its diffuse part is `join` of that part and the rest, with
-    weight 1 for the rest. Neither transport nor the light tuple depends on the weights, so new ones cost no more than
-    a view change. Linear in the weights, and differentiable in them.
+    A texture over all of one BRDF is n = 1; a texture on its diffuse part is `jaxprt.brdf.separable.join` of that part
+    and the rest, with weight 1 for the rest. Neither transport nor the light tuple depends on the weights, so new ones
+    cost no more than a view change. Linear in the weights, and differentiable in them. Rows are the transport's:
+    with `ClusteredTransport` take the weights of `transport.vertex`.
 
     Args:
         view: `view_tuple` of the joined BRDF.
         weight: Of each row of the transport (its vertices), basis BRDF, and color or all colors alike.
-        terms: Number of terms of each basis BRDF, in the order of `join`.
+        terms: Number of terms of each basis BRDF, in the order of `jaxprt.brdf.separable.join`.
 
     Returns:
         The view tuple for `combine`, in the colors of the BRDF or of the weights, whichever are more.

@@ -8,7 +8,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.brdf.separable import SeparableBrdf, factor
+from jaxprt.brdf.separable import SeparableBrdf, factor, join
 from jaxprt.relight import reference, separable
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
@@ -281,18 +281,18 @@ TERMS = (1, 3, 2)
 
 def test_joined_brdfs_are_the_sum_of_their_parts(basis, random, close):
     wi, wo = (directions.normalize(jnp.asarray(random.normal(size=(40, 3)), jnp.float32)) for _ in range(2))
-    joined = separable.join(basis)
+    joined = join(basis)
     assert joined.terms == sum(TERMS)
     assert joined.coordinates is basis[0].coordinates
     close(joined(wi, wo), sum(each(wi, wo) for each in basis))
-    close(separable.join(basis[1:2])(wi, wo), basis[1](wi, wo))
+    close(join(basis[1:2])(wi, wo), basis[1](wi, wo))
 
 
 def test_two_lamberts_joined_are_the_lambert_of_their_summed_albedos(random, close):
     wi, wo = (directions.normalize(jnp.asarray(random.normal(size=(40, 3)), jnp.float32)) for _ in range(2))
     parts = [factor(Lambert(albedo), terms=1, resolution=12) for albedo in ([0.1, 0.2, 0.3], [0.25] * 3)]
     expected = np.array([0.35, 0.45, 0.55]) / np.pi * ((wi[:, 2:] > 0) & (wo[:, 2:] > 0))
-    close(separable.join(parts)(wi, wo), expected, tolerance=1e-4)  # One term of a factorization in float32.
+    close(join(parts)(wi, wo), expected, tolerance=1e-4)  # One term of a factorization in float32.
 
 
 def test_brdfs_on_other_maps_are_not_joined(basis):
@@ -300,9 +300,9 @@ def test_brdfs_on_other_maps_are_not_joined(basis):
     smaller = (each[:, :10, :10] for each in maps)
     for other in (SeparableBrdf(*smaller, jnp.zeros(())), SeparableBrdf(*maps, jnp.zeros(()))):
         with pytest.raises(ValueError, match="brdfs must be at least one, on maps of one kind, got"):
-            separable.join([basis[0], other])
+            join([basis[0], other])
     with pytest.raises(ValueError, match="got none"):
-        separable.join([])
+        join([])
 
 
 @pytest.fixture(scope="module")
@@ -329,7 +329,7 @@ def modulated(transport, brdf, light, weight, terms=TERMS):
 
 def test_weights_per_vertex_give_every_vertex_its_own_brdf(basis, spotted, close):
     mesh, weight, light, expected = spotted
-    joined = separable.join(basis)
+    joined = join(basis)
     transport = precompute(mesh, joined, keep=6 * SIZE**2, size=SIZE, progress=False)
     assert np.count_nonzero(expected.any(1)) > 9
     close(modulated(transport, joined, light, weight), expected, tolerance=RIM)
