@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo check test bench notebooks clean
+.PHONY: help setup demo check test bench tables notebooks clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -29,6 +29,9 @@ bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable 
 	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \
 		$(filter-out __init__ harness,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
 	$(BIN)/python -m benchmarks.$(NAME) $(ARGS)
+
+tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, about an hour: ARGS="--mesh stanford_bunny" for one
+	$(BIN)/python -m benchmarks.tables $(ARGS)
 
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }

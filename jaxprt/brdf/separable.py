@@ -131,7 +131,9 @@ def factor(
 
 
 def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
-    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them; see `jaxprt.relight.separable.modulate`.
+    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them.
+
+    `jaxprt.relight.separable.modulate` mixes them.
 
     Args:
         brdfs: One or more, on maps of one kind and size; those with one color serve as gray beside those with more.
