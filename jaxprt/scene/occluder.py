@@ -40,15 +40,19 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
         raise ValueError(f"faces must be at least 4, got {faces}")
     if len(mesh.face) <= faces:
         return mesh
-    position = np.asarray(mesh.position, np.float64) + 0.0  # -0 is 0
+    position = np.asarray(mesh.position, np.float64)
     _, place = np.unique(position, axis=0, return_inverse=True)
-    corner = np.sort(place.reshape(-1)[np.asarray(mesh.face)], 1)
+    edge = position[np.asarray(mesh.face)[:, 1:]] - position[np.asarray(mesh.face)[:, :1]]
+    solid = np.flatnonzero(np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1))
+    if not solid.size:
+        raise ValueError(f"mesh must have faces with an area, got {len(edge)} without")
+    corner = np.sort(place.reshape(-1)[np.asarray(mesh.face)[solid]], 1)
     _, alike, count = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
-    sheet = (count > 1)[alike.reshape(-1)]
-    if sheet.all():
-        return mesh
-    single = _collapse(mesh, np.flatnonzero(~sheet), max(4, faces - int(np.count_nonzero(sheet))))
-    return join([_part(mesh, sheet), single]) if sheet.any() else single
+    twin = (count > 1)[alike.reshape(-1)]
+    parts = [_part(mesh, solid[twin])] if twin.any() else []
+    if not twin.all():
+        parts.append(_collapse(mesh, solid[~twin], max(4, faces - int(np.count_nonzero(twin)))))
+    return join(parts)
 
 
 def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
@@ -65,10 +69,7 @@ def _collapse(mesh: Mesh, chosen: np.ndarray, faces: int) -> Mesh:
     place = np.column_stack([(np.asarray(mesh.position, np.float64) - low) * unit, mesh.region])
     place, index = np.unique(place, axis=0, return_inverse=True)
     face = index.reshape(-1)[np.asarray(mesh.face)[chosen]]
-    edge = place[face[:, 1:], :3] - place[face[:, :1], :3]
-    face = np.ascontiguousarray(face[np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > 0], np.int32)
-    if not len(face):
-        raise ValueError(f"mesh must have faces with an area, got {len(edge)} without")
+    face = np.ascontiguousarray(face, np.int32)
     result = fast_simplification.simplify(
         place[:, :3].copy(), face, target_count=min(faces, len(face)), preserve_border=True
     )

@@ -1,0 +1,189 @@
+"""How long do precomputation, a change of light and a change of view take, beside the figures of Wang et al. 2004?
+
+    python -m benchmarks.tables [--quick] [--mesh NAME] [--output FILE]
+
+Tables 1 and 2 of the paper: a glossy mesh with one and with four terms of Ashikhmin and Shirley's BRDF on a diffuse
+ground with one, 96 coefficients a vertex and term, light of 6 x 64 x 64 texels, shadows cast by a simplified scene.
+Transport is stored in whole numbers, as in the paper. `peer` are the paper's figures, of a 2.6 GHz Pentium 4 with a
+GeForce 5900 in 2004, so their ratio is of two machines and of two meshes: of three meshes the files have fewer vertices
+than the paper's. `error` is what storing in whole numbers changes in the radiance. All meshes together take about an
+hour on two cores. Without JAXPRT_DATA, and with `--quick`, a small embedded scene stands in, which has no peer.
+"""
+
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness
+from jaxprt.brdf import AshikhminShirley, Lambert, separable
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt.scene import Mesh, builtin, camera, load_mesh, occluder
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.transport import separable as transport
+from jaxprt.transport.quantized import QuantizedTransport, quantize
+
+KEEP = 96
+SIZE = 64
+
+
+class Published(NamedTuple):
+    """A column of the paper's tables; pairs are for one and four terms."""
+
+    vertices: int
+    ground: int
+    simplified: int
+    minutes: tuple[int, int]
+    megabytes: tuple[int, int]
+    view: tuple[float, float]
+    light: tuple[float, float]
+
+
+# Vertex counts of tables 1 are in thousands there.
+PUBLISHED = {
+    "stanford_bunny": Published(36_000, 22_000, 11_000, (21, 70), (30, 84), (90, 63), (20, 7.2)),
+    "happy_buddha_100k": Published(56_000, 31_000, 20_000, (35, 101), (44, 127), (46, 35), (14, 5.0)),
+    "dragon_100k": Published(100_000, 63_000, 32_000, (70, 194), (81, 230), (24, 18), (7.8, 2.7)),
+    "lucy_100k": Published(180_000, 23_000, 17_000, (80, 233), (100, 370), (18, 12), (6.2, 1.7)),
+}
+
+
+def main() -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--mesh", choices=list(PUBLISHED), action="append", help="only this mesh; may be repeated")
+    arguments = parser.parse_args()
+    folder = harness.data() / "meshes"
+    lines = []
+    if arguments.quick or not folder.exists():
+        ball = builtin.sphere(rings=8, sectors=16)
+        cases = [("ball", ball, ground_plane(ball, vertices=100), 256, None)]
+    else:
+        cases = (case(name) for name in arguments.mesh or PUBLISHED)
+    for name, mesh, ground, faces, paper in cases:
+        repeats = 3 if arguments.quick else 21
+        lines += [harness.report(line, arguments.output) for line in measure(name, mesh, ground, faces, paper, repeats)]
+    print(table(lines))
+
+
+def case(name: str) -> tuple[str, Mesh, Mesh, int, Published]:
+    """A mesh of the paper, its ground, and as many faces to cast shadows as a closed mesh of the paper's vertices."""
+    mesh, paper = load_mesh(harness.data() / "meshes" / f"{name}.ply"), PUBLISHED[name]
+    return name, mesh, ground_plane(mesh, vertices=paper.ground), 2 * paper.simplified, paper
+
+
+def measure(name: str, mesh: Mesh, ground: Mesh, faces: int, paper: Published | None, repeats: int) -> list[dict]:
+    """The lines of one mesh: precomputation, view and light, each with one and with four terms."""
+    whole = join([mesh, ground])
+    shadows = occluder.simplify(whole, faces=faces)
+    one_term = separable.factor(Lambert(0.5), terms=1)
+    # One vertex compiles and does not count.
+    transport.precompute(ground, one_term, keep=KEEP, size=SIZE, occluder=shadows, vertex=np.arange(1), progress=False)
+    began = time.perf_counter()
+    below = precompute(ground, one_term, shadows)
+    ground_seconds = time.perf_counter() - began
+    lines = []
+    for column, terms in enumerate((1, 4)):
+        glossy = separable.factor(AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100), terms=terms)
+        began = time.perf_counter()
+        transport.precompute(mesh, glossy, keep=KEEP, size=SIZE, occluder=shadows, vertex=np.arange(1), progress=False)
+        compiled = time.perf_counter() - began
+        began = time.perf_counter()
+        upon = precompute(mesh, glossy, shadows)
+        seconds = time.perf_counter() - began + ground_seconds
+        parts = [(upon, glossy), (below, one_term)]
+        common = {
+            "benchmark": "tables",
+            "error": change(parts),
+            "bytes": sum(q.nbytes for (_, q), _ in parts),
+            "vertices": len(mesh.position),
+            "ground": len(ground.position),
+            "shadow_faces": len(shadows.face),
+            "mesh": name,
+            "terms": terms,
+        }
+        view, light = frames([(q, brdf) for (_, q), brdf in parts], camera.orbit(mesh, elevation=0.3).eye, repeats)
+        timings = {"precompute": harness.Timing(seconds, compiled, 1), "view": view, "light": light}
+        for what, timing in timings.items():
+            line = {**common, "case": f"{what}, {name}, {terms} terms", "what": what, **timing.line()}
+            lines.append(line | (peer(paper, what, column) if paper else {}))
+    return lines
+
+
+def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh):
+    """Transport in floating point and in whole numbers."""
+    result = transport.precompute(mesh, brdf, keep=KEEP, size=SIZE, occluder=shadows, progress=False)
+    return result, jax.block_until_ready(quantize(result))
+
+
+def frames(
+    parts: list[tuple[QuantizedTransport, SeparableBrdf]], eye: jax.Array, repeats: int
+) -> tuple[harness.Timing, harness.Timing]:
+    """A change of view, which keeps the light's tuples, and one of light, which keeps the view's."""
+    environment = builtin.daylight(size=SIZE)
+    lights = [light_tuple(each, environment) for each, _ in parts]
+    views = [view_tuple(each, brdf, eye) for each, brdf in parts]
+
+    def view():
+        return [combine(g, view_tuple(each, brdf, eye)) for g, (each, brdf) in zip(lights, parts, strict=True)]
+
+    def light():
+        return [combine(light_tuple(each, environment), h) for h, (each, _) in zip(views, parts, strict=True)]
+
+    return harness.compare(view, light, repeats=repeats)
+
+
+def change(parts: list) -> float:
+    """Relative L2 difference of the light tuples that whole numbers make."""
+    environment = builtin.daylight(size=SIZE)
+    pairs = [[light_tuple(each, environment) for each in both] for both, _ in parts]
+    return float(
+        jnp.sqrt(sum(jnp.sum((q - plain) ** 2) for plain, q in pairs) / sum(jnp.sum(plain**2) for plain, _ in pairs))
+    )
+
+
+def peer(paper: Published, what: str, column: int) -> dict:
+    """The paper's figure; its errors are not known."""
+    seconds = {
+        "precompute": 60.0 * paper.minutes[column],
+        "view": 1 / paper.view[column],
+        "light": 1 / paper.light[column],
+    }
+    return {
+        "peer": "Wang et al. 2004",
+        "peer_seconds": seconds[what],
+        "peer_error": None,
+        "peer_bytes": 1_000_000 * paper.megabytes[column],
+        "peer_vertices": paper.vertices,
+    }
+
+
+def table(lines: list[dict]) -> str:
+    """Both tables in Markdown: here, and in the paper where it has the mesh."""
+    rows = [
+        "",
+        "| mesh | terms | vertices + ground | precompute | size | view | light |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for start in range(0, len(lines), 3):
+        first, view, light = lines[start : start + 3]
+        rows.append(
+            f"| {first['mesh']} | {first['terms']} | {first['vertices']:,} + {first['ground']:,} "
+            f"| {first['seconds'] / 60:.1f} min | {first['bytes'] / 1e6:.0f} MB "
+            f"| {1 / view['seconds']:.0f} fps | {1 / light['seconds']:.0f} fps |"
+        )
+        paper = PUBLISHED.get(first["mesh"])
+        if paper:
+            column = (1, 4).index(first["terms"])
+            rows.append(
+                f"| in the paper | {first['terms']} | {paper.vertices:,} + {paper.ground:,} "
+                f"| {paper.minutes[column]} min | {paper.megabytes[column]} MB "
+                f"| {paper.view[column]} fps | {paper.light[column]} fps |"
+            )
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    main()
