@@ -1,0 +1,64 @@
+"""Plans against the error that carrying them out has, on views that they did not see."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import plan
+from jaxprt.brdf import AshikhminShirley
+from jaxprt.relight import reference
+from jaxprt.scene import Environment, builtin
+
+BRDF = AshikhminShirley(nu=8, nv=20)
+ASKED = 0.3
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return builtin.sphere(rings=10, sectors=12)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return builtin.daylight(size=8)
+
+
+@pytest.fixture(scope="module")
+def planned(mesh, sky):
+    return plan.separable(mesh, BRDF, [sky], error=ASKED, progress=False)
+
+
+@pytest.fixture(scope="module")
+def ready(mesh, planned):
+    return plan.precompute(mesh, BRDF, planned, size=8, progress=False)
+
+
+def test_the_error_asked_for_holds_from_other_views(mesh, sky, planned, ready):
+    assert planned.error * plan.MARGIN <= ASKED
+    now, exact = [], []
+    for eye in jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]]):
+        now.append(plan.radiance(ready, sky, eye=eye))
+        exact.append(reference.radiance(mesh, BRDF, sky, eye=eye, progress=False))
+    assert np.linalg.norm(np.subtract(now, exact)) < ASKED * np.linalg.norm(exact)
+
+
+def test_bytes_are_those_of_what_is_made(mesh, planned, ready):
+    made = ready.transport.nbytes + ready.visible.nbytes
+    assert planned.nbytes == pytest.approx(made, rel=0.2)
+    assert planned.seconds > 0
+    assert planned.precompute_seconds > 0
+
+
+@pytest.mark.parametrize(
+    ("lights", "error", "message"),
+    [
+        ([], 0.1, "environments must be at least one, got none"),
+        ([4, 8], 0.1, "must be of one size"),
+        ([8], 0.0, "error must be positive, got 0"),
+        ([8], np.nan, "error must be positive, got nan"),
+    ],
+)
+def test_impossible_plans_are_refused(mesh, lights, error, message):
+    lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
+    with pytest.raises(ValueError, match=message):
+        plan.separable(mesh, BRDF, lights, error=error, progress=False)
