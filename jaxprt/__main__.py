@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
         "--order", type=int, default=5, help="bands of the harmonic system (default 5: 25 coefficients)"
     )
     parser.add_argument(
-        "--window", choices=list(report.WINDOWS), default="lanczos", help="against ringing on what is glossy"
+        "--window", choices=list(report.WINDOWS), default="laplacian", help="against ringing on what is glossy"
     )
     parser.add_argument("--ground", action="store_true", help="stand the mesh on a diffuse ground plane")
     parser.add_argument("--size", type=int, default=512, help="edge of the pictures in pixels (default 512)")
