@@ -14,6 +14,7 @@ from jaxprt.sphere import hemisphere
 
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
 _MOST_TERMS = 256
+_NULL = 4  # rounding errors of the largest value: less is none
 
 
 class SeparableBrdf(eqx.Module):
@@ -123,7 +124,9 @@ def factor(
     light_map = jnp.einsum("cor,coi->ri", project, table)
     # M C M^T u = value u continues the view map to texels of no weight, which bilinear lookup needs at the rim.
     response = covariance @ (matrix.T @ vector)
-    inverse = jnp.where(value > 0, 1 / jnp.where(value > 0, value, 1), 0)
+    # What rounding leaves of a null term must not be divided by.
+    known = value > _NULL * jnp.finfo(value.dtype).eps * jnp.max(value)
+    inverse = jnp.where(known, 1 / jnp.where(known, value, 1), 0)
     view_map = jnp.einsum("coi,ir->roc", flux, response * inverse)
     shape = (terms, resolution, resolution)
     light_map, view_map = light_map.reshape(*shape, 1), view_map.reshape(*shape, color)
