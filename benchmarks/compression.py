@@ -40,7 +40,10 @@ FRONT = [
     (48, 16, 96, 768, 16),
     (64, 16, 96, 1024, 16),
     (64, 24, 128, 1024, 64),
+    (96, 32, 192, 1536, 64),
+    (128, 48, 256, 1536, 64),
 ]
+RESOLUTION = 96  # of the BRDF's maps: 48 or 64 cost more error than half of 128 terms
 CLUSTERS = 160
 GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
 
@@ -83,7 +86,7 @@ def measure(quick: bool, store: pathlib.Path | None):
 
     start = time.perf_counter()
     most = np.max(front, 0)
-    factored = separable.factor(BRDF, terms=int(most[0]), resolution=24 if quick else 64)
+    factored = separable.factor(BRDF, terms=int(most[0]), resolution=24 if quick else RESOLUTION)
     limit = (int(most[1]), int(most[2]), int(most[3]))
     parts = [compressed(visible[0], BRDF, factored, clusters, limit, store and store / "glossy-terms.prt")]
     limit = (4, 4, 96) if quick else GROUND_KEEP

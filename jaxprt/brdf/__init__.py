@@ -1,8 +1,9 @@
 """BRDFs: analytic models, and the form that each system gives them."""
 
-from jaxprt.brdf import cylinders, harmonic, measured, models, published, scattered, separable
+from jaxprt.brdf import cylinders, harmonic, lobe, lobe_em, measured, models, published, scattered, separable
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
 from jaxprt.brdf.harmonic import HarmonicBrdf
+from jaxprt.brdf.lobe import LobeBrdf
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
 from jaxprt.brdf.models import (
     AshikhminShirley,
@@ -23,6 +24,7 @@ __all__ = [
     "HarmonicBrdf",
     "Lafortune",
     "Lambert",
+    "LobeBrdf",
     "Phong",
     "PoulinFournier",
     "PoulinFournierGrooves",
@@ -34,6 +36,8 @@ __all__ = [
     "load_merl",
     "load_npf",
     "load_scattered",
+    "lobe",
+    "lobe_em",
     "measured",
     "models",
     "published",

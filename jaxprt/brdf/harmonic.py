@@ -8,7 +8,7 @@ surface.
 
 import itertools
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -16,14 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.sphere import directions, harmonics, hemisphere
+from jaxprt.sphere import harmonics, hemisphere
 
 # Rings and sectors of the quadrature, one after the other until the error is reached; the last only tells it.
 _RULES = ((24, 96), (32, 160), (48, 320), (64, 640), (96, 960))
-_CLUSTER = 4  # power by which nodes crowd around the mirror direction
 _PROBES = 48  # views at which the error of the quadrature is measured
 _BATCH = 16  # views integrated at once
-_TINY = 1e-20
 
 
 class HarmonicBrdf(eqx.Module):
@@ -154,11 +152,7 @@ def tabulate(
 def project(
     brdf: Callable, wo: Float[Array, "v 3"], *, degree: int, rings: int, sectors: int
 ) -> Float[Array, "lm c v"]:
-    """SH coefficients of f(wi, wo) max(0, wi_z) for given views, by quadrature around the mirror direction.
-
-    Nodes lie on arcs from the mirror direction to the horizon, at Gauss-Legendre points in the fourth root of
-    1 - cos of the angle: they crowd where the lobe is, so that one three degrees wide costs no more of them than a
-    wide one, and the integrand is smooth along each arc.
+    """SH coefficients of f(wi, wo) max(0, wi_z) for given views, by quadrature on arcs around the mirror direction.
 
     Args:
         brdf: A BRDF that is a pytree and callable, as the models are.
@@ -172,25 +166,14 @@ def project(
 
     Reference: Kautz, Sloan, Snyder 2002, section 3.
     """
-    place, weight = (jnp.asarray(each, wo.dtype)[:, None] for each in _rule(rings))
-    angle = 2 * np.pi * (np.arange(sectors) + 0.5) / sectors
-    cosine, sine = jnp.asarray(np.cos(angle), wo.dtype), jnp.asarray(np.sin(angle), wo.dtype)
 
     def one(view):
         mirror = view * jnp.array([-1, -1, 1], wo.dtype)
-        # Rows: level, uphill, mirror direction; at the pole any level direction will do.
-        across, up, _ = directions.frame(mirror, jnp.cross(jnp.array([0, 0, 1], wo.dtype), mirror))
-        rise = sine * up[2]
-        whole = 1 + rise / jnp.sqrt(jnp.maximum(mirror[2] ** 2 + rise**2, _TINY))  # 1 - cos at the horizon
-        height = whole * place
-        reach = jnp.sqrt(height * (2 - height))
-        side = [across[i] * cosine + up[i] * sine for i in range(3)]
-        wi = jnp.stack([(1 - height) * mirror[i] + reach * side[i] for i in range(3)], -1).reshape(-1, 3)
-        area = (whole * weight * (2 * np.pi / sectors)).reshape(-1, 1)
+        wi, area = hemisphere.arcs(mirror, rings=rings, sectors=sectors)
         value = brdf(wi, jnp.broadcast_to(view, wi.shape))
         if jnp.ndim(value) != 2 or value.shape[0] != len(wi):
             raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
-        return harmonics.evaluate(wi, degree=degree).T @ (value * jnp.maximum(wi[:, 2:], 0) * area)
+        return harmonics.evaluate(wi, degree=degree).T @ (value * jnp.maximum(wi[:, 2:], 0) * area[:, None])
 
     return jnp.moveaxis(jax.lax.map(one, wo, batch_size=_BATCH), 0, -1)
 
@@ -198,14 +181,6 @@ def project(
 def _as_argument(brdf: Callable) -> Callable:
     """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
-
-
-@lru_cache(maxsize=8)
-def _rule(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on [0, 1] that crowd around 0."""
-    place, weight = np.polynomial.legendre.leggauss(rings)
-    t = (place + 1) / 2
-    return t**_CLUSTER, weight / 2 * _CLUSTER * t ** (_CLUSTER - 1)
 
 
 def _choose_rule(brdfs: Sequence[Callable], degree: int, error: float) -> tuple[int, int, float]:

@@ -1,5 +1,5 @@
 """Light, transport and view to radiance per vertex."""
 
-from jaxprt.relight import direct, harmonic, reference, separable
+from jaxprt.relight import direct, harmonic, lobe, reference, separable
 
-__all__ = ["direct", "harmonic", "reference", "separable"]
+__all__ = ["direct", "harmonic", "lobe", "reference", "separable"]

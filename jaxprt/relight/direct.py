@@ -2,16 +2,38 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import cubemap, directions, haar
-from jaxprt.transport.direct import DirectTransport
+from jaxprt.sphere import cubemap, directions
 
 _GROUP = 16  # texels at once: what is held for each vertex meanwhile
+
+
+@runtime_checkable
+class Visibility(Protocol):
+    """What this system asks of transport: visibility of single texels.
+
+    Attributes:
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+    """
+
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+
+    @property
+    def size(self) -> int:
+        """Edge of the cubemap's faces in texels."""
+        ...
+
+    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
+        """Share of some texels that each vertex sees."""
+        ...
 
 
 @partial(jax.jit, static_argnames=("count",))
@@ -45,7 +67,7 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
 
 @jax.jit
 def radiance(
-    transport: DirectTransport,
+    transport: Visibility,
     brdf: Callable,
     texel: Int[Array, " t"],
     excess: Float[Array, "t c"],
@@ -55,7 +77,7 @@ def radiance(
     """Radiance that vertices send to the eye, of light from some texels.
 
     Args:
-        transport: Visibility of the vertices.
+        transport: Visibility of the vertices: `DirectTransport`, or the bits of `LobeTransport`.
         brdf: A model: a pytree that is callable, (wi, wo) -> value [*b c] in 1/sr on local directions.
         texel: Numbers of the texels.
         excess: Radiance of each, as `split` returns it.
@@ -67,7 +89,7 @@ def radiance(
 
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
-    size = haar.face_edge(transport.level.shape[0])
+    size = transport.size
     frame = jnp.moveaxis(transport.frame, 0, 2)
     wo = directions.normalize(jnp.stack([_along(axis, eye - transport.position) for axis in frame], -1)).T
     # Vertices last, which XLA's CPU code turns into vectors of them.

@@ -109,15 +109,30 @@ def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Floa
     Returns:
         Number of the face, and the coordinates (s, t) on it, column first, in [-1, 1].
     """
-    magnitude = jnp.abs(direction)
-    axis = jnp.argmax(magnitude, axis=-1)
-    forward = jnp.take_along_axis(direction, axis[..., None], axis=-1)[..., 0]
-    face = 2 * axis + (forward < 0)
-    frame = jnp.asarray(_FRAME[:, :2], direction.dtype)[face]
+    face, s, t = project(direction[..., 0], direction[..., 1], direction[..., 2])
+    return face, jnp.stack([s, t], -1)
+
+
+@jax.jit
+def project(
+    x: Float[Array, "*b"], y: Float[Array, "*b"], z: Float[Array, "*b"]
+) -> tuple[Int[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+    """`coordinates` of directions that are given component by component, which XLA fuses with what follows.
+
+    Returns:
+        Number of the face, s and t.
+    """
+    right, up, near = jnp.abs(x), jnp.abs(y), jnp.abs(z)
+    along_x = (right >= up) & (right >= near)
+    along_y = ~along_x & (up >= near)
+    forward = jnp.where(along_x, x, jnp.where(along_y, y, z))
+    back = forward < 0
+    s = jnp.where(along_x, jnp.where(back, z, -z), jnp.where(along_y | ~back, x, -x))
+    t = jnp.where(along_y, jnp.where(back, -z, z), -y)
     length = jnp.abs(forward)
     length = jnp.where(length > 0, length, 1)
-    # A sum with zeros is exact, so that neighboring faces agree on their common edge to the last bit.
-    return face, (frame * direction[..., None, :]).sum(-1) / length[..., None]
+    face = jnp.where(along_x, 0, jnp.where(along_y, 2, 4)) + back
+    return face, s / length, t / length
 
 
 @functools.partial(jax.jit, static_argnames="sharpness")
@@ -147,7 +162,7 @@ def lookup(
     if sharpness < 1:
         raise ValueError(f"sharpness must be at least 1, got {sharpness}")
     n = cubemap.shape[1]
-    padded = _pad(cubemap)
+    padded = pad(cubemap)
     face, place = coordinates(direction)
     place = (place.astype(cubemap.dtype) + 1) * (n / 2) + 0.5  # In texels; the border's first center is at 0.
     corner = jnp.clip(jnp.floor(place), 0, n)
@@ -187,7 +202,7 @@ def _mix(first: Array, second: Array, weight: Array) -> Array:
     return jnp.where(weight < 0.5, first + weight * step, second - (1 - weight) * step)
 
 
-def _pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
+def pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
     """The faces with a border of one texel; its corners are means of the three texels that meet."""
     n = cubemap.shape[1]
     texel, index = cubemap.reshape(6 * n * n, *cubemap.shape[3:]), _border_index(n)

@@ -1,14 +1,21 @@
-"""Maps between the upper hemisphere and the unit square, and bilinear lookup in such maps.
+"""Maps between the upper hemisphere and the unit square, bilinear lookup in such maps, and integrals over it.
 
 Texture coordinates are in [0, 1], first coordinate along columns; texel (row, column) of an n x n map has its
 center at ((column + 1/2) / n, (row + 1/2) / n).
 """
 
+from functools import lru_cache, partial
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.sphere import directions
+
 _TINY = 1e-12
+_LEAST = 1e-20
+_CROWD = 4  # power by which nodes crowd around the middle of `arcs`
 
 
 @jax.jit
@@ -185,3 +192,41 @@ def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
     # d omega = 2 y dy d phi and cos(theta) = 1 - y^2; y^2 - y^4 / 2 is the integral of 2 y (1 - y^2).
     ring = jnp.diff(square - square**2 / 2) * (2 * jnp.pi / resolution)
     return jnp.broadcast_to(ring[:, None], (resolution, resolution))
+
+
+@partial(jax.jit, static_argnames=("rings", "sectors"))
+def arcs(middle: Float[Array, "3"], *, rings: int, sectors: int) -> tuple[Float[Array, "d 3"], Float[Array, " d"]]:
+    """Quadrature over the upper hemisphere of what has a peak around one direction.
+
+    Nodes lie on arcs from that direction to the horizon, at Gauss-Legendre points in the fourth root of 1 - cos of
+    the angle: they crowd around it, so that a peak three degrees wide costs no more of them than a wide one, and what
+    is smooth above the horizon is smooth along each arc.
+
+    Args:
+        middle: A unit vector above the horizon or on it.
+        rings: Number of nodes on an arc.
+        sectors: Number of arcs.
+
+    Returns:
+        Unit directions and the solid angle that each stands for.
+    """
+    place, weight = (jnp.asarray(each, middle.dtype)[:, None] for each in _arc(rings))
+    angle = 2 * np.pi * (np.arange(sectors) + 0.5) / sectors
+    cosine, sine = jnp.asarray(np.cos(angle), middle.dtype), jnp.asarray(np.sin(angle), middle.dtype)
+    # Rows: level, uphill, middle; at the pole any level direction will do.
+    across, up, _ = directions.frame(middle, jnp.cross(jnp.array([0, 0, 1], middle.dtype), middle))
+    rise = sine * up[2]
+    whole = 1 + rise / jnp.sqrt(jnp.maximum(middle[2] ** 2 + rise**2, _LEAST))  # 1 - cos at the horizon
+    height = whole * place
+    reach = jnp.sqrt(height * (2 - height))
+    side = [across[i] * cosine + up[i] * sine for i in range(3)]
+    direction = jnp.stack([(1 - height) * middle[i] + reach * side[i] for i in range(3)], -1)
+    return direction.reshape(-1, 3), (whole * weight * (2 * np.pi / sectors)).reshape(-1)
+
+
+@lru_cache(maxsize=8)
+def _arc(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights on [0, 1] that crowd around 0."""
+    place, weight = np.polynomial.legendre.leggauss(rings)
+    t = (place + 1) / 2
+    return t**_CROWD, weight / 2 * _CROWD * t ** (_CROWD - 1)

@@ -6,6 +6,7 @@ from jaxprt.transport import (
     direct,
     harmonic,
     interreflection,
+    lobe,
     quantized,
     separable,
     sparse,
@@ -14,12 +15,14 @@ from jaxprt.transport import (
 from jaxprt.transport.clustered import ClusteredTransport
 from jaxprt.transport.direct import DirectTransport
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector
+from jaxprt.transport.lobe import LobeTransport
 from jaxprt.transport.quantized import QuantizedTransport
 from jaxprt.transport.sparse import SparseTransport
 
 __all__ = [
     "ClusteredTransport",
     "DirectTransport",
+    "LobeTransport",
     "QuantizedTransport",
     "SparseTransport",
     "TransferMatrix",
@@ -29,6 +32,7 @@ __all__ = [
     "direct",
     "harmonic",
     "interreflection",
+    "lobe",
     "quantized",
     "separable",
     "sparse",

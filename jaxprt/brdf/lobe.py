@@ -1,0 +1,344 @@
+"""A BRDF times cosine as a few lobes on the sphere, tabulated over the view direction.
+
+    f(wi, wo) max(0, wi_z) ~ d(wo) wi_z / pi + sum_l w_l(wo) p(wi; m_l(wo), k_l(wo))
+
+with von Mises-Fisher densities p whose means, concentrations and weights are free, fitted by EM, and a diffuse part
+beside them. Six to sixteen lobes do what takes separable BRDFs sixty-four terms. The published form, Gaussians of four
+fixed widths around the mirror direction, is `jaxprt.brdf.published.mirror_lobes`.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import lobe_em
+from jaxprt.linalg import mixture
+from jaxprt.sphere import harmonics, hemisphere
+
+# EM's steps, and the share that neighbors in the table have in a lobe after them.
+_ROUNDS = ((8, 0.5), (8, 0.5), (8, 0.25), (8, 0.25), (8, 0.1), (8, 0.1), (12, 0.0))
+_DEGREE = 24  # of the natural light by which a table is judged
+_COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
+_GRAZING = 1e-3
+_TINY = 1e-12
+
+
+class Lobes(eqx.Module):
+    """Lobes of some views, in the local frame of each.
+
+    Attributes:
+        mean: Unit directions.
+        concentration: Of each lobe.
+        weight: Integral of each lobe over the sphere, gray or per color.
+        diffuse: Albedo of the diffuse part.
+    """
+
+    mean: Float[Array, "3 l v"]
+    concentration: Float[Array, "l v"]
+    weight: Float[Array, "c l v"]
+    diffuse: Float[Array, "c v"]
+
+
+class LobeBrdf(eqx.Module):
+    """A table of lobes. The last axis, or the last two, are nodes of the view; axes before follow the parameters.
+
+    Attributes:
+        mean: Directions of the lobes. An isotropic table is over tan(theta / 2) alone, from the normal to the horizon,
+            and its x axis is the horizontal part of the view direction; others are parabolic maps.
+        scale: Logarithm of the concentration.
+        weight: Integral of each lobe over the sphere, gray or per color.
+        diffuse: Albedo of the diffuse part.
+        knot: Increasing values of each parameter at which the table was made.
+        error: Relative L2 error of the radiance without shadows under light of natural spectrum, over some views
+            between the nodes.
+    """
+
+    mean: Float[Array, "3 l *q"]
+    scale: Float[Array, "l *q"]
+    weight: Float[Array, "c l *q"]
+    diffuse: Float[Array, "c *q"]
+    knot: tuple[Float[Array, " _"], ...]
+    error: Float[Array, ""]
+
+    @property
+    def lobes(self) -> int:
+        """Number of lobes."""
+        return self.scale.shape[0]
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether the table is over the view angle alone."""
+        return self.scale.ndim - len(self.knot) == 2
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the table."""
+        return sum(each.nbytes for each in (self.mean, self.scale, self.weight, self.diffuse))
+
+    def at(self, *parameter: Float[Array, ""]) -> "LobeBrdf":
+        """The table for given parameters, which then have no axes; values outside the knots count as the nearest knot.
+
+        Differentiable in the parameters: linear between knots.
+
+        Raises:
+            ValueError: The number of parameters is not that of the table.
+        """
+        if len(parameter) != len(self.knot):
+            raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
+        mean, scale, weight, diffuse = self.mean, self.scale, self.weight, self.diffuse
+        for knot, value in zip(self.knot, parameter, strict=True):
+            value = jnp.clip(value, knot[0], knot[-1])
+            low = jnp.clip(jnp.searchsorted(knot, value, side="right") - 1, 0, len(knot) - 2)
+            share = (value - knot[low]) / (knot[low + 1] - knot[low])
+            mean, scale, weight, diffuse = (
+                jnp.take(each, low, axis) * (1 - share) + jnp.take(each, low + 1, axis) * share
+                for each, axis in ((mean, 2), (scale, 1), (weight, 2), (diffuse, 1))
+            )
+        return LobeBrdf(mean, scale, weight, diffuse, (), self.error)
+
+    def lookup(self, wo: Float[Array, "v 3"]) -> Lobes:
+        """Lobes for some views, interpolated between the nodes; without weight where the view is below the horizon.
+
+        Raises:
+            ValueError: The table has parameters: choose them first, by `at`.
+        """
+        if self.knot:
+            raise ValueError(f"the table has {len(self.knot)} parameters, which `at` must choose first")
+        resolution = self.scale.shape[-1]
+        level = jnp.sqrt(jnp.maximum(wo[:, 0] ** 2 + wo[:, 1] ** 2, _TINY))
+        if self.isotropic:
+            place, weight = _between(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), resolution)
+        else:
+            spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
+            (column, right), (row, down) = (_between(spot[:, axis], resolution) for axis in (0, 1))
+            place = [r * resolution + c for r in row for c in column]
+            weight = [r * c for r in down for c in right]
+        nodes = self.scale[0].size
+        rows = [each.reshape(-1, nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
+        # Row by row, so that a row stays in the cache while all views read it.
+        value = jax.lax.map(
+            lambda row: sum(row.at[p].get(mode="promise_in_bounds") * w for p, w in zip(place, weight, strict=True)),
+            jnp.concatenate(rows),
+        )
+        mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
+        x, y, z = mean.reshape(3, -1, len(wo))
+        if self.isotropic:
+            cosine, sine = wo[:, 0] / level, wo[:, 1] / level
+            x, y = cosine * x - sine * y, sine * x + cosine * y
+        length = jnp.sqrt(jnp.maximum(x**2 + y**2 + z**2, _TINY))
+        up = jnp.where(wo[:, 2] > 0, jnp.ones_like(level), 0)
+        strength = strength.reshape(len(self.weight), -1, len(wo))
+        return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF times the cosine of wi in 1/sr, as far as the lobes carry it; zero below the horizon."""
+        batch = wo.shape[:-1]
+        wi, lobe = wi.reshape(-1, 3), self.lookup(wo.reshape(-1, 3))
+        away = sum((wi[:, i] - lobe.mean[i]) ** 2 for i in range(3)) / 2
+        density = jnp.exp(mixture.log_peak(lobe.concentration) - lobe.concentration * away)
+        value = jnp.sum(lobe.weight * density, 1) + lobe.diffuse * wi[:, 2] / np.pi
+        return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, -1)
+
+
+class Remainder(eqx.Module):
+    """What the lobes leave of a BRDF, itself a BRDF of either sign, for low-rank terms.
+
+    Attributes:
+        brdf: The BRDF.
+        lobe: Its lobes; the diffuse part counts as one of them.
+    """
+
+    brdf: Callable
+    lobe: LobeBrdf
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value in 1/sr: the BRDF less the lobes over the cosine, which counts as at least 0.001."""
+        return self.brdf(wi, wo) - self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
+
+
+def tabulate(
+    brdf: Callable,
+    *,
+    lobes: int | None = None,
+    error: float | None = None,
+    resolution: int = 32,
+    knot: Sequence[np.ndarray] = (),
+) -> LobeBrdf:
+    """Fits lobes to a BRDF times cosine for all views.
+
+    Lobes are fitted at each node of the view to samples on arcs around the mirror direction. All nodes start alike, in
+    terms of half vectors, and are drawn to their neighbors between the rounds, so that a lobe stays the same one from
+    node to node and can be interpolated. No lobe is wider than about 0.7 of what a single one would be: with wider ones
+    more lobes would bring nothing where light and visibility vary. The energy of each view is kept.
+
+    Args:
+        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the
+            parameters that makes one.
+        lobes: Number of lobes; or
+        error: the error of the table, see `LobeBrdf`, that the lobes must reach.
+        resolution: Nodes of the view angle. Anisotropic BRDFs have maps of half that on either edge.
+        knot: For a BRDF that varies, the increasing values of each of its one or two parameters.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: Neither or both of lobes and error, an option out of range, knots that do not increase, an error
+            that 32 lobes do not reach, or a BRDF with values that are negative or not finite.
+
+    Reference: Sun et al. 2007, section 4.1, with free lobes instead of theirs.
+    """
+    if (lobes is None) == (error is None):
+        raise ValueError(f"give either lobes or error, got lobes={lobes} and error={error}")
+    if (lobes is not None and not lobes >= 1) or (error is not None and not error > 0) or resolution < 4:
+        raise ValueError(
+            f"tabulate needs at least one lobe or an error above 0, and a resolution of at least 4, "
+            f"got {lobes}, {error} and {resolution}"
+        )
+    if len(knot) > 2:
+        raise ValueError(f"at most two parameters can be tabulated, got {len(knot)}")
+    knots = tuple(_checked(number, values) for number, values in enumerate(knot))
+    made = [_as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
+    isotropic = all(_isotropic(each) for each in made)
+    points = itertools.product(*knots)
+    both = [_sampled(each, resolution, isotropic, point) for each, point in zip(made, points, strict=True)]
+    wo, samples = both[0][0], [each for _, each in both]
+    reached = np.inf
+    for count in _COUNTS if lobes is None else (lobes,):
+        tables = [_table(each, wo, lobes=count) for each in samples]
+        result = _stacked(tables, knots, wo.shape[:-1])
+        reached = max(
+            float(_natural_error(b, _stacked([t], (), wo.shape[:-1]))) for b, t in zip(made, tables, strict=True)
+        )
+        if error is None or reached <= error:
+            return eqx.tree_at(lambda x: x.error, result, jnp.asarray(reached, wo.dtype))
+    raise ValueError(f"error must be at least {reached:.3g}, which {_COUNTS[-1]} lobes reach; got {error}")
+
+
+def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
+    """Views at the nodes of a table, and what EM needs of a BRDF there; see `lobe_em.samples`.
+
+    Raises:
+        ValueError: The BRDF is negative or not finite, or has no axis for colors.
+    """
+    brdf = _as_argument(brdf)
+    return _sampled(brdf, resolution, _isotropic(brdf), ())
+
+
+def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> tuple[Array, tuple[Array, ...]]:
+    wo = _nodes(resolution, isotropic)
+    result = lobe_em.samples(brdf, wo.reshape(-1, 3))
+    _check(result[0], result[1], wo.reshape(-1, 3), point)
+    return wo, result
+
+
+def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
+    """One table of all parameters; gray ones serve as colored beside those with colors."""
+    size = tuple(map(len, knots))
+    colors = max(len(table[2]) for table in tables)
+
+    def stack(index: int, lead: int) -> Array:
+        every = [jnp.broadcast_to(t[index], (colors, *t[index].shape[1:])) if index > 1 else t[index] for t in tables]
+        whole = jnp.stack(every, lead)
+        return whole.reshape(*whole.shape[:lead], *size, *nodes)
+
+    dtype = tables[0][0].dtype
+    knot = tuple(jnp.asarray(each, dtype) for each in knots)
+    return LobeBrdf(stack(0, 2), stack(1, 1), stack(2, 2), stack(3, 1), knot, jnp.asarray(jnp.nan, dtype))
+
+
+def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
+    """Mean, logarithm of the concentration, weight and diffuse albedo of one BRDF on the nodes `wo` [*q 3]."""
+    nodes, wo = wo.shape[:-1], wo.reshape(-1, 3)
+    sample, mass, fixed, extent = samples
+    gray = jnp.sum(mass, -1)
+    lobe, least = lobe_em.start(wo, sample, gray, lobes=lobes)
+    weight = jnp.sum(gray, 1, keepdims=True) / 2
+    for steps, share in _ROUNDS:
+        lobe, weight = lobe_em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=steps)
+        if share:
+            lobe = lobe_em.blend(wo, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
+    weight = lobe_em.weigh(sample, mass, extent, lobe, fixed, weight)
+    mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
+    weight = weight.reshape(*weight.shape[:2], *nodes)
+    return mean, jnp.log(lobe.concentration).T.reshape(-1, *nodes), weight[:, :-1], weight[:, -1]
+
+
+def _between(place: Float[Array, " v"], size: int) -> tuple[list[Array], list[Array]]:
+    """The two neighbors of a place, and the share of each."""
+    place = jnp.clip(place, 0, size - 1)
+    low = jnp.clip(jnp.floor(place), 0, size - 2)
+    share = place - jax.lax.stop_gradient(low)
+    low = low.astype(jnp.int32)
+    return [low, low + 1], [1 - share, share]
+
+
+def _nodes(resolution: int, isotropic: bool) -> Float[Array, "*q 3"]:
+    """View directions of the nodes; the last ones are drawn in from the horizon, where a BRDF has no value."""
+    if not isotropic:
+        return hemisphere.parabolic_texel_direction(resolution=resolution // 2)
+    radius = np.minimum(np.linspace(0, 1, resolution), 1 - 0.25 / resolution)
+    wo = np.stack([2 * radius, 0 * radius, 1 - radius**2], -1) / (1 + radius**2)[:, None]
+    return jnp.asarray(wo, jnp.result_type(float))
+
+
+def _isotropic(brdf: Callable) -> bool:
+    """Whether turning both directions about the normal changes nothing, at a few hundred random pairs."""
+    height, angle, turn = np.split(np.random.default_rng(0).uniform(size=(5, 256)), [2, 4])
+    height, angle = 0.05 + 0.95 * height, 2 * np.pi * angle
+    value = []
+    for shift in (0, 2 * np.pi * turn):
+        radius = np.sqrt(1 - height**2)
+        wi, wo = np.stack([radius * np.cos(angle + shift), radius * np.sin(angle + shift), height], -1)
+        value.append(brdf(*(jnp.asarray(each, jnp.result_type(float)) for each in (wi, wo))))
+    return bool(jnp.linalg.norm(value[0] - value[1]) <= 1e-2 * jnp.linalg.norm(value[0]))
+
+
+@jax.jit
+def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
+    """Relative error of a table without parameters under light whose spectrum falls like (l + 1/2)^-2."""
+    random = np.random.default_rng(1).uniform(size=(2, 24))
+    height, angle = 0.05 + 0.95 * random[0], 2 * np.pi * random[1]
+    radius = np.sqrt(1 - height**2)
+    wo = jnp.asarray(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1), table.scale.dtype)
+    scale = np.concatenate([np.full(2 * band + 1, 1 / (band + 0.5)) for band in range(_DEGREE + 1)])
+
+    def one(view):
+        wi, area = hemisphere.arcs(lobe_em.mirror(view), rings=lobe_em.RINGS, sectors=lobe_em.SECTORS)
+        view = jnp.broadcast_to(view, wi.shape)
+        exact = brdf(wi, view) * jnp.maximum(wi[:, 2:], 0)
+        both = jnp.concatenate([table(wi, view) - exact, exact + jnp.zeros_like(table(wi, view))], 1)
+        return (scale[:, None] * (harmonics.evaluate(wi, degree=_DEGREE).T @ (both * area[:, None]))) ** 2
+
+    wrong, whole = jnp.split(jnp.sum(jax.lax.map(one, wo), (0, 1)), 2)
+    return jnp.sqrt(jnp.sum(wrong) / jnp.maximum(jnp.sum(whole), _TINY))
+
+
+def _check(direction: Array, mass: Array, wo: Array, point: tuple) -> None:
+    """Refuses values that are no BRDF's, and says where the first one is."""
+    wrong = np.argwhere(~np.asarray(jnp.isfinite(mass) & (mass >= 0)))
+    if wrong.size:
+        view, sample, _ = wrong[0]
+        at = f" at parameters {tuple(map(float, point))}" if point else ""
+        raise ValueError(
+            f"the BRDF must be finite and not negative{at}, and is not for {len(wrong)} pairs of directions, first for "
+            f"wi = {np.asarray(direction)[view, sample]}, wo = {np.asarray(wo)[view]}"
+        )
+
+
+def _checked(number: int, values: np.ndarray) -> np.ndarray:
+    """Knots of one parameter in float64, or the error."""
+    values = np.asarray(values, np.float64)
+    if values.ndim != 1 or len(values) < 2 or not np.all(np.isfinite(values)) or not np.all(np.diff(values) > 0):
+        raise ValueError(f"knots of parameter {number} must be at least two finite increasing numbers, got {values}")
+    return values
+
+
+def _as_argument(brdf: Callable) -> Callable:
+    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
+    return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
