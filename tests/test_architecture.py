@@ -34,6 +34,7 @@ SIDEWAYS = {
     ("scene", "camera", "mesh"),
     ("scene", "mesh", "mesh_file"),
     ("brdf", "published", "lobe"),
+    ("brdf", "published", "lobe_em"),
     ("sphere", "harmonics", "cubemap"),
     ("sphere", "hemisphere", "directions"),
     ("sphere", "rotation", "harmonics"),

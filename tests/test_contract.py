@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 
 import jaxprt
-from jaxprt import brdf, scene, transport
+from jaxprt import brdf, linalg, relight, scene, transport
 from jaxprt.image import raster
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
@@ -43,6 +43,14 @@ HOST = {
     "transport.blocks": "runs workers and writes files",
     "transport.separable.precompute": "traces rays",
     "transport.direct.precompute": "traces rays",
+    "transport.lobe.precompute": "traces rays",
+    "transport.lobe.compress": "runs through blocks on the host",
+    "transport.lobe.pyramid": "gives bytes",
+    "transport.lobe.scales": "NumPy tables",
+    "transport.lobe.between": "indices, of a NumPy table",
+    "transport.lobe.corners": "indices beside the weights",
+    "relight.lobe.scales": "NumPy tables",
+    "relight.lobe.look": "gives indices beside shares, compiled in steps; relight.lobe.radiance has them all",
     "transport.clustered.cluster": "sorts on the host, where data enters",
     "transport.clustered.precompute": "runs workers and writes files",
     "transport.clustered.compress": "gives half precision, and vectors of either sign: no one dtype, no one answer",
@@ -63,6 +71,9 @@ HOST = {
     "brdf.measured.load_lafortune": "reads a file",
     "brdf.harmonic.tabulate": "checks values, and chooses the quadrature by them",
     "brdf.separable.factor": "checks values, and chooses the number of terms by them",
+    "brdf.lobe.tabulate": "checks values, and chooses the number of lobes by them",
+    "brdf.lobe.sampled": "checks values",
+    "brdf.lobe_em": "the steps of brdf.lobe.tabulate, and tested through it",
     "brdf.published": "checks values",
     "brdf.separable.sample_error": "draws its own directions",
     "brdf.separable.tabulate": "checks values",
@@ -161,6 +172,22 @@ class Draw:
         level = self.integer(256, 6 * size * size, transport.visibility.BLOCK // 2, dtype=jnp.uint8)
         return transport.DirectTransport(level, self.normal(vertices, 3), self.rotation(vertices))
 
+    def pyramid(self, size=8, *, vertices=3):
+        """Visibility at all scales, for ``light`` of the same size."""
+        level = self.integer(256, vertices, transport.lobe.scales(size).total, dtype=jnp.uint8)
+        vector = self.normal((transport.lobe.DEGREE + 1) ** 2, vertices)
+        return transport.LobeTransport(level, vector, self.normal(vertices, 3), self.rotation(vertices), size)
+
+    def lobes(self, lobes=2):
+        """Wide lobes at five nodes of the view angle, all above the horizon."""
+        mean = jnp.moveaxis(self.upper(lobes, 5), -1, 0)
+        weight, diffuse = self.uniform(3, lobes, 5), self.uniform(3, 5)
+        return brdf.LobeBrdf(mean, self.uniform(lobes, 5, low=1, high=3), weight, diffuse, (), self.uniform())
+
+    def mixture(self, lobes=2):
+        """Wide lobes on the sphere."""
+        return linalg.mixture.Mixture(self.uniform(lobes), self.unit(lobes), self.uniform(lobes, low=1, high=9))
+
     def harmonic(self):
         """A BRDF in four harmonics."""
         return brdf.HarmonicBrdf(self.normal(4, 3, 5, 5), (), self.uniform())
@@ -226,6 +253,8 @@ EXAMPLES = {
     "sphere.cubemap.solid_angle": example(nothing, size=3),
     "sphere.cubemap.vector_area": example(nothing, size=3),
     "sphere.cubemap.coordinates": example(lambda draw: call(draw.normal(7, 3))),
+    "sphere.cubemap.project": example(lambda draw: call(draw.normal(7), draw.normal(7), draw.normal(7))),
+    "sphere.cubemap.pad": example(lambda draw: call(draw.normal(6, 3, 3, 2))),
     "sphere.cubemap.lookup": example(lambda draw: call(draw.normal(6, 3, 3, 2), draw.unit(7)), sharpness=2),
     "sphere.hemisphere.disk_coordinates": example(lambda draw: call(draw.upper(5))),
     "sphere.hemisphere.disk_direction": example(lambda draw: call(draw.uniform(5, 2, low=0.2, high=0.8))),
@@ -234,6 +263,7 @@ EXAMPLES = {
     "sphere.hemisphere.parabolic_coordinates": example(lambda draw: call(draw.upper(5))),
     "sphere.hemisphere.parabolic_direction": example(lambda draw: call(draw.uniform(5, 2))),
     "sphere.hemisphere.lookup": example(lambda draw: call(draw.normal(4, 4, 2), draw.uniform(5, 2))),
+    "sphere.hemisphere.arcs": example(lambda draw: call(draw.upper()), rings=3, sectors=4),
     "sphere.hemisphere.texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.parabolic_texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.texel_area": example(nothing, resolution=5),
@@ -267,6 +297,18 @@ EXAMPLES = {
     "linalg.eigen.left_singular": example(
         lambda draw: call(draw.symmetric(12)[:9], metric=jnp.eye(12)), gradient=(), terms=3, steps=12
     ),
+    "linalg.mixture.Mixture": example(lambda draw: call(draw.mixture(), draw.unit(5))),
+    "linalg.mixture.log_density": example(
+        lambda draw: call(draw.unit(5), draw.unit(2), draw.uniform(2, low=0.5, high=9))
+    ),
+    "linalg.mixture.log_peak": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
+    "linalg.mixture.drop": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
+    "linalg.mixture.concentration_of": example(lambda draw: call(draw.uniform(5))),
+    "linalg.mixture.fit": example(
+        lambda draw: call(draw.unit(9), draw.uniform(9), draw.mixture(), extent=draw.uniform(9, low=0.01, high=0.02)),
+        steps=3,
+    ),
+    "linalg.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
     "brdf.models.Lambert": example(
@@ -330,6 +372,12 @@ EXAMPLES = {
     # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
     "brdf.separable.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
     "brdf.harmonic.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
+    "brdf.lobe.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
+    "brdf.lobe.Remainder": example(
+        lambda draw: call(
+            brdf.lobe.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
+        ),
+    ),
     "brdf.harmonic.project": example(
         lambda draw: call(brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5)),
         degree=2,
@@ -394,6 +442,18 @@ EXAMPLES = {
         ),
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "excess", "eye"),
+    ),
+    "relight.lobe.prefilter": example(lambda draw: call(draw.light(8))),
+    "relight.lobe.combine": example(
+        lambda draw: call(
+            relight.lobe.prefilter(draw.light(8)),
+            relight.lobe.look(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
+        )
+    ),
+    "relight.lobe.radiance": example(
+        lambda draw: call(each := draw.pyramid(), draw.lobes(), draw.light(8), eye=draw.above(each)),
+        # Frames have derivatives along rotations only; see sphere.rotation.
+        gradient=("brdf", "light", "eye"),
     ),
     "relight.harmonic.project": example(lambda draw: call(draw.light()), degree=2),
     "relight.harmonic.radiance": example(

@@ -1,5 +1,5 @@
 """Factorizations; they know no BRDF and no mesh."""
 
-from jaxprt.linalg import eigen
+from jaxprt.linalg import eigen, mixture
 
-__all__ = ["eigen"]
+__all__ = ["eigen", "mixture"]

@@ -45,8 +45,8 @@ class Fit(eqx.Module):
 
     lobe: Mixture
     fixed: Float[Array, " m"]
-    likelihood: Float[Array, " s+1"]
-    residual: Float[Array, " s"]
+    likelihood: Float[Array, " _"]
+    residual: Float[Array, " _"]
 
 
 @jax.jit
@@ -177,7 +177,7 @@ def fit(
 @partial(jax.jit, static_argnames=("steps",))
 def weigh(
     density: Float[Array, "s m"], mass: Float[Array, " s"], weight: Float[Array, " m"], *, steps: int = 50
-) -> tuple[Float[Array, " m"], Float[Array, " s+1"]]:
+) -> tuple[Float[Array, " m"], Float[Array, " _"]]:
     """Weights of fixed densities, fitted to samples with mass.
 
     Args:

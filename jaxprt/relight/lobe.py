@@ -103,7 +103,7 @@ def prefilter(light: Environment) -> LobeLight:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
         )
-    return _prefilter(light, _blurs(light.radiance.shape[1]))
+    return _prefilter(light, _blurs(light.radiance.shape[1], light.radiance.dtype))
 
 
 def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) -> LobeView:
@@ -211,7 +211,7 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLigh
                 return total + source[:, item[0]] * item[1], None
 
             start = jnp.zeros((colors, index.shape[1]), source.dtype)
-            value, _ = jax.lax.scan(add, start, (index, weight.astype(source.dtype)))
+            value, _ = jax.lax.scan(add, start, (index, weight))
         levels.append(cubemap.pad(value.T.reshape(6, edge, edge, colors)).reshape(-1, colors).T)
     coefficient = harmonics.project(light.radiance, degree=DEGREE)
     return LobeLight(jnp.concatenate(levels, 1), coefficient, size)
@@ -225,9 +225,14 @@ def _edge(width: float, size: int, *, least: int) -> int:
     return edge
 
 
-@lru_cache(maxsize=4)
-def _blurs(size: int) -> list[tuple[Array, Array]]:
+def _blurs(size: int, dtype) -> list[tuple[Array, Array]]:
     """For each width the texels that make one of its texels, and their weights; [kept, texels]."""
+    with jax.ensure_compile_time_eval():  # What a trace made could not be kept.
+        return _made_blurs(size, str(dtype))
+
+
+@lru_cache(maxsize=4)
+def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
     scale = scales(size)
     result = []
     for edge, spread in zip(scale.edge.tolist()[1:], scale.spread.tolist()[1:], strict=True):
@@ -247,5 +252,5 @@ def _blurs(size: int) -> list[tuple[Array, Array]]:
         away = np.sum((center[index] - place[:, None]) ** 2, -1) / 2
         weight = known * area[index] * np.exp(-concentration * away)
         weight /= weight.sum(1, keepdims=True)
-        result.append((jnp.asarray(index.T), jnp.asarray(weight.T.astype(np.float32))))
+        result.append((jnp.asarray(index.T), jnp.asarray(weight.T, dtype)))
     return result
