@@ -155,10 +155,10 @@ def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:
 
 @lru_cache(maxsize=8)
 def scales(size: int) -> Scales:
-    """Scales of visibility pyramids: from single texels to a half of a face."""
+    """Scales of visibility pyramids: from single texels to whole faces."""
     if size < 8 or size & (size - 1):
         raise ValueError(f"size must be a power of two, at least 8, got {size}")
-    edge = np.array([size >> k for k in range(size.bit_length() - 1)], np.int32)
+    edge = np.array([size >> k for k in range(size.bit_length())], np.int32)
     # A texel's box and the bilinear tent have a variance of a quarter of its solid angle along either axis.
     spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 4
     count = 6 * (edge[_BITS:] + 2) ** 2
@@ -243,8 +243,8 @@ def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     for edge in scale.edge.tolist()[_BITS:]:
         fold = size // edge
         mean, whole = (jnp.sum(x.reshape(-1, 6, edge, fold, edge, fold), (3, 5)) for x in (value, area[None]))
-        rim = jnp.asarray(cubemap.border_index(size=edge))
-        parts.append(jnp.round(255 * (mean / whole).reshape(count, -1)[:, rim.reshape(-1)]).astype(jnp.uint8))
+        faces = jnp.moveaxis(cubemap.pad(jnp.moveaxis(mean / whole, 0, -1)), -1, 0)
+        parts.append(jnp.round(255 * faces.reshape(count, -1)).astype(jnp.uint8))
     return jnp.concatenate(parts, 1)
 
 
