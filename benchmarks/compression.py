@@ -4,8 +4,9 @@
 
 The bunny with Ashikhmin-Shirley (10, 100) on a diffuse ground (from JAXPRT_DATA; a sphere on its ground where that is
 not set, and with --quick), under each light and from every view against the sum over all texels. A configuration is the
-number of terms, vectors, modes and coefficients of the clustered transport, and of texels summed one by one; the
-published configuration, four sparse terms with 96 coefficients, stands beside. One line for each light: `seconds` is a
+number of terms, vectors, modes and coefficients of the clustered transport, and of texels summed one by one; or a
+number of lobes, the ground's light then by spherical harmonics; the published configuration, four sparse terms with 96
+coefficients, stands beside. One line for each light: `seconds` is a
 light change (environment to radiance of all vertices), `view_seconds` a view change. The peer is the other way to make
 the picture anew: a light change by the published configuration.
 """
@@ -21,12 +22,14 @@ import numpy as np
 
 from benchmarks import harness
 from jaxprt.brdf import AshikhminShirley, Lambert, published, separable
+from jaxprt.brdf import lobe as lobes
 from jaxprt.relight import direct as texels
-from jaxprt.relight import reference
+from jaxprt.relight import lobe, reference
 from jaxprt.relight.separable import combine, light_tuple, view_tuple
 from jaxprt.scene import Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
 from jaxprt.transport import ClusteredTransport, DirectTransport, clustered, direct
+from jaxprt.transport import lobe as pyramids
 from jaxprt.transport import separable as transports
 
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
@@ -44,6 +47,7 @@ FRONT = [
     (128, 48, 256, 1536, 64),
 ]
 RESOLUTION = 96  # of the BRDF's maps: 48 or 64 cost more error than half of 128 terms
+LOBES = [(4, 16), (8, 16), (16, 16), (16, 64)]  # lobes, texels
 CLUSTERS = 160
 GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
 
@@ -102,6 +106,7 @@ def measure(quick: bool, store: pathlib.Path | None):
         name = f"{terms} terms, {vectors} vectors, {modes} modes, {keep} coefficients, {sun} texels"
         stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in visible)
         yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
+    yield from measure_lobes(visible, exact, lights, views, rays, repeats, peer, quick)
 
 
 def scene(quick: bool) -> tuple[Mesh, Mesh, list[Environment]]:
@@ -206,6 +211,62 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
         }
 
 
+def measure_lobes(visible, exact, lights, views, rays, repeats, peer, quick: bool):
+    """Lines of lobes, for the glossy object and for the ground."""
+    start = time.perf_counter()
+    seen = [pyramids.compress(each) for each in visible]
+    seconds = rays + time.perf_counter() - start
+    stored = sum(each.nbytes for each in seen)
+    names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
+    plain = lobes.tabulate(GROUND, lobes=1, resolution=8)
+    for count, sun in [(3, 4)] if quick else LOBES:
+        start = time.perf_counter()
+        tables = [lobes.tabulate(BRDF, lobes=count, resolution=12 if quick else 32), plain]
+        fitted = time.perf_counter() - start
+        parts = list(zip(seen, tables, (BRDF, GROUND), strict=True))
+        for number, light in enumerate(lights):
+            texel, excess, rest = texels.split(light, count=sun)
+            blurred = lobe.prefilter(rest)
+
+            def turn(eye=views[0], blurred=blurred, texel=texel, excess=excess, parts=parts):
+                eye = jnp.asarray(eye)
+                return [
+                    lobe.combine(blurred, lobe.look(each, table, eye=eye))
+                    + texels.radiance(each, brdf, texel, excess, eye=eye)
+                    for each, table, brdf in parts
+                ]
+
+            wrong = whole = 0.0
+            for place, each in enumerate(views):
+                for at, now in enumerate(turn(eye=each)):
+                    wrong += np.sum((np.asarray(now) - exact[at][number, place]) ** 2, dtype=np.float64)
+                    whole += np.sum(exact[at][number, place] ** 2, dtype=np.float64)
+            eye = jnp.asarray(views[0])
+            view = [lobe.look(each, table, eye=eye) for each, table, _ in parts]
+
+            def lighten(light=light, view=view, eye=eye, parts=parts, sun=sun):
+                texel, excess, rest = texels.split(light, count=sun)
+                blurred = lobe.prefilter(rest)
+                return [
+                    lobe.combine(blurred, look) + texels.radiance(each, brdf, texel, excess, eye=eye)
+                    for look, (each, _, brdf) in zip(view, parts, strict=True)
+                ]
+
+            timing, other = harness.compare(lighten, peer[number], repeats=repeats)
+            name = f"{count} lobes, {sun} texels, {names[number]}"
+            yield {
+                **{"benchmark": "compression", "case": name, "light": names[number], "lobes": count},
+                **timing.line(),
+                "view_seconds": harness.measure(turn, repeats=repeats).seconds,
+                "error": float(np.sqrt(wrong / whole)),
+                "bytes": stored,
+                "bytes_per_vertex": stored / sum(len(each.position) for each in seen),
+                "precompute_seconds": seconds,
+                "fit_seconds": fitted,
+                **{"peer": "published", "peer_seconds": other.seconds, "peer_error": 1.0},
+            }
+
+
 def measure_published(glossy, whole, exact, lights, views, quick: bool):
     """The published configuration: its lines, and for each light the change that others are timed against."""
     count = len(glossy.position)
@@ -265,7 +326,8 @@ def plot(lines: list[dict], path: pathlib.Path) -> None:
     for panel, light in zip(axes[0], names, strict=True):
         row = [line for line in lines if line["light"] == light]
         for label, chosen in (
-            ("clustered, texels apart", [x for x in row if "peer" in x]),
+            ("clustered, texels apart", [x for x in row if "peer" in x and "lobes" not in x]),
+            ("lobes, texels apart", [x for x in row if "lobes" in x]),
             ("published: 4 terms of 96", [x for x in row if "peer" not in x]),
         ):
             panel.loglog([1e3 * x["seconds"] for x in chosen], [x["error"] for x in chosen], "o-", label=label)

@@ -1,0 +1,103 @@
+"""How well lobes light each material: error by number of lobes and roughness, and what a frame and a fit cost.
+
+    python -m benchmarks.lobes [--quick] [--output FILE]
+
+Random vertices of the bunny on its ground (from JAXPRT_DATA; a sphere where that is not set, and with --quick) from
+twenty views, under each light, against the sum over all texels; views within three degrees of the surface are left
+out, where the lobe of a smooth material falls between the centers of texels and that sum is no yardstick. Sixteen
+texels are summed exactly. `specular` is Cook-Torrance's model without a diffuse part, so that nothing hides the error.
+`seconds` is a frame in which light, view and BRDF are all new, on all the vertices taken. `unoccluded` is the error of
+the table itself, without shadows; `terms_error` that of sixteen separable terms with exact visibility and all texels.
+"""
+
+import time
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import compression, harness
+from jaxprt.brdf import AshikhminShirley, CookTorrance, separable
+from jaxprt.brdf import lobe as lobes
+from jaxprt.relight import direct as texels
+from jaxprt.relight import lobe, reference
+from jaxprt.scene import Environment
+from jaxprt.scene.mesh import join
+from jaxprt.sphere import directions
+from jaxprt.transport import direct
+from jaxprt.transport import lobe as pyramids
+
+SUN = 16
+GRAZING = 0.05
+MATERIALS = {
+    **{
+        f"specular m = {m}": CookTorrance(diffuse=0.0, specular=0.5, roughness=m, f0=0.3)
+        for m in (0.05, 0.1, 0.2, 0.35, 0.5)
+    },
+    "Ashikhmin-Shirley (10, 100)": AshikhminShirley(),
+}
+COUNTS = (4, 8, 12, 16)
+
+
+def main() -> None:
+    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args()
+    for line in measure(arguments.quick):
+        harness.report(line, arguments.output)
+
+
+def measure(quick: bool):
+    """Lines of all materials, numbers of lobes and lights."""
+    glossy, ground, lights = compression.scene(quick)
+    vertex = np.random.default_rng(0).permutation(len(glossy.position))[: 60 if quick else 1000]
+    size = lights[0].radiance.shape[-2]
+    visible = direct.precompute(join([glossy, ground]), size=size, vertex=np.sort(vertex), progress=False)
+    transport = pyramids.compress(visible)
+    seen = jnp.asarray(visible.seen(np.arange(len(vertex))))
+    views = jnp.asarray(compression.eyes(glossy, 2 if quick else 20))
+    names = list(compression.LIGHTS) if len(lights) == 3 else ["daylight", "studio"]
+    batch = Environment(jnp.stack([light.radiance for light in lights]))
+    for material, brdf in list(MATERIALS.items())[2:4] if quick else MATERIALS.items():
+        exact = radiance(brdf, seen, visible, batch, views)
+        factored = separable.factor(brdf, terms=16, resolution=24 if quick else 64)
+        peer = radiance(factored, seen, visible, batch, views)
+        for count in (3,) if quick else COUNTS:
+            start = time.perf_counter()
+            table = lobes.tabulate(brdf, lobes=count, resolution=12 if quick else 32)
+            fitted = time.perf_counter() - start
+            for number, (name, light) in enumerate(zip(names, lights, strict=True)):
+
+                def frame(eye=views[0], table=table, light=light, brdf=brdf):
+                    texel, excess, rest = texels.split(light, count=SUN)
+                    color = lobe.radiance(transport, table, rest, eye=eye)
+                    return color + texels.radiance(transport, brdf, texel, excess, eye=eye)
+
+                color = np.stack([frame(eye) for eye in views])
+                known = np.stack([height(visible, eye) > GRAZING for eye in views])
+                wrong, other = (error(x, exact[number], known) for x in (color, peer[number]))
+                yield {
+                    **{"benchmark": "lobes", "case": f"{material}, {count} lobes, {name}"},
+                    **harness.measure(frame, repeats=3 if quick else 7).line(),
+                    **{"error": wrong, "bytes": transport.nbytes, "unoccluded": float(table.error)},
+                    **{"fit_seconds": fitted, "table_bytes": table.nbytes},
+                    **{"terms_error": other},
+                }
+
+
+def radiance(brdf, seen, visible, batch, views) -> np.ndarray:
+    """Radiance [light, view, vertex, color] by summing all texels."""
+    each = [reference.integrate(seen, visible.position, visible.frame, brdf, batch, eye) for eye in views]
+    return np.stack(each, 1)
+
+
+def height(visible, eye) -> np.ndarray:
+    """Cosine of each vertex's view."""
+    wo = directions.normalize(eye - visible.position)
+    return np.asarray(jnp.sum(wo * visible.frame[:, 2], -1))
+
+
+def error(value: np.ndarray, exact: np.ndarray, known: np.ndarray) -> float:
+    """Relative L2 error where it is known."""
+    return float(np.linalg.norm((value - exact)[known]) / np.linalg.norm(exact[known]))
+
+
+if __name__ == "__main__":
+    main()
