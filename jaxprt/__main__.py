@@ -30,6 +30,7 @@ _UPRIGHT = {
 _RANGES = (
     (("size", "terms", "keep", "table"), "at least 1", lambda x: x >= 1),
     (("order",), "from 1 to 15", lambda x: 1 <= x <= 15),
+    (("lobes",), "from 1 to 64", lambda x: 1 <= x <= 64),
     (("nu", "nv"), "positive and finite", lambda x: 0 < x < np.inf),
     (("diffuse", "specular"), "not negative and finite", lambda x: 0 <= x < np.inf),
     (("elevation",), "from -90 to 90 degrees", lambda x: abs(x) <= 90),
@@ -62,9 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--specular", type=float, nargs="+", default=[0.75], help="gray or three colors (default 0.75)")
     parser.add_argument("--nu", type=float, default=10.0, help="exponent along the tangent (default 10)")
     parser.add_argument("--nv", type=float, default=100.0, help="exponent across it (default 100)")
-    parser.add_argument(
-        "--system", choices=["separable", "harmonic"], nargs="+", help="separable, or harmonic, or both"
-    )
+    parser.add_argument("--system", choices=["separable", "harmonic", "lobe"], nargs="+", help="one, or several")
     parser.add_argument("--terms", type=int, default=4, help="terms of the factored BRDF (default 4)")
     parser.add_argument("--keep", type=int, default=96, help="wavelet coefficients per vertex and term (default 96)")
     parser.add_argument(
@@ -72,6 +71,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--window", choices=list(report.WINDOWS), default="laplacian", help="against ringing on what is glossy"
+    )
+    parser.add_argument(
+        "--lobes", type=int, default=12, help="lobes of the glossy BRDF in the lobe system (default 12)"
     )
     parser.add_argument("--ground", action="store_true", help="stand the mesh on a diffuse ground plane")
     parser.add_argument("--size", type=int, default=512, help="edge of the pictures in pixels (default 512)")
@@ -107,8 +109,10 @@ def _run(options: argparse.Namespace) -> None:
     for system in systems:
         if system == "separable":
             ready[system] = report.relight_separable(scene, options.output, keep=options.keep)
-        else:
+        elif system == "harmonic":
             ready[system] = report.relight_harmonic(scene, options.output, order=options.order, window=options.window)
+        else:
+            ready[system] = report.relight_lobe(scene, options.output, lobes=options.lobes)
     told["precompute"] = {system: each.told for system, each in ready.items()}
     start, seen = time.perf_counter(), report.seen(scene)
     exact = report.exact(scene, seen)
@@ -121,7 +125,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.table:
         vertex = report.sample(scene, options.table)
         truth = report.exact(scene, [vertex])[0]
-        tables = {"separable": report.table_separable, "harmonic": report.table_harmonic}
+        tables = {"separable": report.table_separable, "harmonic": report.table_harmonic, "lobe": report.table_lobe}
         told["table"] = [row for system in systems for row in tables[system](scene, vertex, truth)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     told["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB

@@ -20,6 +20,9 @@ from jaxprt.sphere import harmonics
 TABLE_TERMS = (1, 4, 16, 64)
 TABLE_KEEP = (32, 96, 256)
 TABLE_ORDERS = (3, 5, 7, 10)
+TABLE_LOBES = (4, 12, 24)
+TABLE_TEXELS = (0, 16, 64)
+_TEXELS = 16  # the brightest of the light, which the lobe system sums one by one
 _LAPLACIAN = 0.4  # share that the window "laplacian" leaves: a tenth of the negative pixels, for a tenth more error
 WINDOWS: dict[str, Callable[[Array], Array]] = {
     "none": lambda light: jnp.ones(harmonics.degree_of(len(light)) + 1),
@@ -62,9 +65,9 @@ class Relit(NamedTuple):
         told: What it took, for the report.
     """
 
-    light: Callable[[Environment], list[Array]]
-    view: Callable[[], list[Array]]
-    combine: Callable[[Array, Array], Array]
+    light: Callable[[Environment], list]
+    view: Callable[[], list]
+    combine: Callable[[Any, Any], Array]
     told: dict[str, Any]
 
     def color(self, light: Environment) -> list[Array]:
@@ -140,6 +143,63 @@ def harmonic_light(light: Environment, *, order: int, window: str) -> Array:
     """Windowed coefficients of a light."""
     coefficient = relight.harmonic.project(light, degree=order - 1)
     return harmonics.convolve(coefficient, WINDOWS[window](coefficient))
+
+
+def relight_lobe(whole: Scene, output: Path, *, lobes: int) -> Relit:
+    """Makes a scene ready for the lobe system, the brightest texels summed exactly; its transport fits any BRDF."""
+    tables, ready, told = [], [], {}
+    for part in whole.parts:
+        start = timeit.default_timer()
+        tables.append(_lobes(part.brdf, lobes))
+        middle = timeit.default_timer()
+        options = {"occluder": whole.mesh, "path": _store(output, part, "_lobe")}
+        ready.append(_kept(transport.lobe.precompute, part.mesh, **options))
+        told[part.name] = {
+            "lobes": 0 if isinstance(part.brdf, Lambert) else lobes,
+            "exact_texels": _TEXELS,
+            "table_seconds": middle - start,
+            "table_error": float(tables[-1].error),
+            "table_bytes": tables[-1].nbytes,
+            **_took(middle, ready[-1]),
+        }
+    eye = whole.camera.eye
+    return Relit(
+        lambda light: [_lobe_light(light, _TEXELS)] * len(ready),
+        lambda: [
+            _lobe_view(each, table, part.brdf, eye)
+            for each, table, part in zip(ready, tables, whole.parts, strict=True)
+        ],
+        _lobe_combine,
+        told,
+    )
+
+
+def _lobes(model: Callable, lobes: int) -> brdf.lobe.LobeBrdf:
+    """Lobes of a BRDF; what is diffuse needs none, but one without weight beside the diffuse part."""
+    if not isinstance(model, Lambert):
+        return brdf.lobe.tabulate(model, lobes=lobes)
+    albedo = jnp.asarray(model.albedo)[:, None]
+    none = jnp.zeros((1, 2), albedo.dtype)
+    up = jnp.stack([none, none, none + 1])
+    return brdf.lobe.LobeBrdf(up, none, 0 * albedo[..., None] + none, albedo + none, (), jnp.zeros((), albedo.dtype))
+
+
+def _lobe_light(light: Environment, texels: int) -> tuple:
+    """A light blurred but for some texels, and those."""
+    if not texels:
+        return (relight.lobe.prefilter(light),)
+    texel, excess, rest = relight.direct.split(light, count=texels)
+    return relight.lobe.prefilter(rest), texel, excess
+
+
+def _lobe_view(ready: transport.LobeTransport, table: brdf.lobe.LobeBrdf, model: Callable, eye: Array) -> tuple:
+    return relight.lobe.look(ready, table, eye=eye), ready, model, eye
+
+
+def _lobe_combine(light: tuple, view: tuple) -> Array:
+    (blurred, *bright), (look, ready, model, eye) = light, view
+    color = relight.lobe.combine(blurred, look)
+    return color + relight.direct.radiance(ready, model, *bright, eye=eye) if bright else color
 
 
 def _store(output: Path, part: Part, suffix: str) -> Path:
@@ -239,12 +299,14 @@ def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -
 def times(whole: Scene, ready: Relit) -> dict[str, float]:
     """Median seconds of what a frame needs."""
     light = next(iter(whole.lights.values()))
-    sides, color, mesh = ready.light(light), jnp.concatenate(ready.color(light)), whole.mesh
+    lit, seen, color, mesh = ready.light(light), ready.view(), jnp.concatenate(ready.color(light)), whole.mesh
+
+    def combined(lights, views):
+        return [ready.combine(*each) for each in zip(lights, views, strict=True)]
+
     return {
-        "light_change_seconds": _median(lambda: ready.light(light)),
-        "view_change_seconds": _median(
-            lambda: [ready.combine(*each) for each in zip(sides, ready.view(), strict=True)]
-        ),
+        "light_change_seconds": _median(lambda: combined(ready.light(light), seen)),
+        "view_change_seconds": _median(lambda: combined(lit, ready.view())),
         "render_seconds": _median(lambda: image.render(mesh, color, whole.camera, background=None)),
     }
 
@@ -298,6 +360,24 @@ def table_harmonic(whole: Scene, vertex: np.ndarray, truth: np.ndarray) -> list[
         for number, (name, each) in enumerate(whole.lights.items()):
             light = harmonic_light(each, order=order, window=window)
             mine = relight.harmonic.radiance(short, few, light, eye=eye)
+            row[f"error {name}"] = float(image.relative_l2(mine, truth[number]))
+        rows.append(row)
+    return rows
+
+
+def table_lobe(whole: Scene, vertex: np.ndarray, truth: np.ndarray) -> list[dict[str, Any]]:
+    """Error against lobes and exact texels on some vertices of the first part."""
+    part, eye = whole.parts[0], whole.camera.eye
+    full = transport.lobe.precompute(part.mesh, occluder=whole.mesh, vertex=vertex)
+    views = {lobes: _lobe_view(full, _lobes(part.brdf, lobes), part.brdf, eye) for lobes in TABLE_LOBES}
+    rows = []
+    for (lobes, view), texels in itertools.product(views.items(), TABLE_TEXELS):
+        light = next(iter(whole.lights.values()))
+        seconds = _median(lambda e=light, v=view, t=texels: _lobe_combine(_lobe_light(e, t), v))
+        row = {"system": "lobe", "lobes": lobes, "exact_texels": texels}
+        row |= _cost(full.nbytes, seconds, len(vertex))
+        for number, (name, each) in enumerate(whole.lights.items()):
+            mine = _lobe_combine(_lobe_light(each, texels), view)
             row[f"error {name}"] = float(image.relative_l2(mine, truth[number]))
         rows.append(row)
     return rows

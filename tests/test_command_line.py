@@ -26,7 +26,7 @@ f 2 4 3
 """
 
 
-SYSTEMS = ("separable", "harmonic")
+SYSTEMS = ("separable", "harmonic", "lobe")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,6 +40,8 @@ def small():
             (prt.transport.harmonic, "precompute", {"size": 8}),
             (prt.transport.harmonic, "precompute_diffuse", {"size": 8}),
             (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1.0}),
+            (prt.transport.lobe, "precompute", {"size": 8}),
+            (prt.brdf.lobe, "tabulate", {"resolution": 8}),
             (prt.scene.mesh, "ground_plane", {"vertices": 49}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
@@ -92,7 +94,7 @@ def report(output):
 
 @pytest.fixture(scope="module")
 def output(place):
-    """What one whole run leaves: two lights, a coarse ground, both systems."""
+    """What one whole run leaves: two lights, a coarse ground, all systems."""
     folder = place / "deep" / "whole"
     options = ["--ground", "--azimuth", "-30", "--system", *SYSTEMS]
     assert run(place, *options, sky=("sky.exr", "dusk.exr"), output=folder) == 0
@@ -103,7 +105,7 @@ def test_pictures_and_report_are_written(output):
     kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
     names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
     expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
-    stores = {f"{part}{order}.prt" for part in ("object", "ground") for order in ("", "_order_5")}
+    stores = {f"{part}{suffix}.prt" for part in ("object", "ground") for suffix in ("", "_order_5", "_lobe")}
     assert {path.name for path in output.iterdir()} == expected | stores | {"report.json"}
     for name in expected:
         assert (output / name).stat().st_size > 50
@@ -128,6 +130,8 @@ def test_the_report_is_json_of_finite_numbers(output):
             assert set(light[system]["vertex_error"]) == {"object", "ground"}
     assert told["precompute"]["separable"]["object"]["keep"] == 8
     assert told["precompute"]["harmonic"]["object"]["coefficients"] == 25
+    assert told["precompute"]["lobe"]["object"]["lobes"] == 0  # it is diffuse
+    assert told["precompute"]["lobe"]["object"]["exact_texels"] == 16
     assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("object", "ground")}
     assert min(numbers(told["times"])) > 0
     assert told["peak_bytes"] > 1e7
@@ -152,27 +156,31 @@ def test_the_pictures_differ_by_what_the_report_says(output):
     np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
 
 
-def test_a_second_run_takes_the_transport_from_the_first(place, tmp_path, capsys):
+@pytest.mark.parametrize("system", ["separable", "lobe"])
+def test_a_second_run_takes_the_transport_from_the_first(place, tmp_path, capsys, system):
     for _ in range(2):
-        assert run(place, output=tmp_path) == 0
+        assert run(place, "--system", system, output=tmp_path) == 0
     told = capsys.readouterr()
     assert "pictures and report.json are in" in told.out
     assert "error" not in told.err.lower()
-    assert report(tmp_path)["lights"]["sky"]["separable"]["image_error"] < 0.5
+    assert report(tmp_path)["lights"]["sky"][system]["image_error"] < 0.5
 
 
 def test_glossy_brdfs_and_the_error_table(place, tmp_path, monkeypatch):
-    for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("ORDERS", (2, 4))):
+    for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("ORDERS", (2, 4)), ("LOBES", (2,))):
         monkeypatch.setattr(f"jaxprt.report.TABLE_{name}", values)
     options = ["--table", "3", "--terms", "2", "--diffuse", "0.2", "0.3", "0.4", "--specular", "0.1", "--nu", "10"]
-    options += ["--system", *SYSTEMS, "--order", "3", "--window", "hann", "--brdf", "ashikhmin-shirley"]
+    options += ["--system", *SYSTEMS, "--order", "3", "--window", "hann", "--lobes", "2"]
+    options += ["--brdf", "ashikhmin-shirley"]
     assert run(place, *options, output=tmp_path) == 0
     table = report(tmp_path)["table"]
-    separable, harmonic = ([row for row in table if row["system"] == system] for system in SYSTEMS)
+    separable, harmonic, lobe = ([row for row in table if row["system"] == system] for system in SYSTEMS)
     assert {(row["terms"], row["keep"]) for row in separable} == {(t, k) for t in (1, 4) for k in (32, 96)}
     assert {row["coefficients"] for row in harmonic} == {4, 16}
+    assert [(row["lobes"], row["exact_texels"]) for row in lobe] == [(2, 0), (2, 16), (2, 64)]
     assert all(0 < row["error sky"] < 2 for row in table)
-    assert report(tmp_path)["precompute"]["harmonic"]["object"]["coefficients"] == 9
+    made = report(tmp_path)["precompute"]
+    assert (made["harmonic"]["object"]["coefficients"], made["lobe"]["object"]["lobes"]) == (9, 2)
 
 
 # The command prints warnings itself; here they would be errors before they reach it.
@@ -216,6 +224,8 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--diffuse=-1"], "--diffuse must be not negative and finite, got -1"),
         (["--specular", "0.1", "0.2", "-0.5"], "--specular must be not negative and finite, got -0.5"),
         (["--order", "0"], "--order must be from 1 to 15, got 0"),
+        (["--lobes", "0"], "--lobes must be from 1 to 64, got 0"),
+        (["--lobes", "65"], "--lobes must be from 1 to 64, got 65"),
         (["--nu", "-5"], "--nu must be positive and finite, got -5"),
         (["--nv", "inf"], "--nv must be positive and finite, got inf"),
         (["--elevation", "95"], "--elevation must be from -90 to 90 degrees, got 95"),
