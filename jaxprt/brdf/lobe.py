@@ -110,7 +110,9 @@ class LobeBrdf(eqx.Module):
         if self.knot:
             raise ValueError(f"the table has {len(self.knot)} parameters, which `at` must choose first")
         resolution = self.scale.shape[-1]
-        level = jnp.sqrt(jnp.maximum(wo[:, 0] ** 2 + wo[:, 1] ** 2, _TINY))
+        square = wo[:, 0] ** 2 + wo[:, 1] ** 2
+        pole = square < _TINY
+        level = jnp.sqrt(jnp.where(pole, _TINY, square))
         if self.isotropic:
             place, weight = _between(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), resolution)
         else:
@@ -126,13 +128,13 @@ class LobeBrdf(eqx.Module):
             jnp.concatenate(rows),
         )
         mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
-        x, y, z = mean.reshape(3, -1, len(wo))
+        x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
-            cosine, sine = wo[:, 0] / level, wo[:, 1] / level
+            cosine, sine = jnp.where(pole, 1, wo[:, 0] / level), jnp.where(pole, 0, wo[:, 1] / level)
             x, y = cosine * x - sine * y, sine * x + cosine * y
         length = jnp.sqrt(jnp.maximum(x**2 + y**2 + z**2, _TINY))
         up = jnp.where(wo[:, 2] > 0, jnp.ones_like(level), 0)
-        strength = strength.reshape(len(self.weight), -1, len(wo))
+        strength = strength.reshape(len(self.weight), self.lobes, len(wo))
         return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
@@ -142,7 +144,7 @@ class LobeBrdf(eqx.Module):
         away = sum((wi[:, i] - lobe.mean[i]) ** 2 for i in range(3)) / 2
         density = jnp.exp(mixture.log_peak(lobe.concentration) - lobe.concentration * away)
         value = jnp.sum(lobe.weight * density, 1) + lobe.diffuse * wi[:, 2] / np.pi
-        return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, -1)
+        return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, len(self.weight))
 
 
 class Remainder(eqx.Module):

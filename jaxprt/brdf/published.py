@@ -148,7 +148,9 @@ def _texels(resolution: int, coordinates: Callable) -> tuple[Array, Array]:
     return direction(resolution=resolution).reshape(-1, 3), area(resolution=resolution).ravel()
 
 
-def mirror_lobes(brdf: Callable, *, angles: tuple[float, ...] = (0, 7, 14, 21), resolution: int = 32) -> lobe.LobeBrdf:
+def mirror_lobes(
+    brdf: Callable, *, angles: tuple[int | float, ...] = (0, 7, 14, 21), resolution: int = 32
+) -> lobe.LobeBrdf:
     """Separates lobes around the mirror direction, of fixed widths, from a BRDF times cosine.
 
     A lobe of k degrees is a Gaussian of which three standard deviations cover k degrees, and 0 degrees the perfect

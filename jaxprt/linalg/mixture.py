@@ -24,9 +24,9 @@ class Mixture(eqx.Module):
         concentration: Of each lobe, above 0; for a sharp lobe the inverse square of its width in radians.
     """
 
-    weight: Float[Array, " l"]
-    mean: Float[Array, "l 3"]
-    concentration: Float[Array, " l"]
+    weight: Float[Array, "*v l"]
+    mean: Float[Array, "*v l 3"]
+    concentration: Float[Array, "*v l"]
 
     def __call__(self, direction: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
         """Mass per steradian at some directions."""
@@ -73,7 +73,7 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     small = concentration < 1e-2  # There the two terms of coth k - 1/k cancel.
     safe = jnp.where(small, 1, concentration)
     far = 1 / safe - 2 * jnp.exp(-2 * safe) / -jnp.expm1(-2 * safe)
-    return jnp.where(small, 1 - concentration / 3, far)
+    return jnp.where(small, 1 - concentration / 3 + concentration**3 / 45, far)
 
 
 @jax.jit
@@ -105,7 +105,7 @@ def fit(
     mass: Float[Array, " s"],
     start: Mixture,
     *,
-    extent: Float[Array, " s"] | float = 0.0,
+    extent: Float[Array, " s"] | Float[Array, ""] | float = 0.0,
     fixed: Float[Array, "s m"] | None = None,
     weight: Float[Array, " m"] | None = None,
     least: Float[Array, ""] | float = 1e-3,

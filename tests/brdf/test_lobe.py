@@ -1,0 +1,429 @@
+"""BRDFs as tables of lobes: their errors, energy, frames and parameters, and the published lobes."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, lobe, lobe_em
+from jaxprt.brdf.published import mirror_lobes
+from jaxprt.sphere import hemisphere
+
+RESOLUTION = 8
+ENERGY = 2e-3  # The plane of the horizon cuts a wide lobe by a sum over its samples, in float32.
+BETWEEN = 0.03  # Eight nodes of the view: weights are linear between them.
+EM = 1e-2  # Rounding in another order, through seventy steps that do not converge.
+DIFFERENCE = 2e-2  # Central differences in float32 of what varies over a tenth of a radian.
+
+GLOSSY = CookTorrance(diffuse=0.2, specular=0.5, roughness=0.2)
+COLORED = AshikhminShirley(diffuse=[0.5, 0.2, 0.1], specular=[0.2, 0.4, 0.6], nu=10.0, nv=100.0)
+ROUGHNESS = np.array([0.1, 0.2, 0.4])
+
+
+def directions(*polar):
+    """Unit vectors of (angle to the normal, angle about it)."""
+    theta, phi = np.array(polar).T
+    vector = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    return jnp.asarray(vector, jnp.float32)
+
+
+def upper(seed, count, least=0.0):
+    """Unit vectors at least so high above the horizon."""
+    random = np.random.default_rng(seed)
+    return directions(*np.stack([np.arccos(random.uniform(least, 1, count)), random.uniform(0, 6.28, count)], -1))
+
+
+def nodes(resolution=RESOLUTION):
+    """Views at which an isotropic table is made, but for the one at the horizon."""
+    return directions(*((2 * np.arctan(r), 0.0) for r in np.linspace(0, 1, resolution)[:-1]))
+
+
+@jax.jit
+def energies(brdf, table, view):
+    """Integrals of the BRDF times cosine, and of the table, by a quadrature other than the one of the fit."""
+
+    def one(wo):
+        wi, area = hemisphere.arcs(lobe_em.mirror(wo), rings=80, sectors=128)
+        wo = jnp.broadcast_to(wo, wi.shape)
+        return area @ (brdf(wi, wo) * wi[:, 2:]), area @ table(wi, wo)
+
+    return jax.lax.map(one, view)
+
+
+@jax.jit
+def value(table, wi, wo):
+    return table(wi, wo)
+
+
+@jax.jit
+def outcome(table, vector):
+    """Something smooth of all that a lookup gives, for a vector that need not be a unit one."""
+    wo = vector / jnp.linalg.norm(vector)
+    found = table.lookup(wo[None])
+    along = jnp.tensordot(jnp.array([0.3, -0.5, 0.8]), found.mean, 1)
+    return jnp.sum(found.weight * (2 + along) * jnp.log(found.concentration)) + jnp.sum(found.diffuse)
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """Tables without the error, which costs more than the rest and is tested by itself."""
+
+    @functools.cache
+    def make(name, lobes=2, resolution=RESOLUTION):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)
+            knot = (ROUGHNESS,) if name == "varying" else ()
+            return lobe.tabulate(BRDF[name], lobes=lobes, resolution=resolution, knot=knot)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def told():
+    """Tables with their errors."""
+    return functools.lru_cache(maxsize=None)(lambda **options: lobe.tabulate(GLOSSY, resolution=RESOLUTION, **options))
+
+
+def gold(wi, wo):
+    return GLOSSY(wi, wo) * jnp.array([1.0, 0.6, 0.2])
+
+
+BRDF = {
+    "glossy": GLOSSY,
+    "anisotropic": COLORED,
+    "matte": Lambert(0.5),
+    "gold": gold,
+    "bright": CookTorrance(diffuse=20.0, specular=50.0, roughness=0.2),
+    "plain": lambda wi, wo: GLOSSY(wi, wo),
+    "varying": lambda roughness: CookTorrance(diffuse=0.2, specular=0.5, roughness=roughness),
+    **{f"rough {r}": CookTorrance(diffuse=0.2, specular=0.5, roughness=r) for r in ROUGHNESS},
+}
+
+
+def test_errors_are_small_and_fall_with_the_lobes(told):
+    error = [float(told(**options).error) for options in ({"error": 0.05}, {"lobes": 4})]
+    assert 0 < error[1] < 0.8 * error[0] < 0.8 * 0.05
+    assert told(lobes=4).lobes == 4
+
+
+def test_an_error_to_be_reached_chooses_the_fewest_lobes(told, quick, close):
+    table = told(error=0.05)
+    assert table.lobes == 2
+    for name in ("mean", "scale", "weight", "diffuse"):
+        close(getattr(table, name), getattr(quick("glossy"), name))
+
+
+def test_an_error_out_of_reach_is_refused_and_the_best_named(told, monkeypatch):
+    monkeypatch.setattr(lobe, "_COUNTS", (2,))
+    best = f"{float(told(error=0.05).error):.3g}"
+    with pytest.raises(ValueError, match=f"error must be at least {best}, which 2 lobes reach; got 1e-05"):
+        lobe.tabulate(GLOSSY, error=1e-5, resolution=RESOLUTION)
+
+
+def test_diffuse_brdfs_have_nearly_no_error_and_the_albedo():
+    table = lobe.tabulate(CookTorrance(diffuse=0.5, specular=0.0, roughness=0.2), lobes=2, resolution=RESOLUTION)
+    assert float(table.error) < 0.01
+    np.testing.assert_allclose(table.diffuse, 0.5, atol=0.03)
+
+
+@pytest.mark.parametrize("name", ["glossy", "gold", "matte"])
+def test_the_energy_of_each_view_is_the_brdfs(quick, name):
+    brdf = jax.tree_util.Partial(BRDF[name])
+    exact, actual = energies(brdf, quick(name), nodes())
+    np.testing.assert_allclose(actual, exact, rtol=ENERGY)
+    exact, actual = energies(brdf, quick(name), directions((0.1, 0.0), (0.4, 2.0), (0.9, -1.0), (1.2, 4.0)))
+    np.testing.assert_allclose(actual, exact, rtol=BETWEEN)
+
+
+def test_the_energy_of_anisotropic_views_is_the_brdfs(quick):
+    table = quick("anisotropic")
+    texel = hemisphere.parabolic_texel_direction(resolution=4)[[1, 2, 0, 1], [1, 2, 1, 3]]
+    exact, actual = energies(COLORED, table, texel)
+    np.testing.assert_allclose(actual, exact, rtol=ENERGY)
+
+
+def test_tables_resemble_the_brdf_times_cosine(told):
+    wi, wo = upper(0, 4000), upper(1, 4000, least=0.3)
+    exact = np.asarray(GLOSSY(wi, wo) * wi[:, 2:])
+    tables = told(error=0.05), told(lobes=4)
+    error = [np.linalg.norm(value(each, wi, wo) - exact) / np.linalg.norm(exact) for each in tables]
+    assert error[1] < 0.8 * error[0]
+    assert error[1] < 0.12  # Point by point; under natural light it is the table's error, much less.
+
+
+def test_lobes_are_unit_directions_with_weights_and_concentrations_in_range(quick):
+    found = quick("anisotropic").lookup(upper(2, 200))
+    np.testing.assert_allclose(jnp.linalg.norm(found.mean, axis=0), 1, rtol=1e-5)
+    assert found.mean.shape == (3, 2, 200)
+    assert found.concentration.shape == (2, 200)
+    assert found.weight.shape == (3, 2, 200)
+    assert found.diffuse.shape == (3, 200)
+    assert jnp.min(found.concentration) > 0.99
+    assert jnp.max(found.concentration) < 1.01 * lobe_em.FINEST
+    assert jnp.min(found.weight) >= 0
+
+
+def test_isotropic_tables_are_over_the_view_angle_and_turn_with_the_view(quick, close):
+    table = quick("glossy")
+    assert table.isotropic
+    assert table.mean.shape == (3, 2, RESOLUTION)
+    assert table.nbytes == (3 + 1 + 1) * 2 * RESOLUTION * 4 + RESOLUTION * 4
+    wi, wo, angle = upper(3, 300), upper(4, 300), 2.1
+    turn = jnp.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], jnp.float32)
+    close(
+        value(table, wi @ turn.T, wo @ turn.T), value(table, wi, wo), tolerance=1e-4
+    )  # Float32, times the sharpness of lobes.
+
+
+def test_at_the_normal_lobes_are_those_next_to_it(quick, close):
+    wi, zero = upper(5, 300), jnp.zeros((300, 1))
+    table = quick("glossy", lobes=4)
+    at, near = (value(table, wi, jnp.concatenate([zero + x, zero, zero + 1], 1)) for x in (0, 2e-6))
+    close(at, near, tolerance=1e-4)
+
+
+def test_anisotropic_tables_are_maps(quick, close):
+    table = quick("anisotropic")
+    assert not table.isotropic
+    assert table.mean.shape == (3, 2, 4, 4)
+    assert table.weight.shape == (3, 2, 4, 4)
+    row, column = np.array([[1, 2, 0, 1], [1, 2, 1, 3]])
+    found = table.lookup(hemisphere.parabolic_texel_direction(resolution=4)[row, column])
+    close(found.weight, table.weight[:, :, row, column])
+    close(jnp.log(found.concentration), table.scale[:, row, column])
+
+
+def test_gray_brdfs_have_one_weight_and_colored_ones_one_per_color(quick, close):
+    gray, colored = quick("glossy"), quick("gold")
+    assert gray.weight.shape[0] == gray.diffuse.shape[0] == 1
+    assert colored.weight.shape[0] == colored.diffuse.shape[0] == 3
+    color = np.array([1.0, 0.6, 0.2], np.float32)[:, None]
+    close(colored.weight, gray.weight * color[..., None], tolerance=EM)
+    close(colored.diffuse, gray.diffuse * color, tolerance=EM)
+
+
+def test_any_function_is_tabulated_as_the_model_that_it_is(quick, close):
+    for actual, expected in zip(jax.tree.leaves(quick("plain")), jax.tree.leaves(quick("glossy")), strict=True):
+        close(actual, expected, tolerance=1e-4)
+
+
+def test_brighter_brdfs_have_weights_as_much_larger(quick, close):
+    dark, bright = quick("glossy"), quick("bright")
+    close(bright.weight, 100 * dark.weight, tolerance=EM)
+    close(bright.diffuse, 100 * dark.diffuse, tolerance=EM)
+    close(bright.mean, dark.mean, tolerance=EM)
+    close(bright.scale, dark.scale, tolerance=EM)
+
+
+def test_lobes_and_their_remainder_are_the_brdf(quick, close):
+    table, wi, wo = quick("anisotropic"), upper(6, 300, least=0.01), upper(7, 300)
+    rest = lobe.Remainder(COLORED, table)
+    close(rest(wi, wo) + table(wi, wo) / wi[:, 2:], COLORED(wi, wo))
+    grazing = directions((np.pi / 2 - 1e-6, 0.3), (np.pi / 2, 0.1))
+    assert np.isfinite(np.asarray(rest(grazing, wo[:2]))).all()
+
+
+def test_views_and_light_below_the_horizon_give_nothing(quick):
+    below = directions((1.6, 0.0), (3.0, 2.0), (np.pi, 0.0))
+    for table in (quick("glossy"), quick("anisotropic")):
+        found = table.lookup(below)
+        np.testing.assert_array_equal(found.weight, 0)
+        np.testing.assert_array_equal(found.diffuse, 0)
+        assert np.isfinite(np.asarray(found.mean)).all()
+        np.testing.assert_array_equal(table(upper(8, 3), below), 0)
+        np.testing.assert_array_equal(table(below, upper(8, 3)), 0)
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (2, 3), (0,)])
+def test_values_come_in_any_batch(quick, close, shape):
+    table = quick("gold")
+    wi, wo = (upper(seed, 7)[: int(np.prod(shape))].reshape(*shape, 3) for seed in (9, 10))
+    actual = table(wi, wo)
+    assert actual.shape == (*shape, 3)
+    found = table.lookup(wo.reshape(-1, 3))
+    each = [
+        sum(
+            found.weight[:, l, v] * scipy.stats.vonmises_fisher(m / np.linalg.norm(m), k).pdf(w)
+            for l, (m, k) in enumerate(
+                zip(np.asarray(found.mean[:, :, v].T, float), np.asarray(found.concentration[:, v], float), strict=True)
+            )
+        )
+        + found.diffuse[:, v] * w[2] / np.pi
+        for v, w in enumerate(np.asarray(wi, float).reshape(-1, 3) if actual.size else [])
+    ]
+    close(actual.reshape(-1, 3), np.array(each).reshape(-1, 3), tolerance=1e-4)  # Sharp lobes, in float32.
+
+
+def test_knots_have_the_tables_of_their_brdfs(quick, close):
+    varying = quick("varying", resolution=4)
+    assert varying.mean.shape == (3, 2, 3, 4)
+    assert varying.isotropic
+    close(varying.knot[0], ROUGHNESS)
+    for number, roughness in enumerate(ROUGHNESS[:2]):
+        single = quick(f"rough {roughness}", resolution=4)
+        found = varying.at(jnp.asarray(roughness, jnp.float32))
+        assert found.knot == ()
+        close(varying.mean[:, :, number], single.mean, tolerance=1e-4)
+        close(found.weight, single.weight, tolerance=1e-4)
+        close(found.scale, single.scale, tolerance=1e-4)
+        close(found.mean, single.mean, tolerance=1e-4)
+        close(found.diffuse, single.diffuse, tolerance=1e-4)
+
+
+def test_parameters_are_linear_between_knots_and_clamped_outside(quick, close):
+    varying = quick("varying", resolution=4)
+    for value, low, share in ((0.15, 0, 0.5), (0.25, 1, 0.25), (0.4, 1, 1), (0.0, 0, 0), (7.0, 1, 1), (np.inf, 1, 1)):
+        found = varying.at(jnp.asarray(value))
+        for actual, table, axis in (
+            (found.mean, varying.mean, 2),
+            (found.scale, varying.scale, 1),
+            (found.weight, varying.weight, 2),
+            (found.diffuse, varying.diffuse, 1),
+        ):
+            close(actual, jnp.take(table, low, axis) * (1 - share) + jnp.take(table, low + 1, axis) * share)
+    wi, wo = upper(11, 200), upper(12, 200, least=0.3)
+    sharp, middle, wide = (varying.at(jnp.asarray(r)).lookup(wo).concentration for r in (0.2, 0.3, 0.4))
+    assert jnp.all((wide - middle) * (sharp - middle) < 0)
+    assert np.isfinite(np.asarray(varying.at(jnp.asarray(0.3))(wi, wo))).all()
+
+
+def test_two_parameters_have_two_axes_and_gray_knots_share_the_colors(quick, close, monkeypatch):
+    monkeypatch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)
+    table = lobe.tabulate(
+        lambda bright, tint: Lambert(bright) if tint < 0.5 else Lambert(bright * jnp.array([1.0, 0.5, 0.1])),
+        lobes=2,
+        resolution=4,
+        knot=(np.array([0.4, 0.8]), np.array([0.0, 1.0])),
+    )
+    assert table.weight.shape == (3, 2, 2, 2, 4)
+    albedo = table.at(jnp.asarray(0.6), jnp.asarray(0.5))
+    close(jnp.sum(albedo.weight, 1) + albedo.diffuse, np.outer([0.6, 0.45, 0.33], np.ones(4)), tolerance=5e-3)
+
+
+@pytest.mark.parametrize("polar", [(0.4, 0.7), (0.9, -2.0), (1.2, 3.0)])
+@pytest.mark.parametrize("name", ["glossy", "anisotropic"])
+def test_gradients_in_the_view_are_finite_differences(quick, name, polar):
+    table, wo, step = quick(name), directions(polar)[0], 1e-3
+    expected = [
+        (outcome(table, wo + step * axis) - outcome(table, wo - step * axis)) / (2 * step) for axis in jnp.eye(3)
+    ]
+    gradient = jax.jit(jax.grad(outcome, argnums=1))(table, wo)
+    np.testing.assert_allclose(gradient, expected, atol=DIFFERENCE * float(np.linalg.norm(expected)))
+
+
+@pytest.mark.parametrize("name", ["glossy", "anisotropic"])
+def test_gradients_are_finite_at_the_normal_the_horizon_and_below(quick, name):
+    view = [[0, 0, 1], [1e-7, 0, 1], [1e-5, 0, 1], [1, 0, 0], [0, 1, 1e-7], [0, 0, -1], [0.6, 0, -0.8]]
+    gradient = jax.vmap(jax.grad(outcome, argnums=1), (None, 0))(quick(name), jnp.array(view, jnp.float32))
+    assert np.isfinite(np.asarray(gradient)).all()
+
+
+def test_gradients_in_the_parameter_are_finite_differences(quick):
+    varying, wo = quick("varying", resolution=4), jnp.array([0.48, -0.36, 0.8])
+    function = jax.jit(lambda roughness: outcome(varying.at(roughness), wo))
+    gradient = jax.jit(jax.grad(function))
+    for roughness in (0.13, 0.33):
+        expected = (function(roughness + 2e-3) - function(roughness - 2e-3)) / 4e-3
+        np.testing.assert_allclose(gradient(roughness), expected, rtol=DIFFERENCE)
+    for roughness in (0.05, 0.1, 0.2, 0.4, 3.0):
+        assert np.isfinite(gradient(roughness))
+    assert gradient(3.0) == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"lobes": 2, "error": 0.1}])
+def test_either_lobes_or_error_must_be_given(options):
+    with pytest.raises(ValueError, match="give either lobes or error, got lobes="):
+        lobe.tabulate(GLOSSY, **options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"lobes": 0}, {"lobes": 2, "resolution": 3}, {"error": 0.0}, {"error": float("nan")}]
+)
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(ValueError, match="needs at least one lobe or an error above 0, and a resolution of at least 4"):
+        lobe.tabulate(GLOSSY, **options)
+
+
+@pytest.mark.parametrize("knot", [[1.0], [1.0, 1.0], [2.0, 1.0], [0.0, np.nan], [0.0, np.inf], [[0.0, 1.0]]])
+def test_knots_that_do_not_increase_are_refused(knot):
+    with pytest.raises(ValueError, match="knots of parameter 1 must be at least two finite increasing numbers, got"):
+        lobe.tabulate(lambda a, b: Lambert(a), lobes=1, knot=(np.array([0.0, 1.0]), np.array(knot)))
+
+
+def test_three_parameters_are_refused():
+    with pytest.raises(ValueError, match="at most two parameters can be tabulated, got 3"):
+        lobe.tabulate(lambda a, b, c: Lambert(a), lobes=1, knot=(np.array([0.0, 1.0]),) * 3)
+
+
+@pytest.mark.parametrize("albedo", [-0.1, np.nan, np.inf])
+def test_brdfs_that_are_negative_or_not_finite_are_refused_and_the_directions_named(albedo):
+    with pytest.raises(
+        ValueError, match=r"finite and not negative, and is not for \d+ pairs .* first for wi = \[.+\], wo = \[.+\]"
+    ):
+        lobe.tabulate(Lambert(albedo), lobes=1, resolution=4)
+    with pytest.raises(ValueError, match=r"not negative at parameters \(2\.0,\), and is not for"):
+        lobe.tabulate(lambda a: Lambert(jnp.where(a < 1.5, 0.5, albedo)), lobes=1, resolution=4, knot=(np.arange(3.0),))
+
+
+def test_brdfs_without_an_axis_of_colors_are_refused():
+    with pytest.raises(ValueError, match=r"the BRDF must return \[\d+, c\] here, got \[\d+\]"):
+        lobe.tabulate(lambda wi, wo: jnp.maximum(wi[..., 2], 0), lobes=1, resolution=4)
+
+
+def test_a_wrong_number_of_parameters_is_refused(quick):
+    with pytest.raises(ValueError, match="the table has 0 parameters, got 1"):
+        quick("glossy").at(jnp.asarray(1.0))
+    with pytest.raises(ValueError, match="the table has 1 parameters, got 0"):
+        quick("varying", resolution=4).at()
+    with pytest.raises(ValueError, match="the table has 1 parameters, which `at` must choose first"):
+        quick("varying", resolution=4).lookup(upper(0, 2))
+
+
+def mirror_lobe(degrees, share):
+    """A BRDF whose product with the cosine is Gaussian lobes around the mirror direction."""
+
+    def brdf(wi, wo):
+        away = jnp.sum((wi - lobe_em.mirror(wo)) ** 2, -1, keepdims=True) / 2
+        k = 1 / (np.radians(np.array(degrees)) / 3) ** 2
+        density = jnp.exp(-k * away) * (k / (2 * np.pi))
+        return jnp.sum(density * np.array(share), -1, keepdims=True) / jnp.maximum(wi[..., 2:], 1e-6)
+
+    return brdf
+
+
+def test_published_lobes_are_in_the_mirror_direction_and_have_the_given_widths():
+    table = mirror_lobes(GLOSSY, angles=(0.0, 7.0, 21.0), resolution=RESOLUTION)
+    expected = np.array([lobe_em.FINEST, *(1 / (np.radians([7, 21]) / 3) ** 2)])
+    np.testing.assert_allclose(jnp.exp(table.scale), np.outer(expected, np.ones(RESOLUTION)), rtol=1e-4)
+    np.testing.assert_array_equal(table.diffuse, 0)
+    wo = nodes()
+    found = table.lookup(wo).mean
+    np.testing.assert_allclose(found, np.asarray(lobe_em.mirror(wo)).T[:, None] * np.ones((3, 3, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("share", [[0.5, 0, 0], [0, 0.3, 0], [0.2, 0, 0.6]])
+def test_published_lobes_find_a_brdf_that_is_such_lobes(share):
+    angles = (3.0, 7.0, 21.0)
+    table = mirror_lobes(mirror_lobe(angles, share), angles=angles, resolution=RESOLUTION)
+    # Far from the horizon, which would cut them; the other lobes part from these as EM goes on.
+    np.testing.assert_allclose(table.weight[0, :, :5], np.outer(share, np.ones(5)), atol=0.01)
+
+
+def test_published_lobes_of_anisotropic_brdfs_are_maps_with_colors():
+    table = mirror_lobes(COLORED, resolution=8)
+    assert table.weight.shape == (3, 4, 4, 4)
+    assert not table.isotropic
+
+
+@pytest.mark.parametrize("angles", [(), (7.0, -1.0)])
+def test_published_lobes_need_angles(angles):
+    with pytest.raises(ValueError, match="angles must be at least one, none below 0, got"):
+        mirror_lobes(GLOSSY, angles=angles)
+
+
+def test_published_lobes_refuse_brdfs_that_are_negative():
+    with pytest.raises(ValueError, match="must be finite and not negative"):
+        mirror_lobes(Lambert(-0.5), resolution=4)
