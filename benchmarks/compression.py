@@ -319,7 +319,7 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
 
 def plot(lines: list[dict], path: pathlib.Path) -> None:
     """Error against milliseconds of a light change, one panel for each light."""
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     names = list(dict.fromkeys(line["light"] for line in lines))
     figure, axes = pyplot.subplots(1, len(names), figsize=(4.5 * len(names), 4), sharey=True, squeeze=False)
@@ -335,6 +335,7 @@ def plot(lines: list[dict], path: pathlib.Path) -> None:
             panel.axvline(1e3 / rate, color="gray", linewidth=0.5)
             panel.text(1e3 / rate, 1, f"{rate}/s", fontsize=7, rotation=90, va="top")
         panel.set(title=light, xlabel="milliseconds per light change")
+        panel.xaxis.set_minor_formatter(ticker.NullFormatter())
     axes[0, 0].set_ylabel("relative L2 error of radiance")
     axes[0, -1].legend(fontsize=7)
     figure.savefig(path, dpi=120, bbox_inches="tight")
