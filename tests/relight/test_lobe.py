@@ -19,8 +19,11 @@ from jaxprt.transport import lobe as transports
 SIZE = 16
 EYE = jnp.array([1.2, 1.5, 2.5])
 # Errors of total radiance; what was measured, and half as much again.
-COARSE = {"matte": 0.02, "glossy": 0.06, "sharp": 0.08, "brushed": 0.06}
-FURNACE = 0.02  # Pyramids and lookups blur the horizon.
+COARSE = {"matte": 0.01, "glossy": 0.03, "sharp": 0.06, "brushed": 0.013}
+FURNACE = 0.0125  # Of all vertices together, measured .0083: pyramids and lookups blur the horizon.
+GRAZING = 0.085  # Of the worst vertex, measured .056.
+BLUR = 0.08  # Measured .077 at the finest scale that texels resolve: the lookup's tent is taken out of the blur.
+COVARIANCE = 0.05  # Of the covariance, what terms of higher order leave: measured .034.
 BRDFS = {
     "matte": Lambert([0.8, 0.5, 0.2]),
     "glossy": CookTorrance(diffuse=0.0, roughness=0.3),
@@ -82,7 +85,7 @@ def test_light_that_grows_towards_the_open_side_counts_more():
         weight /= weight.sum()
         exact, apart = weight @ (open_side * radiance), (weight @ open_side) * (weight @ radiance)
         value = float(lobe.radiance(half, one, light, eye=jnp.array([0.0, 0.0, 5.0]))[0, 0])
-        assert abs(value - exact) < 0.2 * abs(apart - exact)
+        assert abs(value - exact) < COVARIANCE * abs(apart - exact)
 
 
 def test_a_furnace_gives_back_its_albedo(tables):
@@ -94,17 +97,17 @@ def test_a_furnace_gives_back_its_albedo(tables):
     color = np.asarray(lobe.radiance(open_above, tables["glossy"], white, eye=EYE))
     expected = all_texels(frames, BRDFS["glossy"], white)
     facing = expected[:, 0] > 0
-    np.testing.assert_allclose(color[facing], expected[facing], rtol=5 * FURNACE)
+    np.testing.assert_allclose(color[facing], expected[facing], rtol=GRAZING)
     assert abs(color[facing].sum() / expected[facing].sum() - 1) < FURNACE
 
 
 def test_blurred_light_is_the_mean_over_lobes(light):
-    """Against sums over all texels of a light four times as fine, at texel centers of each scale."""
+    """Against sums over all texels, at the texel centers of each scale."""
     filtered, scale = lobe.prefilter(light), lobe.scales(SIZE)
     center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
     area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
     radiance = np.asarray(light.radiance, np.float64).reshape(-1, 3)
-    for number in range(4, len(scale.edge)):
+    for number in range(3, len(scale.edge)):
         edge, start = int(scale.edge[number]), int(scale.start[number])
         concentration = float(mixture.concentration_of(jnp.asarray(scale.spread[number])))
         place = np.asarray(cubemap.direction(size=edge), np.float64).reshape(-1, 3)
@@ -112,8 +115,7 @@ def test_blurred_light_is_the_mean_over_lobes(light):
         expected = (weight / weight.sum(1, keepdims=True)) @ radiance
         level = np.asarray(filtered.level)[:, start : start + 6 * (edge + 2) ** 2].reshape(3, 6, edge + 2, edge + 2)
         value = level[:, :, 1:-1, 1:-1].reshape(3, -1).T
-        # The lookup's tent, a sixth of a texel's area, is taken out of the blur beforehand.
-        assert np.linalg.norm(value - expected) < 0.08 * np.linalg.norm(expected)
+        assert np.linalg.norm(value - expected) < BLUR * np.linalg.norm(expected)
 
 
 def test_constant_light_stays_constant_at_all_scales(close):
