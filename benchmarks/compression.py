@@ -268,7 +268,7 @@ def measure_lobes(visible, exact, lights, views, rays, repeats, peer, quick: boo
 
 
 def measure_published(glossy, whole, exact, lights, views, quick: bool):
-    """The published configuration: its lines, and for each light the change that others are timed against, its error."""
+    """The published configuration: its lines, and for each light the timed change and its error."""
     count = len(glossy.position)
     size = lights[0].radiance.shape[-2]
     start = time.perf_counter()

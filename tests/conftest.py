@@ -11,7 +11,6 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Notebooks and
 # programs, which compute more than they compile, do not inherit that: it is taken back once jax has read it.
-FLAGS = os.environ.get("XLA_FLAGS")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 
 import jax
@@ -21,7 +20,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 jax.devices()
-if FLAGS is None:
+if "--xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
     del os.environ["XLA_FLAGS"]
 
 # Rounding error that a few thousand operations may leave, relative to the norm of the result.
