@@ -1,16 +1,18 @@
 """Fixtures that every test may ask for: ``data``, ``x64``, ``unchecked`` and ``close``."""
 
+import gc
 import os
 import pathlib
 from collections.abc import Callable, Iterator
 
-# Most of a run is compiling. Both test processes, notebooks and programs started by tests share what is compiled, and
-# a later run finds it; `make clean` removes it. Set before jax is imported, and inherited by what the tests start.
+# Programs and notebooks started by tests share what took long to compile, and a later run finds it; `make clean`
+# removes it. What compiles fast takes longer to keep. Set before jax is imported, and inherited by what tests start.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and a twentieth of the time
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Notebooks and
-# programs, which compute more than they compile, do not inherit that: it is taken back once jax has read it.
+# programs, which compute more, inherit a little of it once jax has read what is for tests.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 
 import jax
@@ -20,11 +22,26 @@ import pytest
 from numpy.typing import ArrayLike
 
 jax.devices()
-if "--xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
-    del os.environ["XLA_FLAGS"]
+os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace("optimization_level=0", "optimization_level=1")
+
+# Tracing makes so many objects that searching them all for cycles, as often as Python does, takes a fifth of the time.
+gc.set_threshold(100_000, 20, 100)
 
 # Rounding error that a few thousand operations may leave, relative to the norm of the result.
 TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
+
+
+MOST_MAPPINGS = 25_000  # of the 65,530 that Linux gives a process, unless told otherwise
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room() -> Iterator[None]:
+    """Forgets what was compiled before the process has no room for more: each function is mapped by itself."""
+    yield
+    mappings = pathlib.Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.brdf import grid
 from jaxprt.sphere import harmonics, hemisphere
 
 # Rings and sectors of the quadrature, one after the other until the error is reached; the last only tells it.
@@ -66,22 +67,12 @@ class HarmonicBrdf(eqx.Module):
         if len(parameter) != len(self.knot):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
         resolution = self.table.shape[-1]
-        place = jnp.clip(hemisphere.parabolic_coordinates(wo) * resolution - 0.5, 0, resolution - 1)
-        column, row = (_between(place[:, axis], resolution) for axis in (0, 1))
-        axes = [_between(_place(*each), len(each[0])) for each in zip(self.knot, parameter, strict=True)] + [
-            row,
-            column,
-        ]
-        place, weight = jnp.zeros((1, len(wo)), jnp.int32), jnp.where(wo[:, 2] > 0, jnp.ones((1, len(wo)), wo.dtype), 0)
-        for size, (low, share) in zip(self.table.shape[2:], axes, strict=True):
-            place = jnp.concatenate([place * size + low, place * size + low + 1])
-            weight = jnp.concatenate([weight * (1 - share), weight * share])
-        flat = self.table.reshape(self.table.shape[0] * self.table.shape[1], -1)
-        # Row by row, so that a table of one coefficient stays in the cache while all vertices read it.
-        value = jax.lax.map(
-            lambda row: sum(row.at[p].get(mode="promise_in_bounds") * w for p, w in zip(place, weight, strict=True)),
-            flat,
-        )
+        spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
+        axis = [
+            grid.neighbors(grid.place(knot, each), size=len(knot))
+            for knot, each in zip(self.knot, parameter, strict=True)
+        ] + [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
+        value = grid.read(self.table.reshape(-1, *self.table.shape[2:]), axis) * (wo[:, 2] > 0)
         return value.reshape(*self.table.shape[:2], len(wo))
 
     def __call__(
@@ -124,17 +115,15 @@ def tabulate(
             "tabulate needs a degree of 0 to 50, a resolution of at least 2 and an error above 0, "
             f"got {degree}, {resolution} and {error}"
         )
-    knots = tuple(_checked(number, values) for number, values in enumerate(knot))
-    if len(knots) > 2:
-        raise ValueError(f"at most two parameters can be tabulated, got {len(knots)}")
-    grid = list(itertools.product(*knots))
+    knots = grid.checked(knot)
+    points = list(itertools.product(*knots))
     # A middle and the extreme parameters stand for all where the number of nodes is chosen.
-    made = [_as_argument(brdf(*map(jnp.asarray, point)) if knots else brdf) for point in grid]
+    made = [grid.as_argument(brdf(*map(jnp.asarray, point)) if knots else brdf) for point in points]
     probes = [made[i] for i in sorted({0, len(made) // 2, len(made) - 1})]
     rings, sectors, reached = _choose_rule(probes, degree, error)
     wo = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
     tables = [project(each, wo, degree=degree, rings=rings, sectors=sectors) for each in made]
-    for point, table in zip(grid, tables, strict=True):
+    for point, table in zip(points, tables, strict=True):
         if not bool(jnp.all(jnp.isfinite(table))):
             at = f" at parameters {point}" if point else ""
             raise ValueError(f"the BRDF must be finite for all directions above the horizon, and is not{at}")
@@ -178,11 +167,6 @@ def project(
     return jnp.moveaxis(jax.lax.map(one, wo, batch_size=_BATCH), 0, -1)
 
 
-def _as_argument(brdf: Callable) -> Callable:
-    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
-    return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
-
-
 def _choose_rule(brdfs: Sequence[Callable], degree: int, error: float) -> tuple[int, int, float]:
     """Numbers of rings and sectors that reach an error, told by the next finer rule, and the error."""
     random = np.random.default_rng(0).uniform(size=(2, _PROBES))
@@ -204,24 +188,3 @@ def _choose_rule(brdfs: Sequence[Callable], degree: int, error: float) -> tuple[
             break
         rule, coarse = finer, fine
     return *rule, reached
-
-
-def _place(knot: Float[Array, " k"], parameter: Float[Array, " v"]) -> Float[Array, " v"]:
-    """Where parameters lie among knots: 1.5 halfway between the second and the third."""
-    low = jnp.clip(jnp.searchsorted(knot, parameter, side="right") - 1, 0, len(knot) - 2)
-    share = (parameter - knot[low]) / (knot[low + 1] - knot[low])
-    return jnp.clip(low + share, 0, len(knot) - 1)
-
-
-def _between(place: Float[Array, " v"], size: int) -> tuple[Array, Array]:
-    """The lower of the two neighbors, and the share of the upper."""
-    low = jnp.clip(jnp.floor(place), 0, size - 2)
-    return low.astype(jnp.int32), place - low
-
-
-def _checked(number: int, values: np.ndarray) -> np.ndarray:
-    """Knots of one parameter in float64, or the error."""
-    values = np.asarray(values, np.float64)
-    if values.ndim != 1 or len(values) < 2 or not np.all(np.isfinite(values)) or not np.all(np.diff(values) > 0):
-        raise ValueError(f"knots of parameter {number} must be at least two finite increasing numbers, got {values}")
-    return values

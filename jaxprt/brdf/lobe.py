@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import lobe_em
+from jaxprt.brdf import grid, lobe_em
 from jaxprt.linalg import mixture
 from jaxprt.sphere import harmonics, hemisphere
 
@@ -92,9 +92,7 @@ class LobeBrdf(eqx.Module):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
         mean, scale, weight, diffuse = self.mean, self.scale, self.weight, self.diffuse
         for knot, value in zip(self.knot, parameter, strict=True):
-            value = jnp.clip(value, knot[0], knot[-1])
-            low = jnp.clip(jnp.searchsorted(knot, value, side="right") - 1, 0, len(knot) - 2)
-            share = (value - knot[low]) / (knot[low + 1] - knot[low])
+            low, share = grid.neighbors(grid.place(knot, value), size=len(knot))
             mean, scale, weight, diffuse = (
                 jnp.take(each, low, axis) * (1 - share) + jnp.take(each, low + 1, axis) * share
                 for each, axis in ((mean, 2), (scale, 1), (weight, 2), (diffuse, 1))
@@ -114,19 +112,13 @@ class LobeBrdf(eqx.Module):
         pole = square < _TINY
         level = jnp.sqrt(jnp.where(pole, _TINY, square))
         if self.isotropic:
-            place, weight = _between(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), resolution)
+            axis = [grid.neighbors(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), size=resolution)]
         else:
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
-            (column, right), (row, down) = (_between(spot[:, axis], resolution) for axis in (0, 1))
-            place = [r * resolution + c for r in row for c in column]
-            weight = [r * c for r in down for c in right]
-        nodes = self.scale[0].size
-        rows = [each.reshape(-1, nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
-        # Row by row, so that a row stays in the cache while all views read it.
-        value = jax.lax.map(
-            lambda row: sum(row.at[p].get(mode="promise_in_bounds") * w for p, w in zip(place, weight, strict=True)),
-            jnp.concatenate(rows),
-        )
+            axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
+        nodes = self.scale.shape[1:]
+        rows = [each.reshape(-1, *nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
+        value = grid.read(jnp.concatenate(rows), axis)
         mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
         x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
@@ -203,10 +195,8 @@ def tabulate(
             f"tabulate needs at least one lobe or an error above 0, and a resolution of at least 4, "
             f"got {lobes}, {error} and {resolution}"
         )
-    if len(knot) > 2:
-        raise ValueError(f"at most two parameters can be tabulated, got {len(knot)}")
-    knots = tuple(_checked(number, values) for number, values in enumerate(knot))
-    made = [_as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
+    knots = grid.checked(knot)
+    made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
     isotropic = all(_isotropic(each) for each in made)
     points = itertools.product(*knots)
     both = [_sampled(each, resolution, isotropic, point) for each, point in zip(made, points, strict=True)]
@@ -229,7 +219,7 @@ def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], t
     Raises:
         ValueError: The BRDF is negative or not finite, or has no axis for colors.
     """
-    brdf = _as_argument(brdf)
+    brdf = grid.as_argument(brdf)
     return _sampled(brdf, resolution, _isotropic(brdf), ())
 
 
@@ -270,15 +260,6 @@ def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array,
     mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
     return mean, jnp.log(lobe.concentration).T.reshape(-1, *nodes), weight[:, :-1], weight[:, -1]
-
-
-def _between(place: Float[Array, " v"], size: int) -> tuple[list[Array], list[Array]]:
-    """The two neighbors of a place, and the share of each."""
-    place = jnp.clip(place, 0, size - 1)
-    low = jnp.clip(jnp.floor(place), 0, size - 2)
-    share = place - jax.lax.stop_gradient(low)
-    low = low.astype(jnp.int32)
-    return [low, low + 1], [1 - share, share]
 
 
 def _nodes(resolution: int, isotropic: bool) -> Float[Array, "*q 3"]:
@@ -332,16 +313,3 @@ def _check(direction: Array, mass: Array, wo: Array, point: tuple) -> None:
             f"the BRDF must be finite and not negative{at}, and is not for {len(wrong)} pairs of directions, first for "
             f"wi = {np.asarray(direction)[view, sample]}, wo = {np.asarray(wo)[view]}"
         )
-
-
-def _checked(number: int, values: np.ndarray) -> np.ndarray:
-    """Knots of one parameter in float64, or the error."""
-    values = np.asarray(values, np.float64)
-    if values.ndim != 1 or len(values) < 2 or not np.all(np.isfinite(values)) or not np.all(np.diff(values) > 0):
-        raise ValueError(f"knots of parameter {number} must be at least two finite increasing numbers, got {values}")
-    return values
-
-
-def _as_argument(brdf: Callable) -> Callable:
-    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
-    return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf

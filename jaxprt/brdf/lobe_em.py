@@ -23,7 +23,9 @@ _TINY = 1e-12
 
 
 @jax.jit
-def samples(brdf: Callable, wo: Float[Array, "v 3"]) -> tuple[Array, Array, Array, Array]:
+def samples(
+    brdf: Callable, wo: Float[Array, "v 3"]
+) -> tuple[Float[Array, "v s 3"], Float[Array, "v s c"], Float[Array, "v s 1"], Float[Array, "v s"]]:
     """For each view directions, the mass of f cos that each has, the logarithm of cos / pi, and their extents."""
 
     def one(view):
@@ -39,7 +41,9 @@ def samples(brdf: Callable, wo: Float[Array, "v 3"]) -> tuple[Array, Array, Arra
 
 
 @partial(jax.jit, static_argnames=("lobes",))
-def start(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[mixture.Mixture, Array]:
+def start(
+    wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
+) -> tuple[mixture.Mixture, Float[Array, " v"]]:
     """Lobes on a spiral over half vectors, as dense as the BRDF's core is; and the least concentration of each view."""
     away = 1 - jnp.einsum("vsi,vi->vs", sample, mirror(wo))
     order = jnp.argsort(away, 1)
@@ -64,7 +68,17 @@ def start(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[mixture
 
 
 @partial(jax.jit, static_argnames=("steps",))
-def improve(sample, mass, extent, lobe, least, fixed, weight, *, steps: int) -> tuple[mixture.Mixture, Array]:
+def improve(
+    sample: Float[Array, "v s 3"],
+    mass: Float[Array, "v s"],
+    extent: Float[Array, "v s"],
+    lobe: mixture.Mixture,
+    least: Float[Array, " v"],
+    fixed: Float[Array, "v s k"],
+    weight: Float[Array, "v k"],
+    *,
+    steps: int,
+) -> tuple[mixture.Mixture, Float[Array, "v k"]]:
     """Some steps of EM for each view; arguments as of `jaxprt.linalg.mixture.fit`, with a leading axis of views."""
 
     def one(argument):
@@ -78,7 +92,9 @@ def improve(sample, mass, extent, lobe, least, fixed, weight, *, steps: int) -> 
 
 
 @partial(jax.jit, static_argnames=("nodes",))
-def blend(wo: Array, lobe: mixture.Mixture, share: Array, *, nodes: tuple[int, ...]) -> mixture.Mixture:
+def blend(
+    wo: Float[Array, "v 3"], lobe: mixture.Mixture, share: Float[Array, ""], *, nodes: tuple[int, ...]
+) -> mixture.Mixture:
     """Draws the lobes of each node to those of its neighbors: slopes of half vectors, logarithms, parts of the weight.
 
     A neighbor counts by its lobe's weight, since lobes without weight may be anywhere.
@@ -100,7 +116,14 @@ def blend(wo: Array, lobe: mixture.Mixture, share: Array, *, nodes: tuple[int, .
 
 
 @jax.jit
-def weigh(sample, mass, extent, lobe, fixed, weight) -> Float[Array, "c m v"]:
+def weigh(
+    sample: Float[Array, "v s 3"],
+    mass: Float[Array, "v s c"],
+    extent: Float[Array, "v s"],
+    lobe: mixture.Mixture,
+    fixed: Float[Array, "v s k"],
+    weight: Float[Array, "v k"],
+) -> Float[Array, "c m v"]:
     """Weights of all components, the diffuse one last, for each color; the energy above the horizon is the BRDF's."""
 
     def one(argument):

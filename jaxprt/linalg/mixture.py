@@ -85,8 +85,7 @@ def concentration_of(drop: Float[Array, "*b"]) -> Float[Array, "*b"]:
     tiny = jnp.finfo(drop.dtype).tiny ** 0.5
     wanted = jnp.clip(drop, tiny, 1 - 1e-6)
     length = 1 - wanted
-    start = length * (2 + wanted * length + wanted) / (wanted * (1 + length))
-    concentration = start
+    concentration = length * (2 + wanted * length + wanted) / (wanted * (1 + length))
 
     def newton(_, concentration):
         small = concentration < 0.1
