@@ -24,24 +24,19 @@ from numpy.typing import ArrayLike
 jax.devices()
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace("optimization_level=0", "optimization_level=1")
 
-# Tracing makes so many objects that searching them all for cycles, as often as Python does, takes a fifth of the time.
-gc.set_threshold(100_000, 20, 100)
-
 # Rounding error that a few thousand operations may leave, relative to the norm of the result.
 TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
 
-MOST_MAPPINGS = 25_000  # of the 65,530 that Linux gives a process, unless told otherwise
-
-
 @pytest.fixture(autouse=True, scope="module")
 def room() -> Iterator[None]:
-    """Forgets what was compiled before the process has no room for more: each function is mapped by itself."""
+    """Forgets what a file has compiled: Linux gives a process 65,530 mappings, and each function takes several.
+
+    And the garbage collector has less to search, which otherwise takes half of the time in the end.
+    """
     yield
-    mappings = pathlib.Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
-        jax.clear_caches()
-        gc.collect()
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(scope="session")

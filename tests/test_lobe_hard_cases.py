@@ -9,7 +9,13 @@ import pytest
 
 from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, lobe, lobe_em
 from jaxprt.brdf.published import mirror_lobes
-from jaxprt.sphere import hemisphere
+from jaxprt.relight import direct as texels
+from jaxprt.relight import lobe as relight
+from jaxprt.relight import reference
+from jaxprt.scene import Environment
+from jaxprt.sphere import cubemap, hemisphere
+from jaxprt.transport import LobeTransport
+from jaxprt.transport import lobe as transports
 
 RESOLUTION = 8
 ENERGY = 2e-3  # At nodes: another quadrature, and what the horizon cuts of a lobe.
@@ -141,3 +147,87 @@ def test_published_lobes_of_a_mirror_are_the_sharpest_and_of_nothing_nothing(nam
     whole = np.sum(table.weight[0], 0)
     np.testing.assert_allclose(table.weight[0, 0], whole, rtol=0.01)
     assert np.all((whole > 0) == share)
+
+
+SIZE = 16
+FURNACE = 0.02  # Measured .011 at the horizon and less elsewhere, of what an open vertex sends.
+VISIBLE = {
+    "open": lambda x, y, z: z > 0,
+    "nothing": lambda x, y, z: z > 2,
+    "slit": lambda x, y, z: (z > 0) & (abs(x) < 0.07),
+    "half": lambda x, y, z: (z > 0) & (x > 0),
+}
+HEIGHT = np.radians([0, 30, 60, 80, 89.9])  # of the eye, from the normal
+
+
+@pytest.fixture(scope="module")
+def seen():
+    direction = np.moveaxis(np.asarray(cubemap.direction(size=SIZE)), -1, 0).reshape(3, -1)
+    return jnp.asarray(np.stack([16 * test(*direction) for test in VISIBLE.values()]), jnp.uint8)
+
+
+@pytest.fixture(scope="module")
+def transport(seen):
+    """One vertex of each kind at the origin; irradiance is not what is tested here."""
+    count = len(VISIBLE)
+    frame = jnp.broadcast_to(jnp.eye(3), (count, 3, 3))
+    vector = jnp.zeros(((transports.DEGREE + 1) ** 2, count))
+    return LobeTransport(transports.pyramid(seen), vector, jnp.zeros((count, 3)), frame, SIZE)
+
+
+def radiances(transport, table, light):
+    return np.stack([relight.radiance(transport, table, light, eye=1e3 * each)[:, 0] for each in view(*HEIGHT)])
+
+
+@pytest.mark.parametrize("name", ["sharp", "rough", "mirror", "zero", "power", "brushed"])
+def test_vertices_that_see_nothing_or_a_slit_under_constant_light(tables, transport, name):
+    """A furnace: never more than the reflectance, from a slit less than from half, and from nothing nothing."""
+    color = radiances(transport, tables(name), Environment(jnp.ones((6, SIZE, SIZE, 1))))
+    assert np.isfinite(color).all()
+    lookup = np.asarray(tables(name).lookup(view(*HEIGHT)).weight)[0].sum(0)
+    free, nothing, slit, half = color.T
+    np.testing.assert_array_equal(nothing, 0)
+    assert np.all(free <= lookup * (1 + FURNACE) + 1e-6)
+    assert np.all(half <= free + FURNACE * lookup)
+    assert np.all(slit <= half + FURNACE * lookup)
+    assert np.all(slit >= -FURNACE * lookup)
+
+
+@pytest.mark.parametrize("name", ["sharp", "rough", "mirror", "brushed"])
+def test_light_of_one_texel_is_finite_and_bounded_by_the_flux(tables, transport, name):
+    place = np.argmax(np.asarray(cubemap.direction(size=SIZE))[..., 2].ravel())
+    light = Environment(jnp.zeros(6 * SIZE * SIZE).at[place].set(1e6).reshape(6, SIZE, SIZE, 1))
+    color = radiances(transport, tables(name), light)
+    assert np.isfinite(color).all()
+    np.testing.assert_array_equal(color[:, 1], 0)
+    assert np.max(np.abs(color)) < 2e6
+    texel, _, rest = texels.split(light, count=1)
+    assert texel == place
+    np.testing.assert_array_equal(rest.radiance, 0)
+
+
+def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(seen, transport):
+    """wi = wo, at the normal and at 45 degrees; the bits of the transport against the sum over all texels."""
+    center = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
+    for wanted in ([0, 0, 1], [1, 0, 1], [0.05, 1, 0.05]):
+        place = np.argmax(center @ np.asarray(wanted))
+        light = Environment(jnp.zeros((6 * SIZE * SIZE, 3)).at[place].set(5.0).reshape(6, SIZE, SIZE, 3))
+        eye = jnp.asarray(1e4 * center[place], jnp.float32)
+        texel, excess, _ = texels.split(light, count=1)
+        for name in ("sharp", "rough", "power", "brushed"):
+            color = texels.radiance(transport, BRDF[name], texel, excess, eye=eye)
+            exact = reference.integrate(seen, transport.position, transport.frame, BRDF[name], light, eye)
+            assert np.isfinite(color).all()
+            np.testing.assert_allclose(color, exact, rtol=1e-3, atol=1e-6)
+
+
+def test_gradients_stay_finite_where_nothing_is_seen_and_at_the_horizon(tables, transport):
+    light = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+
+    def mean(eye, table):
+        return jnp.mean(relight.radiance(transport, table, light, eye=eye))
+
+    for eye in 1e3 * view(0.0, np.pi / 2):
+        assert all(
+            np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(jax.grad(mean, (0, 1))(eye, tables("rough")))
+        )

@@ -49,6 +49,26 @@ def test_bytes_are_those_of_what_is_made(mesh, planned, ready):
     assert planned.precompute_seconds > 0
 
 
+def test_a_plan_of_lobes_holds_from_other_views_and_stores_what_it_says(mesh, sky):
+    wanted = plan.lobe(mesh, BRDF, [sky], error=ASKED, progress=False)
+    assert wanted.error * plan.MARGIN <= ASKED
+    ready = plan.precompute(mesh, BRDF, wanted, size=8, progress=False)
+    assert ready.table.lobes == wanted.lobes
+    assert wanted.nbytes == ready.transport.nbytes
+    now, exact = [], []
+    for eye in jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]]):
+        now.append(plan.radiance(ready, sky, eye=eye))
+        exact.append(reference.radiance(mesh, BRDF, sky, eye=eye, progress=False))
+    assert np.linalg.norm(np.subtract(now, exact)) < ASKED * np.linalg.norm(exact)
+
+
+def test_an_error_that_no_number_of_lobes_reaches_is_refused(mesh, sky, monkeypatch):
+    monkeypatch.setattr(plan, "_LOBES", plan._LOBES[:1])
+    with pytest.raises(ValueError, match=r"error must be at least 0\.\d+, which the most lobes reach; got 1e-05"):
+        plan.lobe(mesh, BRDF, [sky], error=1e-5, progress=False)
+
+
+@pytest.mark.parametrize("make", [plan.separable, plan.lobe])
 @pytest.mark.parametrize(
     ("lights", "error", "message"),
     [
@@ -58,7 +78,7 @@ def test_bytes_are_those_of_what_is_made(mesh, planned, ready):
         ([8], np.nan, "error must be positive, got nan"),
     ],
 )
-def test_impossible_plans_are_refused(mesh, lights, error, message):
+def test_impossible_plans_are_refused(mesh, make, lights, error, message):
     lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
     with pytest.raises(ValueError, match=message):
-        plan.separable(mesh, BRDF, lights, error=error, progress=False)
+        make(mesh, BRDF, lights, error=error, progress=False)

@@ -103,10 +103,11 @@ def radiance(
         sent = value(wi, wo) * flux
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
-    spare = -len(texel) % _GROUP
+    count = min(_GROUP, len(texel))
+    spare = -len(texel) % count
     texel, excess = jnp.pad(texel, (0, spare)), jnp.pad(excess, ((0, spare), (0, 0)))
     groups = jax.tree.map(
-        lambda x: x.reshape(len(x) // _GROUP, _GROUP, *x.shape[1:]), (texel, excess, transport.visible(texel))
+        lambda x: x.reshape(len(x) // count, count, *x.shape[1:]), (texel, excess, transport.visible(texel))
     )
     return jnp.sum(jax.lax.map(group, groups), 0).T
 

@@ -8,6 +8,7 @@ E[L V] = E[L] E[V] + k grad E[L] . grad E[V] + ..., and both slopes come with th
 costs nothing.
 """
 
+import math
 from functools import lru_cache, partial, reduce
 
 import equinox as eqx
@@ -28,6 +29,7 @@ _RATIO = 1.5  # from one width to the next
 _WIDEST = 1.3  # radians
 _COARSE = 0.75  # largest texel in widths
 _REACH = 3.0  # widths that a blur sums over
+_TILE = 4  # edge of what is blurred at once, in texels
 
 
 class LobeLight(eqx.Module):
@@ -202,17 +204,14 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLigh
         mips[edge] = value / whole
     levels = []
     for number, edge in enumerate(scale.edge.tolist()):
-        value = light.radiance.reshape(-1, colors).T
+        value = light.radiance
         if number:
             index, weight = blurs[number - 1]
-            source = mips[_edge(np.sqrt(scale.spread[number]), size, least=8)].reshape(-1, colors).T
-
-            def add(total, item, source=source):
-                return total + source[:, item[0]] * item[1], None
-
-            start = jnp.zeros((colors, index.shape[1]), source.dtype)
-            value, _ = jax.lax.scan(add, start, (index, weight))
-        levels.append(cubemap.pad(value.T.reshape(6, edge, edge, colors)).reshape(-1, colors).T)
+            source = mips[_edge(np.sqrt(scale.spread[number]), size, least=8)].reshape(-1, colors)
+            value = weight @ source[index].reshape(*index.shape[:2], 6 * colors)
+            tile = math.isqrt(weight.shape[1])
+            value = value.reshape(edge // tile, edge // tile, tile, tile, 6, colors).transpose(4, 0, 2, 1, 3, 5)
+        levels.append(cubemap.pad(value.reshape(6, edge, edge, colors)).reshape(-1, colors).T)
     coefficient = harmonics.project(light.radiance, degree=DEGREE)
     return LobeLight(jnp.concatenate(levels, 1), coefficient, size)
 
@@ -226,7 +225,10 @@ def _edge(width: float, size: int, *, least: int) -> int:
 
 
 def _blurs(size: int, dtype) -> list[tuple[Array, Array]]:
-    """For each width the texels that make one of its texels, and their weights; [kept, texels]."""
+    """For each width the texels [tile, m, face] that make a tile of the blurred faces, and their weights [tile, o, m].
+
+    What is blurred is made in tiles, so that a small dense product makes each, and weights are the same on all faces.
+    """
     with jax.ensure_compile_time_eval():  # What a trace made could not be kept.
         return _made_blurs(size, str(dtype))
 
@@ -241,16 +243,28 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
         texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
         own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
         concentration = float(mixture.concentration_of(jnp.asarray(own)))
-        place, center = (np.asarray(cubemap.direction(size=n), np.float64).reshape(-1, 3) for n in (edge, source))
+        center = np.asarray(cubemap.direction(size=source), np.float64).reshape(-1, 3)
         area = np.asarray(cubemap.solid_angle(size=source), np.float64).reshape(-1)
+        tile = min(_TILE, edge)
+        place = np.asarray(cubemap.direction(size=edge), np.float64)[0]
+        place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
         reach = 2 * np.sin(min(np.pi, _REACH * np.sqrt(own)) / 2)
-        near = KDTree(center).query_ball_point(place, reach)
-        most = max(map(len, near))
-        index, known = np.zeros((len(place), most), np.int32), np.zeros((len(place), most))
+        near = [np.unique(np.concatenate(each)) for each in KDTree(center).query_ball_point(place, reach)]
+        index, known = (np.zeros((len(place), max(map(len, near))), kind) for kind in (np.int32, np.float64))
         for row, each in enumerate(near):
-            index[row, : len(each)], known[row, : len(each)] = sorted(each), 1
-        away = np.sum((center[index] - place[:, None]) ** 2, -1) / 2
-        weight = known * area[index] * np.exp(-concentration * away)
-        weight /= weight.sum(1, keepdims=True)
-        result.append((jnp.asarray(index.T), jnp.asarray(weight.T, dtype)))
+            index[row, : len(each)], known[row, : len(each)] = each, area[each]
+        away = 1 - np.einsum("toi,tmi->tom", place, center[index])
+        weight = known[:, None] * np.exp(-concentration * away)
+        weight /= weight.sum(-1, keepdims=True)
+        result.append((jnp.asarray(_on_faces(source)[index]), jnp.asarray(weight, dtype)))
     return result
+
+
+def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
+    """For each texel those that lie to the six faces as it lies to the first."""
+    place = np.asarray(cubemap.point(size=2), np.float64)
+    axes = np.stack([place[:, 0, 1] - place[:, 0, 0], place[:, 1, 0] - place[:, 0, 0], place.mean((1, 2))], 1)
+    moved = np.einsum("ti,ji,fjk->tfk", np.asarray(cubemap.direction(size=size)).reshape(-1, 3), axes[0], axes)
+    face, s, t = cubemap.project(*np.moveaxis(moved, -1, 0))
+    column, row = (np.clip((np.asarray(x) + 1) / 2 * size, 0, size - 1).astype(np.int32) for x in (s, t))
+    return np.asarray(face, np.int32) * size * size + row * size + column
