@@ -76,7 +76,7 @@ def measure(quick: bool, store: pathlib.Path | None):
     whole = join([glossy, ground])
     count = len(glossy.position)
     views = eyes(glossy, 3 if quick else 20)
-    front = [(4, 4, 16, 96, 2), (8, 8, 32, 192, 4)] if quick else FRONT
+    front = [(8, 8, 32, 192, 4)] if quick else FRONT
     clusters = 4 if quick else CLUSTERS
     repeats = 3 if quick else 15
 

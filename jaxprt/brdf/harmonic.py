@@ -122,7 +122,7 @@ def tabulate(
     probes = [made[i] for i in sorted({0, len(made) // 2, len(made) - 1})]
     rings, sectors, reached = _choose_rule(probes, degree, error)
     wo = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
-    tables = [project(each, wo, degree=degree, rings=rings, sectors=sectors) for each in made]
+    tables = [_in_blocks(each, wo, degree=degree, rings=rings, sectors=sectors) for each in made]
     for point, table in zip(points, tables, strict=True):
         if not bool(jnp.all(jnp.isfinite(table))):
             at = f" at parameters {point}" if point else ""
@@ -165,6 +165,13 @@ def project(
         return harmonics.evaluate(wi, degree=degree).T @ (value * jnp.maximum(wi[:, 2:], 0) * area[:, None])
 
     return jnp.moveaxis(jax.lax.map(one, wo, batch_size=_BATCH), 0, -1)
+
+
+def _in_blocks(brdf: Callable, wo: Float[Array, "v 3"], **rule: int) -> Float[Array, "lm c v"]:
+    """`project` of many views, as many at once as there are probes: what was compiled for these serves again."""
+    block = np.resize(wo, (-(-len(wo) // _PROBES), _PROBES, 3))
+    value = [np.asarray(project(brdf, jnp.asarray(each), **rule)) for each in block]
+    return jnp.asarray(np.concatenate(value, -1)[..., : len(wo)])
 
 
 def _choose_rule(brdfs: Sequence[Callable], degree: int, error: float) -> tuple[int, int, float]:

@@ -1,5 +1,5 @@
 """Factorizations; they know no BRDF and no mesh."""
 
-from jaxprt.linalg import eigen, mixture
+from jaxprt.linalg import eigen, mixture, tucker
 
-__all__ = ["eigen", "mixture"]
+__all__ = ["eigen", "mixture", "tucker"]

@@ -103,7 +103,7 @@ def radiance(
         sent = value(wi, wo) * flux
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
-    count = min(_GROUP, len(texel))
+    count = max(1, min(_GROUP, len(texel)))
     spare = -len(texel) % count
     texel, excess = jnp.pad(texel, (0, spare)), jnp.pad(excess, ((0, spare), (0, 0)))
     groups = jax.tree.map(

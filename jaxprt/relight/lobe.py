@@ -250,7 +250,8 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
         place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
         reach = 2 * np.sin(min(np.pi, _REACH * np.sqrt(own)) / 2)
         near = [np.unique(np.concatenate(each)) for each in KDTree(center).query_ball_point(place, reach)]
-        index, known = (np.zeros((len(place), max(map(len, near))), kind) for kind in (np.int32, np.float64))
+        index = np.zeros((len(place), max(map(len, near))), np.int32)
+        known = np.zeros(index.shape)
         for row, each in enumerate(near):
             index[row, : len(each)], known[row, : len(each)] = each, area[each]
         away = 1 - np.einsum("toi,tmi->tom", place, center[index])

@@ -46,7 +46,7 @@ def transport(visible):
 
 @pytest.fixture(scope="module")
 def tables():
-    return {name: lobes.tabulate(brdf, lobes=6, resolution=16) for name, brdf in BRDFS.items()}
+    return {name: lobes.tabulate(brdf, lobes=4, resolution=12) for name, brdf in BRDFS.items()}
 
 
 @pytest.fixture(scope="module")
