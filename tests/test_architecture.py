@@ -29,6 +29,7 @@ SIDEWAYS = {
     ("brdf", "published", "models"),
     ("brdf", "published", "separable"),
     ("brdf", "scattered", "measured"),
+    ("linalg", "tucker", "eigen"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),
     ("scene", "camera", "mesh"),

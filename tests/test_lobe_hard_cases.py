@@ -181,7 +181,7 @@ def radiances(transport, table, light):
 
 @pytest.mark.parametrize("name", ["sharp", "rough", "mirror", "zero", "power", "brushed"])
 def test_vertices_that_see_nothing_or_a_slit_under_constant_light(tables, transport, name):
-    """A furnace: never more than the reflectance, from a slit or half not more than from all, and from nothing nothing."""
+    """A furnace: never more than the reflectance, from a slit or half no more than from all, from nothing nothing."""
     color = radiances(transport, tables(name), Environment(jnp.ones((6, SIZE, SIZE, 1))))
     assert np.isfinite(color).all()
     lookup = np.asarray(tables(name).lookup(view(*HEIGHT)).weight)[0].sum(0)

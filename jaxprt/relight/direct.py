@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
 
+_ROW = 32  # texels of which the brightest is looked at first
 _GROUP = 16  # texels at once: what is held for each vertex meanwhile
 
 
@@ -58,7 +59,8 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         raise ValueError(f"count must be between 1 and {6 * size * size - 1}, got {count}")
     radiance = light.radiance.reshape(-1, colors)
     flux = jnp.sum(radiance, -1) * cubemap.solid_angle(size=size).ravel()
-    bright, texel = jax.lax.top_k(flux, count + 1)
+    texel = _largest(jax.lax.stop_gradient(flux), count + 1)
+    bright = flux[texel]
     share = jnp.maximum(1 - bright[-1] / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
     texel, excess = texel[:-1], radiance[texel[:-1]] * share[:, None].astype(radiance.dtype)
     rest = radiance.at[texel].add(-excess).reshape(light.radiance.shape)
@@ -110,6 +112,17 @@ def radiance(
         lambda x: x.reshape(len(x) // count, count, *x.shape[1:]), (texel, excess, transport.visible(texel))
     )
     return jnp.sum(jax.lax.map(group, groups), 0).T
+
+
+def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
+    """Where the largest values are, the largest first: in the rows with the largest maxima, which are few to sort."""
+    rows = len(value) // _ROW
+    if rows <= count or len(value) % _ROW:
+        return jax.lax.top_k(value, count)[1]
+    table = value.reshape(rows, _ROW)
+    row = jnp.sort(jax.lax.top_k(jnp.max(table, 1), count)[1])  # In order, so that of equal values the first is taken.
+    place = jax.lax.top_k(table[row].ravel(), count)[1]
+    return row[place // _ROW] * _ROW + place % _ROW
 
 
 def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:

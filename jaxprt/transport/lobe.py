@@ -73,9 +73,10 @@ class LobeTransport(eqx.Module):
         Returns:
             Shares from 0 to 1, and their derivatives by s and t.
         """
-        # In three steps: XLA's CPU code vectorizes what has no gather in it.
+        # In steps: XLA's CPU code vectorizes what has no gather in it.
         address, bit = _addresses(face, s, t, spread, size=self.size)
-        return _decoded(_bytes(self.level, address), bit, s, t, spread, size=self.size)
+        read = _by_tap(_bytes(self.level, _by_vertex(address)))
+        return _decoded(read, bit, s, t, spread, size=self.size)
 
 
 @partial(jax.jit, static_argnames=("size",))
@@ -98,9 +99,19 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
 
 
 @jax.jit
-def _bytes(level: Array, address: tuple[Array, ...]) -> tuple[Array, ...]:
-    vertex = jnp.broadcast_to(jnp.arange(len(level)), address[0].shape)
-    return tuple(level.at[vertex, each].get(mode="promise_in_bounds") for each in address)
+def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
+    """All that a vertex reads side by side: what lies in memory together is then read together."""
+    return jnp.stack(address).reshape(-1, address[0].shape[1]).T
+
+
+@jax.jit
+def _bytes(level: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
+    return jnp.take_along_axis(level, address, 1, mode="promise_in_bounds")
+
+
+@jax.jit
+def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
+    return tuple(read.T.reshape(8, -1, len(read)))
 
 
 @partial(jax.jit, static_argnames=("size",))

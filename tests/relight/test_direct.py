@@ -86,6 +86,20 @@ def test_excess_and_rest_are_the_light(random, colors, strength):
     np.testing.assert_array_equal(untouched, radiance.reshape(ALL, -1)[order[COUNT:]])
 
 
+@pytest.mark.parametrize("count", [1, 5, 40, 300])
+@pytest.mark.parametrize("kind", ["random", "constant", "few"])
+def test_the_brightest_are_taken_and_of_equal_ones_the_first(random, kind, count):
+    level = {
+        "random": random.random(6 * 32**2),
+        "constant": np.ones(6 * 32**2),
+        "few": random.integers(3, size=6 * 32**2),
+    }
+    light = Environment(jnp.asarray(level[kind].reshape(6, 32, 32, 1), jnp.float32))
+    texel, _, _ = direct.split(light, count=count)
+    brightness = np.asarray(light.radiance[..., 0] * cubemap.solid_angle(size=32)).ravel()
+    np.testing.assert_array_equal(texel, np.argsort(-brightness, kind="stable")[:count])
+
+
 def test_a_texel_keeps_its_color(random):
     radiance = jnp.asarray(random.uniform(0.1, 3, size=(6, SIZE, SIZE, 3)), jnp.float32)
     texel, excess, rest = direct.split(Environment(radiance), count=COUNT)
