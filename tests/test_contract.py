@@ -61,6 +61,10 @@ HOST = {
     "transport.harmonic.check": "checks values",
     "relight.reference.radiance": "traces rays; its pure part is integrate",
     "linalg.clustering": "sorts on the host, where data enters",
+    "linalg.tucker.hosvd": "gives vectors of either sign, whose reconstruction alone has derivatives",
+    "linalg.tucker.truncated": "the same",
+    "linalg.tucker.hooi": "the same",
+    "linalg.tucker.ranks_for": "chooses by values, on the host",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
@@ -292,6 +296,8 @@ EXAMPLES = {
     "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.area": example(nothing, size=4),
     # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
+    "linalg.tucker.multiply": example(lambda draw: call(draw.normal(3, 4, 5), draw.normal(4, 2)), mode=1),
+    "linalg.tucker.gram": example(lambda draw: call(draw.normal(3, 4, 5)), mode=1),
     "linalg.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
     # One vector at a time amplifies rounding where eigenvalues are alike.
     "linalg.eigen.power": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=1, steps=40),

@@ -8,6 +8,7 @@ import numpy as np
 import tqdm
 from jaxtyping import Array, Float, UInt8
 
+from jaxprt.brdf import grid
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
@@ -50,8 +51,7 @@ def radiance(
     normal = np.asarray(mesh.normal, np.float32)
     frame = directions.frame(mesh.normal, mesh.tangent)
     size = light.radiance.shape[-2]
-    if jax.tree_util.all_leaves([brdf]):  # A plain function: what is not an array must not be an argument of jit.
-        brdf = jax.tree_util.Partial(brdf)
+    brdf = grid.as_argument(brdf)
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []
