@@ -200,8 +200,8 @@ def lobe(
 ) -> LobePlan:
     """Finds the fewest lobes and texels that meet an error, measured like the plan of `separable`, and promised alike.
 
-    Lobes store a tenth and precompute faster; below some error only terms reach it. Where both plans can be had, the
-    one with fewer `seconds` relights faster.
+    Lobes store what vertices see and nothing else, and small errors are reached by terms alone. Where both plans can be
+    had, the one with fewer `seconds` relights faster.
 
     Arguments and errors as of `separable`.
     """

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and a twentieth of the time
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and 3 % of the time
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Notebooks and
 # programs, which compute more, inherit a little of it once jax has read what is for tests.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
@@ -30,10 +30,7 @@ TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
 @pytest.fixture(autouse=True, scope="module")
 def room() -> Iterator[None]:
-    """Forgets what a file has compiled: Linux gives a process 65,530 mappings, and each function takes several.
-
-    And the garbage collector has less to search, which otherwise takes half of the time in the end.
-    """
+    """Forgets what a file has compiled: Linux gives a process 65,530 mappings, and each function takes several."""
     yield
     jax.clear_caches()
     gc.collect()

@@ -295,9 +295,9 @@ EXAMPLES = {
     "sphere.haar.forward": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.area": example(nothing, size=4),
-    # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
     "linalg.tucker.multiply": example(lambda draw: call(draw.normal(3, 4, 5), draw.normal(4, 2)), mode=1),
     "linalg.tucker.gram": example(lambda draw: call(draw.normal(3, 4, 5)), mode=1),
+    # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
     "linalg.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
     # One vector at a time amplifies rounding where eigenvalues are alike.
     "linalg.eigen.power": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=1, steps=40),
@@ -585,10 +585,18 @@ def test_defaults_are_keyword_only(name):
     assert not wrong
 
 
-@pytest.mark.parametrize("name", [name for name in EXAMPLES if not isinstance(PUBLIC.get(name), JITTED)])
-def test_what_is_not_compiled_can_be(name, close):
-    arrays = build(name)
-    jax.tree.map(close, jax.jit(lambda arrays: run(name, arrays))(arrays), run(name, arrays))
+@each_pure
+def test_jit_equals_eager(name, close):
+    arrays, function = build(name), PUBLIC[name]
+    if isinstance(function, JITTED):
+        compiled = run(name, arrays)
+        eager = inspect.getattr_static(function, "__wrapped__")(
+            *arrays.position, **arrays.name, **EXAMPLES[name].options
+        )
+    else:
+        compiled = jax.jit(lambda arrays: run(name, arrays))(arrays)
+        eager = run(name, arrays)
+    jax.tree.map(close, compiled, eager)
 
 
 @each_pure

@@ -150,7 +150,11 @@ def test_published_lobes_of_a_mirror_are_the_sharpest_and_of_nothing_nothing(nam
 
 
 SIZE = 16
-FURNACE = 0.02  # Measured .011 at the horizon and less elsewhere, of what an open vertex sends.
+FURNACE = 1e-3  # Rounding: no vertex was measured to send more than the lobes' weight.
+SEEN = (
+    0.97  # Of that weight, by an open vertex up to 80 degrees: measured .980 for a rough material, which the rim cuts.
+)
+ONE = 0.3  # Of the weight times the only texel: it is one of four about the direction, measured .253.
 VISIBLE = {
     "open": lambda x, y, z: z > 0,
     "nothing": lambda x, y, z: z > 2,
@@ -188,7 +192,8 @@ def test_vertices_that_see_nothing_or_a_slit_under_constant_light(tables, transp
     free, nothing, slit, half = color.T
     np.testing.assert_array_equal(nothing, 0)
     assert np.all(free <= lookup * (1 + FURNACE) + 1e-6)
-    assert np.all(half <= free + FURNACE * lookup)
+    assert np.all(free[:-1] >= SEEN * lookup[:-1])
+    assert np.all(half <= 0.52 * lookup)  # Measured .51; the mirror directions lie in the other half.
     assert np.all(slit <= free + FURNACE * lookup)
     assert np.all(slit >= -FURNACE * lookup)
 
@@ -200,14 +205,15 @@ def test_light_of_one_texel_is_finite_and_bounded_by_the_flux(tables, transport,
     color = radiances(transport, tables(name), light)
     assert np.isfinite(color).all()
     np.testing.assert_array_equal(color[:, 1], 0)
-    assert np.max(np.abs(color)) < 2e6
+    lookup = np.asarray(tables(name).lookup(view(*HEIGHT)).weight)[0].sum(0)
+    assert np.all(np.abs(color) <= ONE * 1e6 * lookup[:, None])
     texel, _, rest = texels.split(light, count=1)
     assert texel == place
     np.testing.assert_array_equal(rest.radiance, 0)
 
 
 def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(seen, transport):
-    """wi = wo, at the normal and at 45 degrees; the bits of the transport against the sum over all texels."""
+    """wi = wo, at the normal, at 45 degrees and near the horizon: stored bits against the sum over all texels."""
     center = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
     for wanted in ([0, 0, 1], [1, 0, 1], [0.05, 1, 0.05]):
         place = np.argmax(center @ np.asarray(wanted))

@@ -35,6 +35,10 @@ def ready(mesh, planned):
 
 def test_the_error_asked_for_holds_from_other_views(mesh, sky, planned, ready):
     assert planned.error * plan.MARGIN <= ASKED
+    _check_other_views(mesh, sky, ready)
+
+
+def _check_other_views(mesh, sky, ready):
     now, exact = [], []
     for eye in jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]]):
         now.append(plan.radiance(ready, sky, eye=eye))
@@ -55,11 +59,7 @@ def test_a_plan_of_lobes_holds_from_other_views_and_stores_what_it_says(mesh, sk
     ready = plan.precompute(mesh, BRDF, wanted, size=8, progress=False)
     assert ready.table.lobes == wanted.lobes
     assert wanted.nbytes == ready.transport.nbytes
-    now, exact = [], []
-    for eye in jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]]):
-        now.append(plan.radiance(ready, sky, eye=eye))
-        exact.append(reference.radiance(mesh, BRDF, sky, eye=eye, progress=False))
-    assert np.linalg.norm(np.subtract(now, exact)) < ASKED * np.linalg.norm(exact)
+    _check_other_views(mesh, sky, ready)
 
 
 def test_an_error_that_no_number_of_lobes_reaches_is_refused(mesh, sky, monkeypatch):
