@@ -25,7 +25,10 @@ SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.
 SIDEWAYS = {
     ("*", "dynamic", "lobe"),  # Sun's system is built on the lobes of its own section 4.1.
+    ("*", "dynamic", "separable"),  # Its terms are separable ones, with view maps that change.
     ("brdf", "measured", "models"),
+    ("brdf", "navigation", "models"),
+    ("brdf", "published", "dynamic"),
     ("brdf", "published", "models"),
     ("brdf", "published", "separable"),
     ("brdf", "scattered", "measured"),
@@ -36,6 +39,7 @@ SIDEWAYS = {
     ("scene", "mesh", "mesh_file"),
     ("brdf", "published", "lobe"),
     ("brdf", "published", "lobe_em"),
+    ("relight", "dynamic", "direct"),
     ("sphere", "harmonics", "cubemap"),
     ("sphere", "hemisphere", "directions"),
     ("sphere", "rotation", "harmonics"),
@@ -45,6 +49,7 @@ SIDEWAYS = {
     ("transport", "clustered", "separable"),
     ("transport", "direct", "blocks"),
     ("transport", "direct", "visibility"),
+    ("transport", "dynamic", "direct"),
     ("transport", "lobe", "direct"),
     ("transport", "lobe", "harmonic"),
     ("transport", "quantized", "sparse"),

@@ -1,7 +1,20 @@
 """BRDFs: analytic models, and the form that each system gives them."""
 
-from jaxprt.brdf import cylinders, harmonic, lobe, lobe_em, measured, models, published, scattered, separable
+from jaxprt.brdf import (
+    cylinders,
+    dynamic,
+    harmonic,
+    lobe,
+    lobe_em,
+    measured,
+    models,
+    navigation,
+    published,
+    scattered,
+    separable,
+)
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
+from jaxprt.brdf.dynamic import DynamicBrdf
 from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.brdf.lobe import LobeBrdf
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
@@ -21,6 +34,7 @@ __all__ = [
     "AshikhminShirley",
     "BlinnPhong",
     "CookTorrance",
+    "DynamicBrdf",
     "HarmonicBrdf",
     "Lafortune",
     "Lambert",
@@ -31,6 +45,7 @@ __all__ = [
     "Ward",
     "WardDuer",
     "cylinders",
+    "dynamic",
     "harmonic",
     "load_lafortune",
     "load_merl",
@@ -40,6 +55,7 @@ __all__ = [
     "lobe_em",
     "measured",
     "models",
+    "navigation",
     "published",
     "scattered",
     "separable",

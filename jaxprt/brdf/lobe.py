@@ -83,21 +83,18 @@ class LobeBrdf(eqx.Module):
     def at(self, *parameter: Float[Array, ""]) -> "LobeBrdf":
         """The table for given parameters, which then have no axes; values outside the knots count as the nearest knot.
 
-        Differentiable in the parameters: linear between knots.
+        Differentiable in the parameters; between knots as `mean` has it.
 
         Raises:
             ValueError: The number of parameters is not that of the table.
         """
         if len(parameter) != len(self.knot):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
-        mean, scale, weight, diffuse = self.mean, self.scale, self.weight, self.diffuse
+        result = self
         for knot, value in zip(self.knot, parameter, strict=True):
-            low, share = grid.neighbors(grid.place(knot, value), size=len(knot))
-            mean, scale, weight, diffuse = (
-                jnp.take(each, low, axis) * (1 - share) + jnp.take(each, low + 1, axis) * share
-                for each, axis in ((mean, 2), (scale, 1), (weight, 2), (diffuse, 1))
-            )
-        return LobeBrdf(mean, scale, weight, diffuse, (), self.error)
+            low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
+            result = mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
+        return result
 
     def lookup(self, wo: Float[Array, "v 3"]) -> Lobes:
         """Lobes for some views, interpolated between the nodes; without weight where the view is below the horizon.
@@ -137,6 +134,20 @@ class LobeBrdf(eqx.Module):
         density = jnp.exp(mixture.log_peak(lobe.concentration) - lobe.concentration * away)
         value = jnp.sum(lobe.weight * density, 1) + lobe.diffuse * wi[:, 2] / np.pi
         return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, len(self.weight))
+
+
+def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
+    """Lobes between those along the first parameter of a table, which then has no axis.
+
+    Each lobe lies, and is as wide, as in the mean of the BRDFs by its weight in them: one that a BRDF has no light in
+    has no say there. Weights are linear in the shares.
+    """
+    share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
+    part = share * (jnp.sum(table.weight, 0) + _TINY)
+    part = part / jnp.sum(part, 1, keepdims=True)
+    place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
+    scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)
+    return LobeBrdf(place, scale, weight, diffuse, table.knot[1:], table.error)
 
 
 class Remainder(eqx.Module):
@@ -197,7 +208,7 @@ def tabulate(
         )
     knots = grid.checked(knot)
     made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
-    isotropic = all(_isotropic(each) for each in made)
+    isotropic = all(is_isotropic(each) for each in made)
     points = itertools.product(*knots)
     both = [_sampled(each, resolution, isotropic, point) for each, point in zip(made, points, strict=True)]
     wo, samples = both[0][0], [each for _, each in both]
@@ -220,7 +231,7 @@ def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], t
         ValueError: The BRDF is negative or not finite, or has no axis for colors.
     """
     brdf = grid.as_argument(brdf)
-    return _sampled(brdf, resolution, _isotropic(brdf), ())
+    return _sampled(brdf, resolution, is_isotropic(brdf), ())
 
 
 def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> tuple[Array, tuple[Array, ...]]:
@@ -271,7 +282,7 @@ def _nodes(resolution: int, isotropic: bool) -> Float[Array, "*q 3"]:
     return jnp.asarray(wo, jnp.result_type(float))
 
 
-def _isotropic(brdf: Callable) -> bool:
+def is_isotropic(brdf: Callable) -> bool:
     """Whether turning both directions about the normal changes nothing, at a few hundred random pairs."""
     height, angle, turn = np.split(np.random.default_rng(0).uniform(size=(5, 256)), [2, 4])
     height, angle = 0.05 + 0.95 * height, 2 * np.pi * angle

@@ -1,17 +1,17 @@
-"""Forms of BRDFs as published: eigenvectors of each color; one normalized term; lobes around the mirror direction.
+"""Forms of BRDFs as published: eigenvectors of each color, one normalized term, mirror lobes, tensors of sets.
 
 Maps are orthographic or polar. Either samples the BRDF at its texels; every texel counts by the integral of
 cos(theta) d omega over it. On the orthographic disk these are all equal, so that the matrix is the published one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxprt.brdf import lobe, lobe_em, models
+from jaxprt.brdf import dynamic, lobe, lobe_em, models
 from jaxprt.brdf.separable import SeparableBrdf, tabulate
 from jaxprt.linalg import eigen, mixture
 from jaxprt.sphere import hemisphere
@@ -191,3 +191,30 @@ def mirror_lobes(
     scale = jnp.broadcast_to(jnp.log(concentration)[:, None], (len(angles), len(mean))).reshape(-1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
     return lobe.LobeBrdf(table, scale, weight, 0 * weight[:, 0], (), jnp.asarray(jnp.nan, mean.dtype))
+
+
+def factor_tensor(
+    brdfs: Sequence[Callable], *, ranks: tuple[int, int, int] = (4, 8, 8), resolution: int = 48
+) -> dynamic.DynamicBrdf:
+    """Decomposes a set of BRDFs, sampled at the texels of the orthographic disk.
+
+    Optimal in the Frobenius norm of the disk, which the largest values, those of sharp lobes and at grazing angles,
+    dominate: prefer `jaxprt.brdf.dynamic.factor` unless the published form itself is wanted. Lobes are
+    narrower than its texels and cannot be taken out of these samples; with lobes, too, take the other. The error is
+    relative, in the same norm.
+
+    Arguments, result and errors as of `jaxprt.brdf.dynamic.factor`.
+
+    Reference: Sun et al. 2007, section 3.2, equation 2.
+    """
+    dynamic.check(brdfs, None)
+    direction, area = _texels(resolution, hemisphere.disk_coordinates)
+    # Texels outside the disk, which bilinear lookup needs at the rim, count next to nothing.
+    flux = jnp.sqrt(jnp.maximum(area, 1e-6 * jnp.max(area)))
+    tensor = jnp.asarray(np.stack([np.asarray(tabulate(brdf, direction) * flux) for brdf in brdfs]))
+    dynamic.check_values([jnp.min(tensor, (1, 2, 3))])
+    whole = jnp.sum(jnp.sum(tensor**2, (0, 1, 3)) * area)
+    rest = (None, dynamic.stacked(brdfs))
+    return dynamic.decompose(
+        tensor, jnp.diag(1 / flux), jnp.sqrt(area), whole, ranks, rest, hemisphere.disk_coordinates
+    )

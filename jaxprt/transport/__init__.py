@@ -4,6 +4,7 @@ from jaxprt.transport import (
     blocks,
     clustered,
     direct,
+    dynamic,
     harmonic,
     interreflection,
     lobe,
@@ -14,6 +15,7 @@ from jaxprt.transport import (
 )
 from jaxprt.transport.clustered import ClusteredTransport
 from jaxprt.transport.direct import DirectTransport
+from jaxprt.transport.dynamic import DynamicTransport
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector
 from jaxprt.transport.lobe import LobeTransport
 from jaxprt.transport.quantized import QuantizedTransport
@@ -22,6 +24,7 @@ from jaxprt.transport.sparse import SparseTransport
 __all__ = [
     "ClusteredTransport",
     "DirectTransport",
+    "DynamicTransport",
     "LobeTransport",
     "QuantizedTransport",
     "SparseTransport",
@@ -30,6 +33,7 @@ __all__ = [
     "blocks",
     "clustered",
     "direct",
+    "dynamic",
     "harmonic",
     "interreflection",
     "lobe",

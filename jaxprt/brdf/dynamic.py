@@ -1,0 +1,369 @@
+"""A set of BRDFs in a form that can change at run time: lobes of each, and what they leave as one small tensor.
+
+    f(h, wi, wo) ~ lobes_h(wi, wo) + sum_ijk D(i, j, k) U^h(h, i) U^wo(wo, j) U^wi(wi, k)
+
+Transport needs the light factors U^wi alone, which all BRDFs of the set share. A BRDF chosen at run time is a
+separable one on these, with view maps of its own, and a table of lobes. Diffuse parts are kept out of the set: every
+transport has a term for them. The set is gray where its BRDFs are; of colored ones each color is a BRDF of its own.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import grid, lobe_em
+from jaxprt.brdf import lobe as lobes
+from jaxprt.brdf.lobe import LobeBrdf
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.linalg import mixture, tucker
+from jaxprt.sphere import harmonics, hemisphere
+
+_DEGREE = 24  # of the natural light that the factors are chosen for
+_RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
+_GRAZING = 1e-3  # least cosine that a product with it is divided by
+_SWEEPS = 2
+_NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
+_RANK = 1e-3  # of the largest singular value, below which float32 has no more
+
+
+class Mixed(eqx.Module):
+    """The BRDF at one place of a set; `__call__` gives its value in 1/sr, as far as lobes and terms carry it.
+
+    Attributes:
+        terms: What the lobes leave.
+        lobe: The lobes, if the set has any.
+        brdf: The model whose parameters are the mean of those of the set, where they have such a mean.
+    """
+
+    terms: SeparableBrdf
+    lobe: LobeBrdf | None
+    brdf: Callable | None
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr; zero below the horizon."""
+        value = self.terms(wi, wo)
+        if self.lobe is None:
+            return value
+        return value + self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
+
+
+class DynamicBrdf(eqx.Module):
+    """A set of BRDFs, without their diffuse parts.
+
+    Attributes:
+        core: D, with as many numbers along each axis as its rank: of the set, of the view, of the light.
+        factor: U^h of each BRDF and color, gray or per color.
+        view_map: U^wo on the view direction.
+        light_map: U^wi on the incident direction, in 1/sr; view factors of a BRDF have a mean square of about one.
+        lobe: Lobes of each BRDF, along the one parameter of the table; none if None.
+        brdf: The set as one model whose parameters have a leading axis; None where the BRDFs have no such form.
+        error: Relative L2 error of the light that all BRDFs reflect to all views, under light of natural spectrum.
+        coordinates: From local direction to coordinates in the maps.
+    """
+
+    core: Float[Array, "h o i"]
+    factor: Float[Array, "m c h"]
+    view_map: Float[Array, "o n n"]
+    light_map: Float[Array, "i n n"]
+    lobe: LobeBrdf | None
+    brdf: Callable | None
+    error: Float[Array, ""]
+    coordinates: Callable = eqx.field(static=True, default=hemisphere.parabolic_coordinates)
+
+    @property
+    def size(self) -> int:
+        """Number of BRDFs in the set."""
+        return self.factor.shape[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the tensor and of the lobes."""
+        tensor = (self.core, self.factor, self.view_map, self.light_map)
+        return sum(each.nbytes for each in tensor) + (0 if self.lobe is None else self.lobe.nbytes)
+
+    def at(self, share: Float[Array, " m"]) -> Mixed:
+        """The BRDF with given shares of those in the set, as `jaxprt.brdf.navigation` makes them from coordinates.
+
+        Terms are mixed; lobes move, from the place and width they have in one BRDF to those they have in the next,
+        unless they are where all have them, as the published ones. Differentiable in the shares.
+        """
+        view = jnp.einsum("m,mch,hoi,oyx->iyxc", share, self.factor, self.core, self.view_map)
+        terms = SeparableBrdf(self.light_map[..., None], view, self.error, self.coordinates)
+        return Mixed(terms, _mean(self.lobe, share), jax.tree.map(lambda x: jnp.tensordot(share, x, 1), self.brdf))
+
+
+def _mean(table: LobeBrdf | None, share: Array) -> LobeBrdf | None:
+    return None if table is None else lobes.mean(table, share)
+
+
+def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable | None = None) -> LobeBrdf:
+    """Lobes of every BRDF of a set, as one table along the number of the BRDF.
+
+    Args:
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr, all isotropic or none.
+        lobes: Number of free lobes, which `jaxprt.brdf.lobe.tabulate` fits; or
+        separator: what makes a table of one BRDF: `jaxprt.brdf.published.mirror_lobes` for the published form.
+
+    Raises:
+        ValueError: No BRDFs, some isotropic and some not, or as of `jaxprt.brdf.lobe.tabulate`.
+
+    Reference: Sun et al. 2007, section 4.1.
+    """
+    if not brdfs:
+        raise ValueError("brdfs must be at least one, got none")
+    tables = [_fit(each, lobes) if separator is None else separator(each) for each in brdfs]
+    if len({each.isotropic for each in tables}) > 1:
+        found = ", ".join("isotropic" if each.isotropic else "anisotropic" for each in tables)
+        raise ValueError(f"brdfs must be all isotropic or none, got {found}")
+    colors = max(len(each.weight) for each in tables)
+
+    def stack(name: str, axis: int, colored: bool = False) -> Array:
+        every = [getattr(each, name) for each in tables]
+        if colored:
+            every = [jnp.broadcast_to(each, (colors, *each.shape[1:])) for each in every]
+        return jnp.stack(every, axis)
+
+    number = jnp.arange(len(tables), dtype=tables[0].scale.dtype)
+    error = jnp.max(jnp.stack([each.error for each in tables]))
+    parts = (stack("mean", 2), stack("scale", 1), stack("weight", 2, True), stack("diffuse", 1, True))
+    return LobeBrdf(*parts, (number,), error)
+
+
+def _fit(brdf: Callable, count: int) -> LobeBrdf:
+    return lobes.tabulate(brdf, lobes=count)
+
+
+def factor(
+    brdfs: Sequence[Callable],
+    lobe: LobeBrdf | None = None,
+    *,
+    ranks: tuple[int, int, int] | None = None,
+    resolution: int = 32,
+) -> DynamicBrdf:
+    """Makes a set of BRDFs of their lobes, and decomposes what these leave, for the light that it will meet.
+
+    Of eight free lobes a percent of the light is left, and terms of that change nothing that can be seen: they need no
+    ranks. The published lobes, or none, do.
+
+    The tensor is the light that each BRDF reflects to each view from each spherical harmonic, weighted as natural light
+    has it: least squares for the picture, as in `jaxprt.brdf.separable.factor`, whatever sharp peaks there are. Maps
+    are parabolic, and light maps limited to the band of the harmonics. The published norm and maps are
+    `jaxprt.brdf.published.factor_tensor`.
+
+    Args:
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
+        lobe: Their lobes, from `separate`; None decomposes the BRDFs whole.
+        ranks: Factors of the set, of the view and of the light; no terms if None. The published ones are (4, 8, 8) for
+            Cook-Torrance's model, 3 of the set for Blinn-Phong's.
+        resolution: Edge of the square maps in texels.
+
+    Returns:
+        The set. Its error is what lobes and terms together leave; without terms the largest error of the lobes.
+
+    Raises:
+        ValueError: Neither lobes nor ranks, no BRDFs, lobes of another number of them, BRDFs that are negative or not
+            finite or of unequal numbers of colors, a rank below 1 or above the tensor's size, or a resolution below 4.
+
+    Reference: Sun et al. 2007, section 3.2, equation 2, with the prior in place of their Frobenius norm.
+    """
+    if resolution < 4:
+        raise ValueError(f"resolution must be at least 4, got {resolution}")
+    check(brdfs, lobe)
+    together = stacked(brdfs)
+    if ranks is None:
+        if lobe is None:
+            raise ValueError("a set needs lobes, or ranks of a tensor, or both; got neither")
+        colors, dtype = len(lobe.weight), lobe.scale.dtype
+        core, along, maps = (jnp.zeros(x, dtype) for x in ((0, 0, 0), (len(brdfs), colors, 0), (0, 4, 4)))
+        return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
+    direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
+    center = 2 * (np.arange(resolution) + 0.5) / resolution - 1
+    square = (center**2 + center[:, None] ** 2).ravel()
+    area = jnp.asarray(np.where(square < 1, 4 / (1 + square) ** 2, 0) * (2 / resolution) ** 2, direction.dtype)
+    if together is None:
+        each = [
+            (jax.tree.map(lambda x: x[None], grid.as_argument(brdf)), None if lobe is None else _one(lobe, number))
+            for number, brdf in enumerate(brdfs)
+        ]
+    else:
+        each = [(together, lobe)]
+    # Of isotropic BRDFs one view of each height is enough.
+    turned = all(map(lobes.is_isotropic, brdfs))
+    view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
+    found = [_reflected(*pair, jnp.arange(1 if together is None else len(brdfs)), view) for pair in each]
+    check_values([least for _, _, least in found])
+    tensor = jnp.concatenate([rest[:, :, back] for rest, _, _ in found])
+    if turned:
+        tensor = _turn(tensor, direction)
+    whole = jnp.sum(jnp.concatenate([square for _, square, _ in found])[:, :, back] * area)
+    # Light maps are smooth functions whose reflection is the one that is wanted.
+    flux = direction[:, 2:] * area[:, None]
+    light = harmonics.evaluate(direction, degree=_DEGREE)
+    value, vector = np.linalg.eigh(np.asarray(light.T @ (light * flux), np.float64))
+    known = value > _NULL * value[-1]
+    smooth = (vector[:, known] / value[known]) @ vector[:, known].T
+    to_map = jnp.asarray(smooth / _prior()[:, None], light.dtype) @ light.T
+    return decompose(tensor, to_map, jnp.sqrt(area), whole, ranks, (lobe, together), hemisphere.parabolic_coordinates)
+
+
+def decompose(
+    tensor: Float[Array, "m c d b"],
+    to_map: Float[Array, "b e"],
+    weight: Float[Array, " d"],
+    whole: Float[Array, ""],
+    ranks: tuple[int, int, int],
+    rest: tuple[LobeBrdf | None, Callable | None],
+    coordinates: Callable,
+) -> DynamicBrdf:
+    """Tucker decomposition of what a set of BRDFs reflects, and the maps of its factors.
+
+    View maps and then light maps are least squares with all other factors as they are, also on texels of no weight.
+
+    Args:
+        tensor: What each BRDF and color reflects to the view of each texel from each of some kinds of light.
+        to_map: Light maps of what reflects one kind of light each.
+        weight: Root of what the square of each view counts.
+        whole: Squared norm of what the whole BRDFs reflect.
+        ranks: As of `factor`.
+        rest: Lobes and model of the set.
+        coordinates: Of the maps.
+
+    Raises:
+        ValueError: Ranks below 1 or above the tensor's size.
+    """
+    count, colors = tensor.shape[:2]
+    inside = np.flatnonzero(np.asarray(weight))
+    most = (count * colors, len(inside), tensor.shape[3])
+    if len(ranks) != 3 or any(not 1 <= r <= n for r, n in zip(ranks, most, strict=True)):
+        raise ValueError(f"ranks must be three, from 1 to the tensor's size {most}, got {ranks}")
+    flat = tensor.reshape(count * colors, *tensor.shape[2:])
+    met = flat[:, inside] * weight[inside, None]
+    found, _ = tucker.hooi(met, ranks=ranks, sweeps=_SWEEPS)
+    core, (along, _, across) = found.core, found.factor
+    seen = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, view, k]
+    unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)
+    view = jnp.moveaxis(seen, 1, 0).reshape(len(weight), -1) @ jnp.linalg.pinv(unfolded, rtol=_RANK)
+    made = jnp.einsum("mh,hok,do->mdk", along, core, view * weight[:, None])[:, inside]
+    square = jnp.einsum("mdk,mdl->kl", made, made)
+    light = jnp.linalg.pinv(square, rtol=_RANK**2, hermitian=True) @ jnp.einsum("mdk,mdb->kb", made, met)
+    left = jnp.vdot(met, met) - jnp.vdot(light, square @ light)
+    # Light maps carry the size, so that what compresses transport knows what each is worth.
+    size = jnp.sqrt(jnp.diagonal(square) / (jnp.sum(weight**2) * count * colors))
+    edge = math.isqrt(len(weight))
+    return DynamicBrdf(
+        core / jnp.where(size > 0, size, 1),
+        along.reshape(count, colors, -1),
+        view.T.reshape(-1, edge, edge),
+        (size[:, None] * light @ to_map).reshape(-1, edge, edge),
+        *rest,
+        jnp.sqrt(jnp.maximum(left, 0) / jnp.where(whole > 0, whole, 1)),
+        coordinates,
+    )
+
+
+def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None) -> None:
+    """Refuses a set without BRDFs, and lobes that are not those of the set."""
+    if not brdfs:
+        raise ValueError("brdfs must be at least one, got none")
+    if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
+        raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
+    colors = [brdf(*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
+    if len(set(colors)) > 1 or len(colors[0]) != 2 or colors[0][1] not in (1, 3):
+        raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(colors)}")
+
+
+def check_values(least: Sequence[Float[Array, " m"]]) -> None:
+    """Refuses BRDFs by their least values, which are not a number where any is not finite."""
+    value = np.concatenate([np.asarray(each) for each in least])
+    wrong = np.flatnonzero(~(value >= 0))
+    if wrong.size:
+        raise ValueError(
+            f"a BRDF must be finite and not negative above the horizon, {wrong.size} of {len(value)} are not, first "
+            f"number {wrong[0]}"
+        )
+
+
+def stacked(brdfs: Sequence[Callable]) -> Callable | None:
+    """One model whose parameters have a leading axis along the set, if all BRDFs are of one kind."""
+    leaves = [jax.tree.leaves(each) for each in brdfs]
+    kinds = {(jax.tree.structure(each), tuple(map(jnp.shape, own))) for each, own in zip(brdfs, leaves, strict=True)}
+    if len(kinds) > 1 or not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
+        return None
+    return jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs)
+
+
+def _times_cosine(lobe: LobeBrdf, wi: Float[Array, "d 3"], wo: Float[Array, "3"]) -> Float[Array, "d c"]:
+    """Lobes of one view, which are looked up once."""
+    found = lobe.lookup(wo[None])
+    mean, concentration, weight = found.mean[..., 0], found.concentration[:, 0], found.weight[..., 0]
+    away = jnp.sum((wi[:, :, None] - mean) ** 2, 1) / 2
+    density = jnp.exp(mixture.log_peak(concentration) - concentration * away)
+    return density @ weight.T + found.diffuse[:, 0] * wi[:, 2:] / np.pi
+
+
+@jax.jit
+def _reflected(
+    brdf: Callable, lobe: LobeBrdf | None, number: Array, view: Float[Array, "d 3"]
+) -> tuple[Float[Array, "m c d b"], Float[Array, "m c d"], Float[Array, " m"]]:
+    """What is left of each harmonic reflected to each view, the square of the whole, and the least value of a BRDF."""
+    prior = jnp.asarray(_prior(), view.dtype)
+
+    def row(wo):
+        wi, area = hemisphere.arcs(lobe_em.mirror(wo), rings=_RINGS, sectors=_SECTORS)
+        cosine = jnp.maximum(wi[:, 2:], 0)
+        light = harmonics.evaluate(wi, degree=_DEGREE) * (area[:, None] * prior)
+
+        def values(number, brdf, lobe):
+            value = brdf(wi, jnp.broadcast_to(wo, wi.shape))
+            least = jnp.min(jnp.where(jnp.isfinite(value), value, -1))
+            value = value * cosine
+            return value, value if lobe is None else value - _times_cosine(lobe, wi, wo), least
+
+        table = None if lobe is None else _first(lobe)
+        whole, rest, least = jax.vmap(values)(number, brdf, table)
+        whole, rest = (jnp.einsum("mdc,db->mcb", each, light) for each in (whole, rest))
+        return rest, jnp.sum(whole**2, -1), least
+
+    rest, square, least = jax.lax.map(row, view)
+    return jnp.moveaxis(rest, 0, 2), jnp.moveaxis(square, 0, 2), jnp.min(least, 0)
+
+
+def _heights(direction: Array) -> tuple[Array, np.ndarray]:
+    """A view in the x z plane for each height among some, and which of these every direction has."""
+    height, first, back = np.unique(np.round(np.asarray(direction)[:, 2], 5), return_index=True, return_inverse=True)
+    height = np.asarray(direction)[first, 2]
+    return jnp.stack([jnp.sqrt(1 - height**2), 0 * height, height], -1), back
+
+
+@jax.jit
+def _turn(tensor: Float[Array, "m c d b"], direction: Float[Array, "d 3"]) -> Float[Array, "m c d b"]:
+    """Harmonics of what is reflected to views in the x z plane, turned about the normal to where the views are."""
+    azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])
+    order = np.concatenate([np.arange(-each, each + 1) for each in range(_DEGREE + 1)])
+    opposite = np.arange(len(order)) - 2 * order
+    angle = azimuth[:, None] * order
+    return tensor * jnp.cos(angle) - tensor[..., opposite] * jnp.sin(angle)
+
+
+def _first(table: LobeBrdf) -> LobeBrdf:
+    """A table with the axis of its set first, for vmap."""
+    mean, weight = jnp.moveaxis(table.mean, 2, 0), jnp.moveaxis(table.weight, 2, 0)
+    scale, diffuse = jnp.moveaxis(table.scale, 1, 0), jnp.moveaxis(table.diffuse, 1, 0)
+    return LobeBrdf(mean, scale, weight, diffuse, (), jnp.broadcast_to(table.error, (len(mean),)))
+
+
+def _one(table: LobeBrdf, number: int) -> LobeBrdf:
+    """Lobes of one of the set, as a set of it alone."""
+    part = slice(number, number + 1)
+    mean, weight = table.mean[:, :, part], table.weight[:, :, part]
+    return LobeBrdf(mean, table.scale[:, part], weight, table.diffuse[:, part], table.knot, table.error)
+
+
+def _prior() -> np.ndarray:
+    """Size of each harmonic in natural light."""
+    return np.concatenate([np.full(2 * each + 1, 1 / (each + 0.5)) for each in range(_DEGREE + 1)])

@@ -1,0 +1,252 @@
+"""Relighting with materials that change: light, view and the BRDF of every region are free.
+
+    B(x, wo) = sum_ijk D(i, j, k) U^h(h, i) U^wo(wo, j) sum_l C_l U_x^I(l, k) + lobes + diffuse
+
+A change of light redoes `light_side`, a change of view or of materials `view_side`; the caller keeps the other, and
+`combine` makes radiance of both.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxprt.brdf.dynamic import DynamicBrdf, Mixed
+from jaxprt.brdf.models import Lambert
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.relight import direct, lobe, separable
+from jaxprt.relight.lobe import LobeLight, LobeView
+from jaxprt.scene.environment import Environment
+from jaxprt.transport.dynamic import DynamicTransport, RegionTransport
+from jaxprt.transport.lobe import LobeTransport
+
+
+class Material(eqx.Module):
+    """What a region is made of at present.
+
+    Attributes:
+        share: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
+        diffuse: Albedo of the diffuse part: gray, a color, or a texture of one for each vertex of the mesh.
+        specular: What the BRDF of the set is multiplied by; the same.
+    """
+
+    share: Float[Array, " m"]
+    diffuse: Float[Array, "*v c"]
+    specular: Float[Array, "*v c"]
+
+
+class DynamicLight(eqx.Module):
+    """What a light is for all regions.
+
+    Attributes:
+        met: What each row and term of each region takes of it.
+        blurred: The same light for lobes; None where no region has any.
+        texel: Its brightest texels, which are lit by one by one.
+        excess: Their radiance.
+    """
+
+    met: tuple[Float[Array, "_ _ c"], ...]
+    blurred: LobeLight | None
+    texel: Int[Array, " t"]
+    excess: Float[Array, "t c"]
+
+
+class RegionView(eqx.Module):
+    """What a view and a material are for one region.
+
+    Attributes:
+        brdf: The BRDF.
+        factor: Of each row and term without the diffuse one, if there are others.
+        looked: Where rows read the light for their lobes, if there are any.
+        diffuse: Albedo of each row, zero where it looks away; None in a region that does not change.
+        specular: What all but the diffuse part is multiplied by, of each row or of all; likewise.
+    """
+
+    brdf: Mixed | SeparableBrdf
+    factor: Float[Array, "q r c"] | None
+    looked: LobeView | None
+    diffuse: Float[Array, "q d"] | None
+    specular: Float[Array, "_ e"] | None
+
+
+class DynamicView(eqx.Module):
+    """What a view and all materials are.
+
+    Attributes:
+        eye: Position of the viewer in world units.
+        region: Of each region.
+    """
+
+    eye: Float[Array, "3"]
+    region: tuple[RegionView, ...]
+
+
+def radiance(
+    transport: DynamicTransport,
+    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    materials: Sequence[Material | None],
+    light: Environment,
+    *,
+    eye: Float[Array, "3"],
+    texels: int = 16,
+) -> Float[Array, "v c"]:
+    """Radiance that each vertex sends to the eye.
+
+    Args:
+        transport: Precomputed transport.
+        brdfs: Of each region, those that the transport was made for.
+        materials: Of each region, what it is made of at present; None where that does not change.
+        light: The environment.
+        eye: Position of the viewer in world units.
+        texels: How many of the brightest texels light the vertices one by one, exactly.
+
+    Returns:
+        Linear radiance per vertex in the light's units; slightly negative values occur at shadow boundaries.
+        Differentiable in the light, the eye and the materials.
+
+    Raises:
+        ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
+            be, shares of another number of BRDFs, or a light of another size.
+
+    Reference: Sun et al. 2007, equation 3 with direct lighting, and section 4.1.
+    """
+    lit = light_side(transport, light, texels=texels)
+    return combine(transport, lit, view_side(transport, brdfs, materials, eye=eye))
+
+
+def light_side(transport: DynamicTransport, light: Environment, *, texels: int = 16) -> DynamicLight:
+    """What changes with the light.
+
+    Arguments and errors as of `radiance`.
+    """
+    size = transport.size
+    if light.radiance.shape[:-1] != (6, size, size):
+        raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
+    texel, excess, rest = direct.split(light, count=texels)
+    met = tuple(each.terms.apply(separable.project(rest)) for each in transport.region)
+    blurred = None
+    if any(_has_pyramid(each) for each in transport.region):
+        blurred = lobe.prefilter(rest)
+        blurred = LobeLight(blurred.level, blurred.coefficient[:0], blurred.size)
+    return DynamicLight(met, blurred, texel, excess)
+
+
+def view_side(
+    transport: DynamicTransport,
+    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    materials: Sequence[Material | None],
+    *,
+    eye: Float[Array, "3"],
+) -> DynamicView:
+    """What changes with the view and the materials.
+
+    Arguments and errors as of `radiance`.
+    """
+    count = len(transport.region)
+    if len(brdfs) != count or len(materials) != count:
+        raise ValueError(
+            f"there must be a BRDF and a material for each of {count} regions, got {len(brdfs)} and {len(materials)}"
+        )
+    region = []
+    for number, (own, brdf, material) in enumerate(zip(transport.region, brdfs, materials, strict=True)):
+        _check(number, own, brdf, material, len(transport.place))
+        if isinstance(brdf, SeparableBrdf):
+            region.append(RegionView(brdf, separable.view_tuple(own.terms, brdf, eye), None, None, None))
+            continue
+        assert material is not None
+        mixed = _mixed(brdf, material.share)
+        looked = None if mixed.lobe is None else lobe.look(own.seen, mixed.lobe, eye=eye)
+        diffuse, specular = (_by_row(each, own.vertex) for each in (material.diffuse, material.specular))
+        diffuse = _facing(diffuse, own.seen, eye)
+        factor = separable.view_tuple(own.terms, mixed.terms, eye) if mixed.terms.terms else None
+        region.append(RegionView(mixed, factor, looked, diffuse, specular))
+    return DynamicView(eye, tuple(region))
+
+
+def combine(transport: DynamicTransport, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
+    """Radiance of a view under a light.
+
+    Args:
+        transport: The transport of both.
+        light: From `light_side`.
+        view: From `view_side`.
+    """
+    result = []
+    for own, met, each in zip(transport.region, light.met, view.region, strict=True):
+        if isinstance(each.brdf, SeparableBrdf):
+            single = direct.radiance(own.seen, each.brdf, light.texel, light.excess, eye=view.eye)
+            result.append(separable.combine(met, each.factor) + single)
+            continue
+        model = each.brdf if each.brdf.brdf is None else each.brdf.brdf
+        single = direct.radiance(own.seen, model, light.texel, light.excess, eye=view.eye)
+        matte = direct.radiance(own.seen, Lambert(1.0), light.texel, light.excess, eye=view.eye)
+        glossy = None
+        if each.looked is not None:
+            glossy = lobe.combine(light.blurred, _glossy(each.looked)), each.looked.diffuse.T
+        result.append(_sum(met, each.factor, glossy, single, matte, each.diffuse, each.specular))
+    return _gathered(tuple(result), transport.place)
+
+
+@jax.jit
+def _mixed(brdf: DynamicBrdf, share: Array) -> Mixed:
+    return brdf.at(share)
+
+
+def _glossy(view: LobeView) -> LobeView:
+    """Lobes alone: their diffuse part is lit by the diffuse term."""
+    nothing = jnp.zeros_like(view.diffuse[:, :1])
+    return LobeView(view.place, view.share, view.weight, nothing, view.vector, view.size)
+
+
+@jax.jit
+def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
+    irradiance, result = met[:, -1], single
+    if factor is not None:
+        result = result + separable.combine(met[:, :-1], factor)
+    if glossy is not None:
+        lobes, base = glossy
+        result = result + lobes + irradiance * base
+    return result * specular + (irradiance + matte) * diffuse
+
+
+@jax.jit
+def _gathered(rows: tuple[Array, ...], place: Array) -> Array:
+    colors = max(each.shape[1] for each in rows)
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[place]
+
+
+@jax.jit
+def _facing(diffuse: Array, seen: LobeTransport, eye: Array) -> Array:
+    """Albedo of the rows that the eye can see; of the others nothing."""
+    above = jnp.sum(seen.frame[:, 2] * (eye - seen.position), 1) > 0
+    return jnp.where(above[:, None], diffuse, 0)
+
+
+def _by_row(value: Array, vertex: Array) -> Array:
+    return value[None] if value.ndim == 1 else value[vertex]
+
+
+def _has_pyramid(region: RegionTransport) -> bool:
+    return region.seen.level.shape[1] > 6 * region.seen.size**2 // 8
+
+
+def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:
+    """Refuses what does not fit a region."""
+    changes = isinstance(brdf, DynamicBrdf)
+    terms = brdf.light_map.shape[0] + changes
+    if terms != own.terms.terms or (changes and brdf.lobe is not None) != _has_pyramid(own):
+        raise ValueError(f"the BRDF of region {number} must be the one that its transport was made for")
+    if changes != (material is not None):
+        raise ValueError(f"region {number} {'needs a material' if changes else 'has one BRDF for good: give None'}")
+    if material is None:
+        return
+    if len(material.share) != brdf.size:
+        raise ValueError(f"the shares of region {number} must be of its {brdf.size} BRDFs, got {len(material.share)}")
+    for name in ("diffuse", "specular"):
+        shape = getattr(material, name).shape
+        if len(shape) > 2 or (len(shape) == 2 and shape[0] != vertices):
+            raise ValueError(
+                f"{name} of region {number} must be a color or one for each of {vertices} vertices, got {list(shape)}"
+            )
