@@ -4,8 +4,9 @@
 
 Three hundred random vertices of the bunny on its ground (from JAXPRT_DATA; a sphere where that is not set, and with
 --quick) from twenty views, under each light, against the sum over all texels; views within three degrees of the surface
-are left out, where the lobe of a smooth material falls between the centers of texels and that sum is no yardstick. Sixteen
-texels are summed exactly. `specular` is Cook-Torrance's model without a diffuse part, so that nothing hides the error.
+are left out, where the lobe of a smooth material falls between the centers of texels and that sum is no yardstick.
+Sixteen texels are summed exactly. `specular` is Cook-Torrance's model without a diffuse part, so that nothing hides the
+error.
 `seconds` is a frame in which light, view and BRDF are all new, on all the vertices taken. `unoccluded` is the error of
 the table itself, without shadows; `terms_error` that of sixteen separable terms with exact visibility and all texels.
 `remainder_errors`, of eight lobes, are what 4, 8 and 16 separable terms of the remainder leave, with exact visibility.

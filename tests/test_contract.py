@@ -78,6 +78,22 @@ HOST = {
     "brdf.separable.factor": "checks values, and chooses the number of terms by them",
     "brdf.lobe.tabulate": "checks values, and chooses the number of lobes by them",
     "brdf.lobe.sampled": "checks values",
+    "brdf.lobe.is_isotropic": "compares values",
+    "brdf.dynamic.separate": "checks values",
+    "brdf.dynamic.factor": "the same",
+    "brdf.dynamic.decompose": "the same",
+    "brdf.dynamic.check": "the same",
+    "brdf.dynamic.check_values": "the same",
+    "brdf.dynamic.stacked": "looks at types",
+    "brdf.navigation.triangulate": "by SciPy, where data enters",
+    "brdf.navigation.blinn_phong": "checks values",
+    "brdf.navigation.cook_torrance": "reads a file",
+    "brdf.published.factor_tensor": "checks values",
+    "transport.dynamic.precompute": "traces rays",
+    "transport.dynamic.compress": "runs workers and writes files",
+    "relight.dynamic.light_side": "gives indices; relight.dynamic.radiance has them all",
+    "relight.dynamic.view_side": "the same",
+    "relight.dynamic.combine": "takes indices; the same",
     "brdf.lobe_em": "the steps of brdf.lobe.tabulate, and tested through it",
     "brdf.published": "checks values",
     "brdf.separable.sample_error": "draws its own directions",
@@ -188,6 +204,42 @@ class Draw:
         mean = jnp.moveaxis(self.upper(lobes, 5), -1, 0)
         weight, diffuse = self.uniform(3, lobes, 5), self.uniform(3, 5)
         return brdf.LobeBrdf(mean, self.uniform(lobes, 5, low=1, high=3), weight, diffuse, (), self.uniform())
+
+    def changing(self, count=2):
+        """A set of BRDFs with lobes and terms."""
+        each = [self.lobes() for _ in range(count)]
+        stack = lambda name, axis: jnp.stack([getattr(one, name) for one in each], axis)  # noqa: E731
+        lobe = brdf.LobeBrdf(
+            stack("mean", 2),
+            stack("scale", 1),
+            stack("weight", 2),
+            stack("diffuse", 1),
+            (self.normal(count),),
+            self.uniform(),
+        )
+        maps = self.normal(2, 4, 4), self.normal(2, 4, 4)
+        return brdf.DynamicBrdf(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
+
+    def regions(self, size=8, vertices=3):
+        """Transport of one region for ``changing`` and ``light``."""
+        seen = self.pyramid(size, vertices=vertices)
+        small = transport.LobeTransport(seen.level, seen.vector[:0], seen.position, seen.frame, size)
+        row = jnp.arange(vertices)
+        terms = transport.ClusteredTransport(
+            self.integer(6 * size * size, 1, 5, dtype=jnp.uint16),
+            jnp.zeros((1, 5, 4), jnp.float16),
+            jnp.zeros((1, 4, 2, 3), jnp.float16),
+            self.normal(1, vertices, 2),
+            seen.position,
+            seen.frame,
+            row,
+            row,
+            self.uniform(6 * size * size),
+        )
+        # Stored in half precision; here in the one under test.
+        both = self.normal(1, 5, 4), self.normal(1, 4, 2, 3)
+        terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
+        return transport.DynamicTransport((transport.dynamic.RegionTransport(terms, small, row),), row)
 
     def mixture(self, lobes=2):
         """Wide lobes on the sphere."""
@@ -380,6 +432,14 @@ EXAMPLES = {
     "brdf.separable.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
     "brdf.harmonic.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
     "brdf.lobe.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
+    "brdf.lobe.mean": example(
+        lambda draw: call(draw.changing().lobe, draw.uniform(2)),
+        gradient=("table", "share"),
+    ),
+    "brdf.dynamic.Mixed": example(
+        lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
+    ),
+    "transport.dynamic.light_factors": example(lambda draw: call(draw.changing())),
     "brdf.lobe.Remainder": example(
         lambda draw: call(
             brdf.lobe.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
@@ -449,6 +509,18 @@ EXAMPLES = {
         ),
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "excess", "eye"),
+    ),
+    "relight.dynamic.radiance": example(
+        lambda draw: call(
+            each := draw.regions(),
+            (draw.changing(),),
+            (relight.dynamic.Material(draw.uniform(2), draw.uniform(3), draw.uniform(3, 3)),),
+            draw.light(8),
+            eye=draw.above(each.region[0].terms),
+        ),
+        # The BRDFs' light factors are in the transport.
+        gradient=("materials", "light", "eye"),
+        texels=3,
     ),
     "relight.lobe.prefilter": example(lambda draw: call(draw.light(8))),
     "relight.lobe.combine": example(

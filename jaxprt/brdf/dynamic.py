@@ -26,7 +26,6 @@ from jaxprt.sphere import harmonics, hemisphere
 _DEGREE = 24  # of the natural light that the factors are chosen for
 _RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
 _GRAZING = 1e-3  # least cosine that a product with it is divided by
-_SWEEPS = 2
 _NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
 _RANK = 1e-3  # of the largest singular value, below which float32 has no more
 
@@ -140,7 +139,7 @@ def _fit(brdf: Callable, count: int) -> LobeBrdf:
 
 def factor(
     brdfs: Sequence[Callable],
-    lobe: LobeBrdf | None = None,
+    lobe: LobeBrdf | None,
     *,
     ranks: tuple[int, int, int] | None = None,
     resolution: int = 32,
@@ -185,30 +184,24 @@ def factor(
     center = 2 * (np.arange(resolution) + 0.5) / resolution - 1
     square = (center**2 + center[:, None] ** 2).ravel()
     area = jnp.asarray(np.where(square < 1, 4 / (1 + square) ** 2, 0) * (2 / resolution) ** 2, direction.dtype)
-    if together is None:
-        each = [
-            (jax.tree.map(lambda x: x[None], grid.as_argument(brdf)), None if lobe is None else _one(lobe, number))
-            for number, brdf in enumerate(brdfs)
-        ]
-    else:
-        each = [(together, lobe)]
+    # All at once where they are of one kind, and else one by one.
+    parts = (
+        [(jax.tree.map(lambda x: x[None], grid.as_argument(each)), jnp.array([n])) for n, each in enumerate(brdfs)]
+        if together is None
+        else [(together, jnp.arange(len(brdfs)))]
+    )
     # Of isotropic BRDFs one view of each height is enough.
     turned = all(map(lobes.is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
-    found = [_reflected(*pair, jnp.arange(1 if together is None else len(brdfs)), view) for pair in each]
+    found = [_reflected(part, lobe, number, view) for part, number in parts]
     check_values([least for _, _, least in found])
     tensor = jnp.concatenate([rest[:, :, back] for rest, _, _ in found])
     if turned:
         tensor = _turn(tensor, direction)
     whole = jnp.sum(jnp.concatenate([square for _, square, _ in found])[:, :, back] * area)
-    # Light maps are smooth functions whose reflection is the one that is wanted.
-    flux = direction[:, 2:] * area[:, None]
-    light = harmonics.evaluate(direction, degree=_DEGREE)
-    value, vector = np.linalg.eigh(np.asarray(light.T @ (light * flux), np.float64))
-    known = value > _NULL * value[-1]
-    smooth = (vector[:, known] / value[known]) @ vector[:, known].T
-    to_map = jnp.asarray(smooth / _prior()[:, None], light.dtype) @ light.T
-    return decompose(tensor, to_map, jnp.sqrt(area), whole, ranks, (lobe, together), hemisphere.parabolic_coordinates)
+    return decompose(
+        tensor, _to_map(direction), jnp.sqrt(area), whole, ranks, (lobe, together), hemisphere.parabolic_coordinates
+    )
 
 
 def decompose(
@@ -243,7 +236,7 @@ def decompose(
         raise ValueError(f"ranks must be three, from 1 to the tensor's size {most}, got {ranks}")
     flat = tensor.reshape(count * colors, *tensor.shape[2:])
     met = flat[:, inside] * weight[inside, None]
-    found, _ = tucker.hooi(met, ranks=ranks, sweeps=_SWEEPS)
+    found = tucker.truncated(met, ranks=ranks)
     core, (along, _, across) = found.core, found.factor
     seen = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, view, k]
     unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)
@@ -291,8 +284,10 @@ def check_values(least: Sequence[Float[Array, " m"]]) -> None:
 def stacked(brdfs: Sequence[Callable]) -> Callable | None:
     """One model whose parameters have a leading axis along the set, if all BRDFs are of one kind."""
     leaves = [jax.tree.leaves(each) for each in brdfs]
+    if not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
+        return None
     kinds = {(jax.tree.structure(each), tuple(map(jnp.shape, own))) for each, own in zip(brdfs, leaves, strict=True)}
-    if len(kinds) > 1 or not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
+    if len(kinds) > 1:
         return None
     return jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs)
 
@@ -318,19 +313,29 @@ def _reflected(
         cosine = jnp.maximum(wi[:, 2:], 0)
         light = harmonics.evaluate(wi, degree=_DEGREE) * (area[:, None] * prior)
 
-        def values(number, brdf, lobe):
+        def values(number, brdf):
             value = brdf(wi, jnp.broadcast_to(wo, wi.shape))
             least = jnp.min(jnp.where(jnp.isfinite(value), value, -1))
             value = value * cosine
-            return value, value if lobe is None else value - _times_cosine(lobe, wi, wo), least
+            return value, value if lobe is None else value - _times_cosine(_one(lobe, number), wi, wo), least
 
-        table = None if lobe is None else _first(lobe)
-        whole, rest, least = jax.vmap(values)(number, brdf, table)
+        whole, rest, least = jax.vmap(values)(number, brdf)
         whole, rest = (jnp.einsum("mdc,db->mcb", each, light) for each in (whole, rest))
         return rest, jnp.sum(whole**2, -1), least
 
     rest, square, least = jax.lax.map(row, view)
     return jnp.moveaxis(rest, 0, 2), jnp.moveaxis(square, 0, 2), jnp.min(least, 0)
+
+
+def _to_map(direction: Array) -> Array:
+    """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
+    up = jnp.array([0, 0, 1], direction.dtype)
+    wi, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
+    light = np.asarray(harmonics.evaluate(wi, degree=_DEGREE), np.float64)
+    value, vector = np.linalg.eigh(light.T @ (light * np.asarray(wi[:, 2:] * area[:, None], np.float64)))
+    known = value > _NULL * value[-1]
+    inverse = (vector[:, known] / value[known]) @ vector[:, known].T / _prior()[:, None]
+    return jnp.asarray(inverse, direction.dtype) @ harmonics.evaluate(direction, degree=_DEGREE).T
 
 
 def _heights(direction: Array) -> tuple[Array, np.ndarray]:
@@ -350,18 +355,10 @@ def _turn(tensor: Float[Array, "m c d b"], direction: Float[Array, "d 3"]) -> Fl
     return tensor * jnp.cos(angle) - tensor[..., opposite] * jnp.sin(angle)
 
 
-def _first(table: LobeBrdf) -> LobeBrdf:
-    """A table with the axis of its set first, for vmap."""
-    mean, weight = jnp.moveaxis(table.mean, 2, 0), jnp.moveaxis(table.weight, 2, 0)
-    scale, diffuse = jnp.moveaxis(table.scale, 1, 0), jnp.moveaxis(table.diffuse, 1, 0)
-    return LobeBrdf(mean, scale, weight, diffuse, (), jnp.broadcast_to(table.error, (len(mean),)))
-
-
-def _one(table: LobeBrdf, number: int) -> LobeBrdf:
-    """Lobes of one of the set, as a set of it alone."""
-    part = slice(number, number + 1)
-    mean, weight = table.mean[:, :, part], table.weight[:, :, part]
-    return LobeBrdf(mean, table.scale[:, part], weight, table.diffuse[:, part], table.knot, table.error)
+def _one(table: LobeBrdf, number) -> LobeBrdf:
+    """Lobes of one of the set."""
+    mean, weight = table.mean[:, :, number], table.weight[:, :, number]
+    return LobeBrdf(mean, table.scale[:, number], weight, table.diffuse[:, number], (), table.error)
 
 
 def _prior() -> np.ndarray:

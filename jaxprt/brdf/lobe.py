@@ -136,6 +136,7 @@ class LobeBrdf(eqx.Module):
         return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, len(self.weight))
 
 
+@jax.jit
 def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     """Lobes between those along the first parameter of a table, which then has no axis.
 
@@ -143,7 +144,7 @@ def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     has no say there. Weights are linear in the shares.
     """
     share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
-    part = share * (jnp.sum(table.weight, 0) + _TINY)
+    part = share * jnp.sum(table.weight, 0) + _TINY
     part = part / jnp.sum(part, 1, keepdims=True)
     place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
     scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)

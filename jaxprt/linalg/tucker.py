@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxprt.linalg import eigen
 
+_BLOCK = 4096  # columns
+
 
 class Tucker(eqx.Module):
     """A core, and a matrix with orthonormal columns for each of its modes.
@@ -73,7 +75,7 @@ def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
     if slices.shape[2] == 1:
         return slices[..., 0].T @ slices[..., 0]
     if slices.shape[0] == 1:
-        return slices[0] @ slices[0].T
+        return _square(slices[0])
     size = slices.shape[1]
     return jax.lax.scan(lambda sum, each: (sum + each @ each.T, None), jnp.zeros((size, size), tensor.dtype), slices)[0]
 
@@ -180,6 +182,26 @@ def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
         left = np.cumsum(np.maximum(square, 0))  # from the smallest on
         result.append(max(1, len(square) - int(np.searchsorted(left, error**2 / tensor.ndim * left[-1], "right"))))
     return tuple(result)
+
+
+@jax.custom_jvp
+def _square(matrix: Array) -> Array:
+    """A wide matrix times its transpose, by blocks: one product would pack much of the matrix anew."""
+    count = matrix.shape[1] // _BLOCK
+    rest = matrix[:, count * _BLOCK :]
+
+    def add(total, start):
+        each = jax.lax.dynamic_slice_in_dim(matrix, start, _BLOCK, 1)
+        return total + each @ each.T, None
+
+    return jax.lax.scan(add, rest @ rest.T, _BLOCK * jnp.arange(count))[0] if count else rest @ rest.T
+
+
+@_square.defjvp
+def _square_jvp(primal, tangent):
+    # Transposed, the scan would add a whole matrix at each step.
+    product = tangent[0] @ primal[0].T
+    return _square(*primal), product + product.T
 
 
 def _slices(tensor: Array, mode: int) -> Array:

@@ -34,7 +34,7 @@ class Material(eqx.Module):
 
     share: Float[Array, " m"]
     diffuse: Float[Array, "*v c"]
-    specular: Float[Array, "*v c"]
+    specular: Float[Array, "*w d"]
 
 
 class DynamicLight(eqx.Module):
@@ -196,8 +196,7 @@ def _mixed(brdf: DynamicBrdf, share: Array) -> Mixed:
 
 def _glossy(view: LobeView) -> LobeView:
     """Lobes alone: their diffuse part is lit by the diffuse term."""
-    nothing = jnp.zeros_like(view.diffuse[:, :1])
-    return LobeView(view.place, view.share, view.weight, nothing, view.vector, view.size)
+    return LobeView(view.place, view.share, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
 
 
 @jax.jit

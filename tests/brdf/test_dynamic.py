@@ -1,0 +1,202 @@
+"""Sets of BRDFs: what lobes and tensors carry of each, and of those between them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, dynamic, lobe, published
+from jaxprt.sphere import hemisphere
+
+ROUGH = [0.25, 0.4, 0.6]
+RESOLUTION = 12
+
+
+def lobe_of(roughness, f0=0.3):
+    return CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0)
+
+
+SET = [lobe_of(m) for m in ROUGH]
+
+
+def fit(brdf):
+    """Fewer lobes and nodes than the default: the same code in a fraction of the time."""
+    return lobe.tabulate(brdf, lobes=3, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def lobes():
+    return dynamic.separate(SET, separator=fit)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Directions well above the horizon."""
+    random = np.random.default_rng(0)
+    vector = random.normal(size=(2, 400, 3))
+    vector[..., 2] = np.abs(vector[..., 2]) + 0.3
+    return jnp.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True), jnp.float32)
+
+
+def relative(value, exact):
+    return float(jnp.linalg.norm(value - exact) / jnp.linalg.norm(exact))
+
+
+def test_tables_of_a_set_are_those_of_its_brdfs(lobes):
+    for number, brdf in enumerate(SET):
+        alone = fit(brdf)
+        np.testing.assert_allclose(lobes.scale[:, number], alone.scale, rtol=1e-5)
+        np.testing.assert_allclose(lobes.weight[:, :, number], alone.weight, rtol=1e-5, atol=1e-7)
+    assert lobes.knot[0].tolist() == [0, 1, 2]
+
+
+def test_a_member_of_the_set_is_its_own_table(lobes, pairs):
+    table = dynamic.factor(SET, lobes)
+    wi, wo = pairs
+    for number, brdf in enumerate(SET):
+        mixed = table.at(jnp.eye(3)[number])
+        alone = fit(brdf)
+        np.testing.assert_allclose(mixed(wi, wo), alone(wi, wo) / wi[:, 2:], rtol=2e-3, atol=1e-5)
+
+
+def test_between_members_lobes_are_those_of_the_model_there(lobes, pairs):
+    """Halfway in the logarithm of the roughness, as far off as at the members."""
+    mixed = dynamic.factor(SET, lobes).at(jnp.array([0.5, 0.5, 0.0]))
+    model = lobe_of(np.sqrt(ROUGH[0] * ROUGH[1]))
+    wi, wo = pairs
+    member = relative(fit(SET[0])(wi, wo), SET[0](wi, wo) * wi[:, 2:])
+    assert relative(mixed(wi, wo) * wi[:, 2:], model(wi, wo) * wi[:, 2:]) < member + 0.06
+
+
+def test_between_fresnel_reflectances_lobes_without_light_have_no_say(pairs):
+    """A reflectance of zero has lobes at grazing angles alone; their places must not draw the others away."""
+    ends = [lobe_of(0.2, 0.0), lobe_of(0.2, 1.0)]
+    mixed = dynamic.factor(ends, dynamic.separate(ends, separator=fit)).at(jnp.array([0.7, 0.3]))
+    wi, wo = pairs
+    steep = (wo[:, 2] > 0.6)[:, None]
+    exact = jnp.where(steep, lobe_of(0.2, 0.3)(wi, wo), 0)
+    alone = fit(lobe_of(0.2, 0.3))(wi, wo) / wi[:, 2:]
+    assert relative(jnp.where(steep, mixed(wi, wo), 0), exact) < 1.5 * relative(jnp.where(steep, alone, 0), exact)
+
+
+def test_the_model_between_members_has_the_mean_of_their_parameters(lobes):
+    mixed = dynamic.factor(SET, lobes).at(jnp.array([0.5, 0.25, 0.25]))
+    assert isinstance(mixed.brdf, CookTorrance)
+    np.testing.assert_allclose(mixed.brdf.roughness, np.dot([0.5, 0.25, 0.25], ROUGH), rtol=1e-6)
+
+
+@pytest.mark.parametrize("ranks", [(1, 4, 4), (2, 8, 8), (3, 24, 24)])
+def test_the_error_of_a_tensor_is_that_of_what_it_reflects(ranks):
+    """Under a few harmonics, by a quadrature of its own."""
+    table = dynamic.factor(SET, None, ranks=ranks, resolution=24)
+    wrong, whole = 0.0, 0.0
+    for height in (0.35, 0.6, 0.9):
+        wo = jnp.array([np.sqrt(1 - height**2), 0, height], jnp.float32)
+        wi, area = hemisphere.arcs(wo * jnp.array([-1, 1, 1]), rings=32, sectors=48)
+        basis = jnp.stack([jnp.ones(len(wi)), *wi.T, wi[:, 0] * wi[:, 2]], 1) * (wi[:, 2:] * area[:, None])
+        view = jnp.broadcast_to(wo, wi.shape)
+        for number, brdf in enumerate(SET):
+            exact = basis.T @ brdf(wi, view)
+            wrong += float(jnp.sum((basis.T @ table.at(jnp.eye(3)[number])(wi, view) - exact) ** 2))
+            whole += float(jnp.sum(exact**2))
+    assert np.sqrt(wrong / whole) < 1.5 * float(table.error) + 0.02
+
+
+def test_errors_fall_with_ranks():
+    errors = [float(dynamic.factor(SET, None, ranks=r, resolution=RESOLUTION).error) for r in [(1, 2, 2), (2, 8, 8)]]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_lobes_leave_less_than_a_coarse_tensor(lobes):
+    both = dynamic.factor(SET, lobes, ranks=(2, 4, 4), resolution=RESOLUTION)
+    tensor = dynamic.factor(SET, None, ranks=(3, 16, 16), resolution=RESOLUTION)
+    assert both.error < 0.5 * tensor.error
+
+
+def test_turned_views_equal_views_one_by_one(monkeypatch):
+    fast = dynamic.factor(SET, None, ranks=(2, 4, 4), resolution=RESOLUTION)
+    monkeypatch.setattr(lobe, "is_isotropic", lambda brdf: False)
+    slow = dynamic.factor(SET, None, ranks=(2, 4, 4), resolution=RESOLUTION)
+    np.testing.assert_allclose(fast.error, slow.error, rtol=1e-3)
+    share = jnp.array([0.2, 0.5, 0.3])
+    view, other = (each.at(share).terms for each in (fast, slow))
+    both = [jnp.einsum("kxyl,kuvl->xyuv", each.light_map, each.view_map) for each in (view, other)]
+    assert relative(*both) < 1e-2
+
+
+def test_sets_of_unlike_functions_are_factored_one_by_one(pairs):
+    mixed = [lobe_of(0.4), BlinnPhong(diffuse=0.0, specular=0.5, exponent=20.0), lambda wi, wo: 0 * wi[:, 2:] + 0.2]
+    table = dynamic.factor(mixed, None, ranks=(3, 16, 16), resolution=16)
+    assert table.brdf is None
+    assert table.at(jnp.eye(3)[0]).brdf is None
+    wi, wo = pairs
+    assert relative(table.at(jnp.eye(3)[2])(wi, wo), jnp.full((400, 1), 0.2)) < 0.15
+
+
+def test_colors_of_a_set_are_members_of_their_own(pairs):
+    colored = [Lambert([0.9, 0.3, 0.1]), Lambert([0.2, 0.2, 0.8])]
+    table = dynamic.factor(colored, None, ranks=(2, 1, 1), resolution=RESOLUTION)
+    assert table.factor.shape == (2, 3, 2)
+    wi, wo = pairs
+    value = table.at(jnp.array([0.5, 0.5]))(wi, wo)
+    np.testing.assert_allclose(value, jnp.broadcast_to(jnp.array([0.55, 0.25, 0.45]) / np.pi, value.shape), rtol=0.03)
+
+
+def test_published_tensor_is_exact_at_full_rank():
+    table = published.factor_tensor(SET, ranks=(3, 40, 40), resolution=8)
+    direction = hemisphere.texel_direction(resolution=8).reshape(-1, 3)
+    inside = np.flatnonzero(hemisphere.texel_area(resolution=8).ravel())[8:30]
+    wi = jnp.broadcast_to(direction[inside][:, None], (22, 22, 3))
+    for number, brdf in enumerate(SET):
+        exact = brdf(wi, wi.swapaxes(0, 1))
+        assert relative(table.at(jnp.eye(3)[number])(wi, wi.swapaxes(0, 1)), exact) < 0.02
+    assert table.error < 1e-2
+
+
+def test_published_lobes_leave_what_a_tensor_can_carry():
+    lobes = dynamic.separate(SET, separator=lambda b: published.mirror_lobes(b, resolution=12))
+    assert lobes.scale.shape[:2] == (4, 3)
+    with_lobes = dynamic.factor(SET, lobes, ranks=(3, 16, 16), resolution=RESOLUTION)
+    without = dynamic.factor(SET, None, ranks=(3, 16, 16), resolution=RESOLUTION)
+    assert with_lobes.error < without.error
+
+
+def test_derivatives_by_shares(lobes, pairs):
+    table = dynamic.factor(SET, lobes, ranks=(2, 4, 4), resolution=RESOLUTION)
+    wi, wo = pairs
+
+    def total(share):
+        return jnp.mean(table.at(share)(wi, wo))
+
+    share, step = jnp.array([0.5, 0.3, 0.2]), jnp.array([0.02, -0.02, 0.0])
+    slope = jax.grad(total)(share) @ step
+    assert np.isclose(slope, (total(share + step) - total(share - step)) / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda _: dynamic.factor([], None, ranks=(1, 1, 1)), "at least one, got none"),
+        (lambda _: dynamic.separate([]), "at least one, got none"),
+        (lambda _: dynamic.factor(SET, None), "lobes, or ranks of a tensor"),
+        (lambda each: dynamic.factor(SET[:2], each), "those of the 2 BRDFs"),
+        (lambda _: dynamic.factor(SET, None, ranks=(4, 1, 1), resolution=8), r"from 1 to the tensor's size \(3, "),
+        (lambda _: dynamic.factor(SET, None, ranks=(0, 1, 1), resolution=8), "from 1"),
+        (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=2), "resolution must be at least 4"),
+        (lambda _: dynamic.factor([SET[0], Lambert([1.0, 0, 0])], None, ranks=(1, 1, 1)), r"\[b 1\], or all to"),
+        (
+            lambda _: dynamic.factor([SET[0], lambda wi, wo: -wi[:, 2:]], None, ranks=(1, 1, 1), resolution=8),
+            "1 of 2 are not, first number 1",
+        ),
+        (
+            lambda _: published.factor_tensor(
+                [SET[0], lambda wi, wo: wi[:, 2:] * jnp.nan], ranks=(1, 1, 1), resolution=8
+            ),
+            "finite",
+        ),
+        (lambda _: dynamic.separate([SET[0], AshikhminShirley(diffuse=0.0)], separator=fit), "all isotropic or none"),
+    ],
+)
+def test_what_cannot_be_a_set_is_refused(lobes, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(lobes)

@@ -1,0 +1,200 @@
+"""Relighting with materials that change, against the sum over all texels with the BRDF itself."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import CookTorrance, Lambert, lobe, navigation, separable
+from jaxprt.brdf import dynamic as brdfs
+from jaxprt.relight import dynamic, reference
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.transport import dynamic as transports
+
+SIZE = 16
+EYE = jnp.array([1.2, 1.5, 2.5])
+ROUGH = [0.25, 0.4, 0.6]
+ALBEDO = jnp.array([0.5, 0.4, 0.3])
+# Relative errors; what was measured, and half as much again.
+GLOSSY = 0.05
+GROUND = 0.03
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A ball over the ground."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    return join([ball, ground_plane(ball, vertices=36)])
+
+
+@pytest.fixture(scope="module")
+def line():
+    return navigation.Line(jnp.log(jnp.array(ROUGH)))
+
+
+@pytest.fixture(scope="module")
+def family():
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in ROUGH]
+    lobes = brdfs.separate(members, separator=lambda each: lobe.tabulate(each, lobes=4, resolution=16))
+    return brdfs.factor(members, lobes)
+
+
+@pytest.fixture(scope="module")
+def fixed():
+    return separable.factor(Lambert(ALBEDO), terms=1, resolution=8)
+
+
+@pytest.fixture(scope="module")
+def transport(mesh, family, fixed):
+    return transports.precompute(mesh, [family, fixed], size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def light():
+    return builtin.daylight(size=SIZE)
+
+
+def material(line, roughness, diffuse=(0.3, 0.2, 0.1), specular=(0.5, 0.5, 0.4)):
+    share = line.share(jnp.log(jnp.asarray(roughness)))
+    return dynamic.Material(share, jnp.asarray(diffuse), jnp.asarray(specular))
+
+
+def by_region(mesh, value, other):
+    return np.where((np.asarray(mesh.region) == 0)[:, None], value, other)
+
+
+def relative(value, exact):
+    return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
+
+
+@pytest.mark.parametrize("roughness", [0.25, 0.3, 0.4, 0.6])
+def test_radiance_is_the_sum_over_all_texels(mesh, transport, family, fixed, line, light, roughness):
+    color = dynamic.radiance(transport, [family, fixed], [material(line, roughness), None], light, eye=EYE)
+    model = CookTorrance(
+        diffuse=jnp.array([0.3, 0.2, 0.1]), specular=jnp.array([0.5, 0.5, 0.4]), roughness=roughness, f0=0.3
+    )
+    exact = by_region(
+        mesh,
+        reference.radiance(mesh, model, light, eye=EYE),
+        reference.radiance(mesh, Lambert(ALBEDO), light, eye=EYE),
+    )
+    ball = np.asarray(mesh.region) == 0
+    assert relative(np.asarray(color)[ball], exact[ball]) < GLOSSY
+    assert relative(np.asarray(color)[~ball], exact[~ball]) < GROUND
+
+
+def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
+    """A rough set by its tensor alone."""
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.9) for m in (0.6, 0.8)]
+    tensor = brdfs.factor(members, None, ranks=(2, 24, 24), resolution=24)
+    transport = transports.precompute(mesh, [tensor, fixed], size=SIZE, progress=False)
+    assert transport.region[0].seen.level.shape[1] == 6 * SIZE**2 // 8  # Bits alone.
+    matter = dynamic.Material(jnp.array([1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
+    color = dynamic.radiance(transport, [tensor, fixed], [matter, None], light, eye=EYE)
+    ball = np.asarray(mesh.region) == 0
+    exact = np.asarray(reference.radiance(mesh, members[0], light, eye=EYE))
+    assert relative(np.asarray(color)[ball], exact[ball]) < 0.1
+
+
+def test_terms_of_the_remainder_change_little_and_not_for_the_worse(mesh, family, fixed, line, light):
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in ROUGH]
+    more = brdfs.factor(members, family.lobe, ranks=(3, 12, 12), resolution=16)
+    transport = transports.precompute(mesh, [more, fixed], size=SIZE, progress=False)
+    matter = dynamic.Material(jnp.array([0.0, 1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
+    ball = np.asarray(mesh.region) == 0
+    exact = np.asarray(reference.radiance(mesh, members[1], light, eye=EYE))[ball]
+    color = np.asarray(dynamic.radiance(transport, [more, fixed], [matter, None], light, eye=EYE))[ball]
+    assert relative(color, exact) < GLOSSY
+
+
+def test_a_texture_on_the_diffuse_part(mesh, transport, family, fixed, line, light):
+    texture = np.random.default_rng(0).uniform(size=(len(mesh.position), 3)).astype(np.float32)
+    both = [
+        dynamic.radiance(transport, [family, fixed], [material(line, 0.4, diffuse), None], light, eye=EYE)
+        for diffuse in (texture, np.zeros(3, np.float32), np.ones(3, np.float32))
+    ]
+    ball = np.asarray(mesh.region) == 0
+    textured, black, white = (np.asarray(each)[ball] for each in both)
+    np.testing.assert_allclose(textured, black + texture[ball] * (white - black), rtol=1e-4, atol=1e-4)
+
+
+def test_light_and_weights_are_linear(transport, family, fixed, line, light):
+    def color(light, scale):
+        matter = material(line, 0.4, scale * np.array([0.3, 0.2, 0.1]), scale * np.array([0.5, 0.5, 0.4]))
+        return dynamic.radiance(transport, [family, fixed], [matter, None], light, eye=EYE)
+
+    np.testing.assert_allclose(color(Environment(2 * light.radiance), 1.0), 2 * color(light, 1.0), rtol=1e-4, atol=1e-4)
+    ball = slice(0, 20)
+    np.testing.assert_allclose(color(light, 0.5)[ball], 0.5 * color(light, 1.0)[ball], rtol=1e-4, atol=1e-5)
+
+
+def test_staged_calls_equal_the_whole(transport, family, fixed, line, light):
+    materials = [material(line, 0.3), None]
+    lit = dynamic.light_side(transport, light)
+    seen = dynamic.view_side(transport, [family, fixed], materials, eye=EYE)
+    whole = dynamic.radiance(transport, [family, fixed], materials, light, eye=EYE)
+    np.testing.assert_allclose(dynamic.combine(transport, lit, seen), whole, rtol=1e-6)
+
+
+def test_gradient_by_all_that_can_change(transport, family, fixed, line, light):
+    def loss(roughness, weight, radiance):
+        matter = material(line, roughness, weight * jnp.ones(3))
+        color = dynamic.radiance(transport, [family, fixed], [matter, None], Environment(radiance), eye=EYE)
+        return jnp.mean(color**2)
+
+    at = (jnp.array(0.33), jnp.array(0.4), light.radiance)
+    slope = jax.grad(loss, (0, 1, 2))(*at)
+    assert all(bool(jnp.isfinite(each).all()) for each in slope)
+    for number, step in ((0, 1e-3), (1, 1e-2)):
+        near = [loss(*(x + sign * step * (i == number) for i, x in enumerate(at))) for sign in (1, -1)]
+        np.testing.assert_allclose(slope[number], (near[0] - near[1]) / (2 * step), rtol=0.03)
+
+
+def test_a_region_that_does_not_change_has_no_machinery(transport):
+    changing, static = transport.region
+    assert static.terms.terms == 1
+    assert changing.terms.terms == 1  # Lobes, and the diffuse part.
+    assert static.seen.level.shape[1] == 6 * SIZE**2 // 8 < changing.seen.level.shape[1]
+    assert transport.nbytes == changing.nbytes + static.nbytes
+
+
+def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light, line, tmp_path):
+    for _ in range(2):
+        again = transports.precompute(mesh, [family, fixed], size=SIZE, path=tmp_path, progress=False)
+    materials = [material(line, 0.3), None]
+    color, same = (dynamic.radiance(each, [family, fixed], materials, light, eye=EYE) for each in (transport, again))
+    np.testing.assert_allclose(color, same, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t, b, m: (t, b[:1], m), "for each of 2 regions, got 1 and 2"),
+        (lambda t, b, m: (t, b, m[:1]), "for each of 2 regions, got 2 and 1"),
+        (lambda t, b, m: (t, b, [None, None]), "region 0 needs a material"),
+        (lambda t, b, m: (t, b, [m[0], m[0]]), "region 1 has one BRDF for good"),
+        (lambda t, b, m: (t, [b[1], b[0]], [None, m[0]]), "must be the one that its transport was made for"),
+        (lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.share, m[0], jnp.ones(2)), None]), "of its 3 BRDFs, got 2"),
+        (
+            lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.diffuse, m[0], jnp.ones((5, 3))), None]),
+            "one for each of .* vertices",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, change, message):
+    with pytest.raises(ValueError, match=message):
+        dynamic.radiance(*change(transport, [family, fixed], [material(line, 0.3), None]), light, eye=EYE)
+
+
+def test_a_light_of_another_size_is_refused(transport):
+    with pytest.raises(ValueError, match=r"one environment \[6, 16, 16, c\]"):
+        dynamic.light_side(transport, builtin.daylight(size=8))
+
+
+def test_regions_without_a_brdf_are_refused(mesh, family):
+    with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
+        transports.precompute(mesh, [family], size=SIZE, progress=False)
+    with pytest.raises(TypeError, match=r"must be a set|Type-check"):
+        transports.precompute(mesh, [family, Lambert(0.5)], size=SIZE, progress=False)

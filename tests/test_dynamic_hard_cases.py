@@ -1,0 +1,140 @@
+"""The dynamic system where something degenerates: nothing may become NaN, infinite or absurd."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import BlinnPhong, CookTorrance, lobe, navigation
+from jaxprt.brdf import dynamic as brdfs
+from jaxprt.relight import dynamic, reference
+from jaxprt.scene import Environment, builtin
+from jaxprt.transport import dynamic as transports
+
+SIZE = 8
+RANKS = (2, 4, 4)
+RESOLUTION = 8
+ENDS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.5) for m in (0.01, 1.0)]
+
+
+def fit(brdf):
+    return lobe.tabulate(brdf, lobes=2, resolution=8)
+
+
+def directions(*height):
+    """Views at some heights, and incident directions in front, behind and at the same place."""
+    level = [np.sqrt(1 - h**2) for h in height]
+    wo = np.array([[x, 0, h] for x, h in zip(level, height, strict=True)])
+    wi = wo[:, None] * np.array([[1, 1, 1], [-1, 1, 1]])
+    return jnp.asarray(wi, jnp.float32), jnp.asarray(np.repeat(wo[:, None], 2, 1), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return builtin.sphere(rings=6, sectors=8)
+
+
+@pytest.fixture(scope="module")
+def family():
+    return brdfs.factor(ENDS, brdfs.separate(ENDS, separator=fit))
+
+
+@pytest.fixture(scope="module")
+def transport(mesh, family):
+    return transports.precompute(mesh, [family], size=SIZE, progress=False)
+
+
+def color(transport, family, share, light, eye=(0.5, 1.0, 3.0), diffuse=0.2):
+    matter = dynamic.Material(jnp.asarray(share), jnp.full(1, diffuse), jnp.ones(1))
+    return dynamic.radiance(transport, [family], [matter], light, eye=jnp.asarray(eye), texels=4)
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        [CookTorrance(diffuse=0.0, specular=1.0, roughness=0.3)],
+        [CookTorrance(diffuse=0.0, specular=1.0, roughness=0.3)] * 3,
+        [CookTorrance(diffuse=0.0, specular=s, roughness=0.3) for s in (0.0, 0.5, 1.0)],
+        [CookTorrance(diffuse=0.0, specular=0.0, roughness=0.3)] * 2,
+    ],
+    ids=["one alone", "identical", "multiples of one", "black"],
+)
+def test_sets_of_low_rank(members):
+    """Of rank one or less, whatever is asked for."""
+    ranks = (min(2, len(members)), 4, 4)
+    many = brdfs.factor(members, None, ranks=ranks, resolution=RESOLUTION)
+    one = brdfs.factor(members[-1:], None, ranks=(1, 4, 4), resolution=RESOLUTION)
+    assert all(bool(jnp.isfinite(each).all()) for each in jax.tree.leaves(many))
+    wi, wo = directions(0.3, 0.7, 0.99)
+    last = many.at(jnp.eye(len(members))[-1])(wi, wo)
+    np.testing.assert_allclose(last, one.at(jnp.ones(1))(wi, wo), rtol=0.02, atol=2e-3)
+
+
+def test_a_constant_tensor():
+    members = [lambda wi, wo: 0 * wi[:, 2:] + 0.25, lambda wi, wo: 0 * wi[:, 2:] + 0.25]
+    flat = brdfs.factor(members, None, ranks=(2, 3, 3), resolution=RESOLUTION)
+    wi, wo = directions(0.3, 0.7, 0.99)
+    np.testing.assert_allclose(flat.at(jnp.array([0.5, 0.5]))(wi, wo), 0.25, rtol=0.02)
+    assert flat.error < 1e-2
+
+
+@pytest.mark.parametrize("exponent", [1.0, 200.0])
+def test_shininess_at_the_ends(exponent):
+    members = [BlinnPhong(diffuse=0.0, specular=1.0, exponent=n) for n in (1.0, 200.0)]
+    family = brdfs.factor(members, brdfs.separate(members, separator=fit), ranks=RANKS, resolution=RESOLUTION)
+    share = navigation.Line(jnp.array([1.0, 200.0])).share(jnp.asarray(exponent))
+    wi, wo = directions(0.2, 0.7, 1.0)
+    mixed = family.at(share)
+    assert bool(jnp.isfinite(mixed(wi, wo)).all())
+    np.testing.assert_allclose(mixed.brdf.exponent, exponent)
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-30, 1e-6, 1e-3, 1.0])
+@pytest.mark.parametrize("number", [0, 1])
+def test_views_down_to_the_horizon(family, number, height):
+    mixed = family.at(jnp.eye(2)[number])
+    wi, wo = directions(height, 0.5)
+    value = mixed(wi, wo)
+    assert bool(jnp.isfinite(value).all())
+    slope = jax.grad(lambda share: jnp.sum(family.at(share)(wi, wo)))(jnp.eye(2)[number])
+    assert bool(jnp.isfinite(slope).all())
+
+
+@pytest.mark.parametrize("share", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5), (0.0, 0.0)])
+def test_zero_light_gives_zero(transport, family, share):
+    dark = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
+    np.testing.assert_array_equal(color(transport, family, share, dark), 0)
+
+
+def test_a_sun_in_one_texel_is_exact(mesh, transport, family):
+    """All of the light is lit by one by one: what errs is the stored visibility, in bits."""
+    texel = 77
+    sun = jnp.zeros((6 * SIZE * SIZE, 3)).at[texel].set(100.0).reshape(6, SIZE, SIZE, 3)
+    lit = color(transport, family, (0.0, 1.0), Environment(sun))
+    model = CookTorrance(diffuse=0.2, specular=1.0, roughness=1.0, f0=0.5)
+    exact = reference.radiance(mesh, model, Environment(sun), eye=jnp.array([0.5, 1.0, 3.0]))
+    assert float(jnp.linalg.norm(lit - exact) / jnp.linalg.norm(exact)) < 0.05
+
+
+def test_a_furnace_stays_near_what_the_brdf_reflects(transport, family):
+    """Constant light; a sphere sees its hemisphere whole."""
+    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
+    value = color(transport, family, (0.0, 0.0), white, diffuse=1.0)
+    facing = np.asarray(value)[:, 0] > 0
+    assert facing.any()
+    np.testing.assert_allclose(np.asarray(value)[facing], 1.0, atol=0.05)
+
+
+@pytest.mark.parametrize("coordinate", [(-1e6, 0.5), (0.5, -3.0), (2.0, 100.0), (0.3, 1e-30), (1.0, 1.0)])
+def test_coordinates_outside_the_hull(coordinate):
+    plane = navigation.cook_torrance().navigation
+    share, slope = jax.jit(lambda x: (plane.share(x), jax.jacobian(plane.share)(x)))(jnp.asarray(coordinate))
+    assert bool(jnp.isfinite(share).all())
+    assert bool(jnp.isfinite(slope).all())
+    np.testing.assert_allclose(share.sum(), 1, rtol=1e-5)
+    assert share.min() >= 0
+
+
+def test_an_eye_at_a_vertex(mesh, transport, family):
+    light = builtin.daylight(size=SIZE)
+    assert bool(jnp.isfinite(color(transport, family, (0.5, 0.5), light, eye=mesh.position[3])).all())
