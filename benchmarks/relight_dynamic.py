@@ -218,7 +218,7 @@ def gradient(mesh: Mesh, transport, brdfs, plane, triple: Triple, error: float, 
     """An image's loss and its gradient in light, weights and coordinates, beside the loss alone."""
     view = camera.orbit(mesh, width=256, height=256)
     fragments = raster.rasterize(mesh, view)
-    fixed = materials(plane, triple, 1 + (transport.region[1].terms.terms == transport.region[0].terms.terms))
+    fixed = materials(plane, triple, common["adjustable"])
 
     def loss(light, diffuse, specular, coordinate):
         first = relight.Material(plane.share(coordinate), diffuse, specular)
