@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -273,21 +274,31 @@ def test_knots_have_the_tables_of_their_brdfs(quick, close):
         close(found.diffuse, single.diffuse, tolerance=1e-4)
 
 
-def test_parameters_are_linear_between_knots_and_clamped_outside(quick, close):
+def test_weights_are_linear_between_knots_and_places_means_by_weight_and_both_clamped_outside(quick, close):
     varying = quick("varying", resolution=4)
     for value, low, share in ((0.15, 0, 0.5), (0.25, 1, 0.25), (0.4, 1, 1), (0.0, 0, 0), (7.0, 1, 1), (np.inf, 1, 1)):
         found = varying.at(jnp.asarray(value))
-        for actual, table, axis in (
-            (found.mean, varying.mean, 2),
-            (found.scale, varying.scale, 1),
-            (found.weight, varying.weight, 2),
-            (found.diffuse, varying.diffuse, 1),
-        ):
-            close(actual, jnp.take(table, low, axis) * (1 - share) + jnp.take(table, low + 1, axis) * share)
+        part = np.array([1 - share, share])[:, None]
+        weight = np.asarray(varying.weight)[:, :, low : low + 2]
+        close(found.weight, np.sum(weight * part, 2))
+        close(found.diffuse, np.sum(np.asarray(varying.diffuse)[:, low : low + 2] * part, 1))
+        # Places and widths are means by weight.
+        power = np.sum(weight, 0) * part
+        power = power / power.sum(1, keepdims=True)
+        close(found.mean, np.sum(np.asarray(varying.mean)[:, :, low : low + 2] * power, 2))
+        close(found.scale, np.sum(np.asarray(varying.scale)[:, low : low + 2] * power, 1))
     wi, wo = upper(11, 200), upper(12, 200, least=0.3)
     sharp, middle, wide = (varying.at(jnp.asarray(r)).lookup(wo).concentration for r in (0.2, 0.3, 0.4))
     assert jnp.all((wide - middle) * (sharp - middle) < 0)
     assert np.isfinite(np.asarray(varying.at(jnp.asarray(0.3))(wi, wo))).all()
+
+
+def test_lobes_without_light_have_no_say_between_knots(quick):
+    varying = quick("varying", resolution=4)
+    dark = eqx.tree_at(lambda x: x.weight, varying, varying.weight.at[:, :, 1].set(0))
+    found = dark.at(varying.knot[0][0] * 0.4 + varying.knot[0][1] * 0.6)
+    np.testing.assert_allclose(found.mean, varying.mean[:, :, 0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.weight, 0.4 * varying.weight[:, :, 0], rtol=1e-4)
 
 
 def test_two_parameters_have_two_axes_and_gray_knots_share_the_colors(quick, close, monkeypatch):
