@@ -18,7 +18,7 @@ MOST_ERROR = {
     "lobes": 0.15,
     "precompute_separable": 3e-3,
     "rasterize": 1e-3,
-    "relight_dynamic": 0.7,
+    "relight_dynamic": 0.08,
     "relight_harmonic": 0.7,
     "relight_separable": 5e-3,
     "rotation": 1e-5,

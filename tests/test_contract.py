@@ -324,6 +324,7 @@ EXAMPLES = {
     "sphere.hemisphere.texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.parabolic_texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.texel_area": example(nothing, resolution=5),
+    "sphere.hemisphere.parabolic_texel_area": example(nothing, resolution=5),
     "sphere.hemisphere.polar_lookup": example(lambda draw: call(draw.normal(4, 4, 2), draw.uniform(5, 2))),
     "sphere.hemisphere.polar_texel_direction": example(nothing, resolution=5),
     "sphere.hemisphere.polar_texel_area": example(nothing, resolution=5),
@@ -335,6 +336,7 @@ EXAMPLES = {
     "sphere.harmonics.phong": example(lambda draw: call(10 * draw.uniform(4)), degree=5),
     "sphere.harmonics.hann": example(nothing, degree=5),
     "sphere.harmonics.lanczos": example(nothing, degree=5),
+    "sphere.harmonics.natural": example(nothing, degree=5),
     "sphere.harmonics.least_laplacian": example(lambda draw: call(draw.normal(9, 2), draw.uniform())),
     "sphere.harmonics.disc": example(lambda draw: call(draw.unit(4), draw.uniform(4)), degree=4),
     # Derivatives by a rotation are along rotations only; tests of the module's own compare those.

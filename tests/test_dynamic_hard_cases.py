@@ -66,15 +66,15 @@ def test_sets_of_low_rank(members):
     assert all(bool(jnp.isfinite(each).all()) for each in jax.tree.leaves(many))
     wi, wo = directions(0.3, 0.7, 0.99)
     last = many.at(jnp.eye(len(members))[-1])(wi, wo)
-    np.testing.assert_allclose(last, one.at(jnp.ones(1))(wi, wo), rtol=0.02, atol=2e-3)
+    np.testing.assert_allclose(last, one.at(jnp.ones(1))(wi, wo), rtol=1e-5, atol=1e-6)
 
 
 def test_a_constant_tensor():
     members = [lambda wi, wo: 0 * wi[:, 2:] + 0.25, lambda wi, wo: 0 * wi[:, 2:] + 0.25]
     flat = brdfs.factor(members, None, ranks=(2, 3, 3), resolution=RESOLUTION)
     wi, wo = directions(0.3, 0.7, 0.99)
-    np.testing.assert_allclose(flat.at(jnp.array([0.5, 0.5]))(wi, wo), 0.25, rtol=0.02)
-    assert flat.error < 1e-2
+    np.testing.assert_allclose(flat.at(jnp.array([0.5, 0.5]))(wi, wo), 0.25, rtol=2.5e-3)
+    assert flat.error < 1e-3
 
 
 def test_shininess_at_the_ends():
@@ -84,7 +84,7 @@ def test_shininess_at_the_ends():
     for exponent in (0.0, 1.0, 200.0, 1e9):
         mixed = family.at(navigation.Line(jnp.array([1.0, 200.0])).share(jnp.asarray(exponent)))
         assert bool(jnp.isfinite(mixed(wi, wo)).all())
-        np.testing.assert_allclose(mixed.brdf.exponent, np.clip(exponent, 1, 200), rtol=1e-6)
+        np.testing.assert_allclose(mixed.brdf.exponent, np.clip(exponent, 1, 200), rtol=1e-5)
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-30, 1e-6, 1e-3, 1.0])
@@ -105,13 +105,13 @@ def test_zero_light_gives_zero(transport, family, share):
 
 
 def test_a_sun_in_one_texel_is_exact(mesh, transport, family):
-    """All of the light is lit by one by one: what errs is the stored visibility, in bits."""
+    """All of the light is lit by one by one."""
     texel = 77
     sun = jnp.zeros((6 * SIZE * SIZE, 3)).at[texel].set(100.0).reshape(6, SIZE, SIZE, 3)
     lit = color(transport, family, (0.0, 1.0), Environment(sun))
     model = CookTorrance(diffuse=0.2, specular=1.0, roughness=1.0, f0=0.5)
     exact = reference.radiance(mesh, model, Environment(sun), eye=jnp.array([0.5, 1.0, 3.0]))
-    assert float(jnp.linalg.norm(lit - exact) / jnp.linalg.norm(exact)) < 0.05
+    assert float(jnp.linalg.norm(lit - exact) / jnp.linalg.norm(exact)) < 1e-6
 
 
 def test_a_furnace_of_diffuse_parts_is_white(mesh, transport, family):
@@ -120,7 +120,7 @@ def test_a_furnace_of_diffuse_parts_is_white(mesh, transport, family):
     value = np.asarray(color(transport, family, (0.0, 0.0), white, diffuse=1.0))[:, 0]
     exact = np.asarray(reference.radiance(mesh, Lambert(1.0), white, eye=jnp.array([0.5, 1.0, 3.0])))[:, 0]
     assert (exact > 0.9).sum() > 5
-    np.testing.assert_allclose(value, exact, atol=0.03)
+    np.testing.assert_allclose(value, exact, atol=3e-4)
 
 
 @pytest.mark.parametrize("coordinate", [(-1e6, 0.5), (0.5, -3.0), (2.0, 100.0), (0.3, 1e-30), (1.0, 1.0)])

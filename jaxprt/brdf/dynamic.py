@@ -17,10 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import grid, lobe_em
-from jaxprt.brdf import lobe as lobes
-from jaxprt.brdf.lobe import LobeBrdf
+from jaxprt.brdf.lobe import LobeBrdf, is_isotropic, mean, tabulate
 from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.linalg import mixture, tucker
+from jaxprt.linalg import tucker
 from jaxprt.sphere import harmonics, hemisphere
 
 _DEGREE = 24  # of the natural light that the factors are chosen for
@@ -36,7 +35,7 @@ class Mixed(eqx.Module):
     Attributes:
         terms: What the lobes leave.
         lobe: The lobes, if the set has any.
-        brdf: The model whose parameters are the mean of those of the set, where they have such a mean.
+        brdf: The model whose parameters are between those of the set, where they have such a mean.
     """
 
     terms: SeparableBrdf
@@ -88,16 +87,22 @@ class DynamicBrdf(eqx.Module):
     def at(self, share: Float[Array, " m"]) -> Mixed:
         """The BRDF with given shares of those in the set, as `jaxprt.brdf.navigation` makes them from coordinates.
 
-        Terms are mixed; lobes move, from the place and width they have in one BRDF to those they have in the next,
-        unless they are where all have them, as the published ones. Differentiable in the shares.
+        Shares sum to one. Terms are mixed; lobes move, from the place and width they have in one BRDF to those they
+        have in the next, unless they are where all have them, as the published ones. Differentiable in the shares.
         """
         view = jnp.einsum("m,mch,hoi,oyx->iyxc", share, self.factor, self.core, self.view_map)
         terms = SeparableBrdf(self.light_map[..., None], view, self.error, self.coordinates)
-        return Mixed(terms, _mean(self.lobe, share), jax.tree.map(lambda x: jnp.tensordot(share, x, 1), self.brdf))
+        lobe = None if self.lobe is None else mean(self.lobe, share)
+        return Mixed(terms, lobe, jax.tree.map(lambda x: _between(x, share), self.brdf))
 
 
-def _mean(table: LobeBrdf | None, share: Array) -> LobeBrdf | None:
-    return None if table is None else lobes.mean(table, share)
+def _between(parameter: Array, share: Array) -> Array:
+    """Mean of a parameter: of a width or exponent, which have no colors, in its logarithm, as lobes have it."""
+    linear = jnp.tensordot(share, parameter, 1)
+    if parameter.ndim > 1:
+        return linear
+    positive = jnp.all(parameter > 0)
+    return jnp.where(positive, jnp.exp(share @ jnp.log(jnp.where(positive, parameter, 1))), linear)
 
 
 def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable | None = None) -> LobeBrdf:
@@ -115,7 +120,7 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
     """
     if not brdfs:
         raise ValueError("brdfs must be at least one, got none")
-    tables = [_fit(each, lobes) if separator is None else separator(each) for each in brdfs]
+    tables = [tabulate(each, lobes=lobes) if separator is None else separator(each) for each in brdfs]
     if len({each.isotropic for each in tables}) > 1:
         found = ", ".join("isotropic" if each.isotropic else "anisotropic" for each in tables)
         raise ValueError(f"brdfs must be all isotropic or none, got {found}")
@@ -131,10 +136,6 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
     error = jnp.max(jnp.stack([each.error for each in tables]))
     parts = (stack("mean", 2), stack("scale", 1), stack("weight", 2, True), stack("diffuse", 1, True))
     return LobeBrdf(*parts, (number,), error)
-
-
-def _fit(brdf: Callable, count: int) -> LobeBrdf:
-    return lobes.tabulate(brdf, lobes=count)
 
 
 def factor(
@@ -181,9 +182,7 @@ def factor(
         core, along, maps = (jnp.zeros(x, dtype) for x in ((0, 0, 0), (len(brdfs), colors, 0), (0, 4, 4)))
         return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
     direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
-    center = 2 * (np.arange(resolution) + 0.5) / resolution - 1
-    square = (center**2 + center[:, None] ** 2).ravel()
-    area = jnp.asarray(np.where(square < 1, 4 / (1 + square) ** 2, 0) * (2 / resolution) ** 2, direction.dtype)
+    area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
     # All at once where they are of one kind, and else one by one.
     parts = (
         [(jax.tree.map(lambda x: x[None], grid.as_argument(each)), jnp.array([n])) for n, each in enumerate(brdfs)]
@@ -191,7 +190,7 @@ def factor(
         else [(together, jnp.arange(len(brdfs)))]
     )
     # Of isotropic BRDFs one view of each height is enough.
-    turned = all(map(lobes.is_isotropic, brdfs))
+    turned = all(map(is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
     found = [_reflected(part, lobe, number, view) for part, number in parts]
     check_values([least for _, _, least in found])
@@ -292,35 +291,25 @@ def stacked(brdfs: Sequence[Callable]) -> Callable | None:
     return jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs)
 
 
-def _times_cosine(lobe: LobeBrdf, wi: Float[Array, "d 3"], wo: Float[Array, "3"]) -> Float[Array, "d c"]:
-    """Lobes of one view, which are looked up once."""
-    found = lobe.lookup(wo[None])
-    mean, concentration, weight = found.mean[..., 0], found.concentration[:, 0], found.weight[..., 0]
-    away = jnp.sum((wi[:, :, None] - mean) ** 2, 1) / 2
-    density = jnp.exp(mixture.log_peak(concentration) - concentration * away)
-    return density @ weight.T + found.diffuse[:, 0] * wi[:, 2:] / np.pi
-
-
 @jax.jit
 def _reflected(
     brdf: Callable, lobe: LobeBrdf | None, number: Array, view: Float[Array, "d 3"]
 ) -> tuple[Float[Array, "m c d b"], Float[Array, "m c d"], Float[Array, " m"]]:
     """What is left of each harmonic reflected to each view, the square of the whole, and the least value of a BRDF."""
-    prior = jnp.asarray(_prior(), view.dtype)
 
     def row(wo):
         wi, area = hemisphere.arcs(lobe_em.mirror(wo), rings=_RINGS, sectors=_SECTORS)
         cosine = jnp.maximum(wi[:, 2:], 0)
-        light = harmonics.evaluate(wi, degree=_DEGREE) * (area[:, None] * prior)
+        light = area * harmonics.convolve(harmonics.evaluate(wi, degree=_DEGREE).T, harmonics.natural(degree=_DEGREE))
 
         def values(number, brdf):
             value = brdf(wi, jnp.broadcast_to(wo, wi.shape))
             least = jnp.min(jnp.where(jnp.isfinite(value), value, -1))
             value = value * cosine
-            return value, value if lobe is None else value - _times_cosine(_one(lobe, number), wi, wo), least
+            return value, value if lobe is None else value - _one(lobe, number).lookup(wo[None]).evaluate(wi).T, least
 
         whole, rest, least = jax.vmap(values)(number, brdf)
-        whole, rest = (jnp.einsum("mdc,db->mcb", each, light) for each in (whole, rest))
+        whole, rest = (jnp.einsum("mdc,bd->mcb", each, light) for each in (whole, rest))
         return rest, jnp.sum(whole**2, -1), least
 
     rest, square, least = jax.lax.map(row, view)
@@ -334,8 +323,9 @@ def _to_map(direction: Array) -> Array:
     light = np.asarray(harmonics.evaluate(wi, degree=_DEGREE), np.float64)
     value, vector = np.linalg.eigh(light.T @ (light * np.asarray(wi[:, 2:] * area[:, None], np.float64)))
     known = value > _NULL * value[-1]
-    inverse = (vector[:, known] / value[known]) @ vector[:, known].T / _prior()[:, None]
-    return jnp.asarray(inverse, direction.dtype) @ harmonics.evaluate(direction, degree=_DEGREE).T
+    inverse = jnp.asarray((vector[:, known] / value[known]) @ vector[:, known].T, direction.dtype)
+    smooth = inverse @ harmonics.evaluate(direction, degree=_DEGREE).T
+    return harmonics.convolve(smooth, 1 / harmonics.natural(degree=_DEGREE))
 
 
 def _heights(direction: Array) -> tuple[Array, np.ndarray]:
@@ -359,8 +349,3 @@ def _one(table: LobeBrdf, number) -> LobeBrdf:
     """Lobes of one of the set."""
     mean, weight = table.mean[:, :, number], table.weight[:, :, number]
     return LobeBrdf(mean, table.scale[:, number], weight, table.diffuse[:, number], (), table.error)
-
-
-def _prior() -> np.ndarray:
-    """Size of each harmonic in natural light."""
-    return np.concatenate([np.full(2 * each + 1, 1 / (each + 0.5)) for each in range(_DEGREE + 1)])

@@ -43,6 +43,13 @@ class Lobes(eqx.Module):
     weight: Float[Array, "c l v"]
     diffuse: Float[Array, "c v"]
 
+    def evaluate(self, wi: Float[Array, "d 3"]) -> Float[Array, "c d"]:
+        """The BRDF times the cosine of wi in 1/sr; zero below the horizon. Of one view, or of one for each wi."""
+        away = sum((wi[:, i] - self.mean[i]) ** 2 for i in range(3)) / 2
+        density = jnp.exp(mixture.log_peak(self.concentration) - self.concentration * away)
+        value = jnp.sum(self.weight * density, 1) + self.diffuse * wi[:, 2] / np.pi
+        return jnp.where(wi[:, 2] > 0, value, 0)
+
 
 class LobeBrdf(eqx.Module):
     """A table of lobes. The last axis, or the last two, are nodes of the view; axes before follow the parameters.
@@ -129,19 +136,17 @@ class LobeBrdf(eqx.Module):
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF times the cosine of wi in 1/sr, as far as the lobes carry it; zero below the horizon."""
         batch = wo.shape[:-1]
-        wi, lobe = wi.reshape(-1, 3), self.lookup(wo.reshape(-1, 3))
-        away = sum((wi[:, i] - lobe.mean[i]) ** 2 for i in range(3)) / 2
-        density = jnp.exp(mixture.log_peak(lobe.concentration) - lobe.concentration * away)
-        value = jnp.sum(lobe.weight * density, 1) + lobe.diffuse * wi[:, 2] / np.pi
-        return jnp.where(wi[:, 2:] > 0, value.T, 0).reshape(*batch, len(self.weight))
+        value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
+        return value.T.reshape(*batch, len(self.weight))
 
 
 @jax.jit
 def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     """Lobes between those along the first parameter of a table, which then has no axis.
 
-    Each lobe lies, and is as wide, as in the mean of the BRDFs by its weight in them: one that a BRDF has no light in
-    has no say there. Weights are linear in the shares.
+        w = sum_h s_h w_h,    (m, log k) = sum_h s_h w_h (m_h, log k_h) / w
+
+    with shares s that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
     """
     share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
     part = share * jnp.sum(table.weight, 0) + _TINY
@@ -297,19 +302,19 @@ def is_isotropic(brdf: Callable) -> bool:
 
 @jax.jit
 def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
-    """Relative error of a table without parameters under light whose spectrum falls like (l + 1/2)^-2."""
+    """Relative error of a table without parameters under light of natural spectrum."""
     random = np.random.default_rng(1).uniform(size=(2, 24))
     height, angle = 0.05 + 0.95 * random[0], 2 * np.pi * random[1]
     radius = np.sqrt(1 - height**2)
     wo = jnp.asarray(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1), table.scale.dtype)
-    scale = np.concatenate([np.full(2 * band + 1, 1 / (band + 0.5)) for band in range(_DEGREE + 1)])
 
     def one(view):
         wi, area = hemisphere.arcs(lobe_em.mirror(view), rings=lobe_em.RINGS, sectors=lobe_em.SECTORS)
         view = jnp.broadcast_to(view, wi.shape)
         exact = brdf(wi, view) * jnp.maximum(wi[:, 2:], 0)
         both = jnp.concatenate([table(wi, view) - exact, exact + jnp.zeros_like(table(wi, view))], 1)
-        return (scale[:, None] * (harmonics.evaluate(wi, degree=_DEGREE).T @ (both * area[:, None]))) ** 2
+        reflected = harmonics.evaluate(wi, degree=_DEGREE).T @ (both * area[:, None])
+        return harmonics.convolve(reflected, harmonics.natural(degree=_DEGREE)) ** 2
 
     wrong, whole = jnp.split(jnp.sum(jax.lax.map(one, wo), (0, 1)), 2)
     return jnp.sqrt(jnp.sum(wrong) / jnp.maximum(jnp.sum(whole), _TINY))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.linalg import eigen
-from jaxprt.sphere import hemisphere
+from jaxprt.sphere import harmonics, hemisphere
 
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
 _MOST_TERMS = 256
@@ -110,7 +110,8 @@ def factor(
     if error is not None and not error > 0:
         raise ValueError(f"error must be positive, got {error}")
     _check_resolution(resolution)
-    direction, solid_angle = _parabolic_texels(resolution)
+    direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
+    solid_angle = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
     inside = np.flatnonzero(solid_angle)
     _check_terms(1 if terms is None else terms, inside.size)
     table = tabulate(brdf, direction)
@@ -225,7 +226,7 @@ def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c 
 
 
 def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Array, "d d"]:
-    """Covariance of natural light between directions, sum_l (l + 1/2)^-2 (2l + 1) / (4 pi) P_l(cos).
+    """Covariance of natural light between directions, sum_l s_l^2 (2l + 1) / (4 pi) P_l(cos).
 
     Args:
         direction: Unit directions.
@@ -234,18 +235,19 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
     Returns:
         A positive semidefinite matrix, relative units.
 
-    Reference: the power spectra of natural illumination fall about so: Dror, Willsky, Adelson 2004.
+    Reference: the addition theorem, with s_l from `jaxprt.sphere.harmonics.natural`.
     """
     cosine = jnp.clip(direction @ direction.T, -1, 1)
 
-    def step(carry, order):
-        before, legendre, total = carry
-        total = total + legendre / (order + 0.5) * (2 / (4 * jnp.pi))
+    def step(carry, band):
+        (before, legendre, total), (order, size) = carry, band
+        total = total + size**2 * (2 * order + 1) / (4 * jnp.pi) * legendre
         after = ((2 * order + 1) * cosine * legendre - order * before) / (order + 1)
         return (legendre, after, total), None
 
     start = (jnp.zeros_like(cosine), jnp.ones_like(cosine), jnp.zeros_like(cosine))
-    (_, _, total), _ = jax.lax.scan(step, start, jnp.arange(degree + 1, dtype=cosine.dtype))
+    band = jnp.arange(degree + 1, dtype=cosine.dtype), harmonics.natural(degree=degree).astype(cosine.dtype)
+    (_, _, total), _ = jax.lax.scan(step, start, band)
     return total
 
 
@@ -267,14 +269,6 @@ def _leading(matrix: Array, covariance: Array, terms: int | None, error: float |
         if count == most:
             raise ValueError(f"error must be at least {remainder[-1]:.3g}, which {count} terms reach; got {error}")
         count = min(4 * count, most)
-
-
-def _parabolic_texels(resolution: int) -> tuple[Array, Array]:
-    """Directions of the texels of a parabolic map, and their solid angles; outside the disk none."""
-    center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
-    square = (center**2 + center[:, None] ** 2).ravel()
-    weight = jnp.where(square < 1, 4 / (1 + square) ** 2, 0.0) * (2 / resolution) ** 2
-    return hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3), weight
 
 
 def _check_resolution(resolution: int) -> None:

@@ -253,7 +253,8 @@ def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> 
 
     Args:
         coefficient: Coefficients in l(l+1)+m order.
-        factor: One factor for each band, from `cosine`, `phong`, `hann`, `lanczos` or `least_laplacian`.
+        factor: One factor for each band, from `cosine`, `phong`, `hann`, `lanczos`, `natural` or
+            `least_laplacian`.
 
     Raises:
         ValueError: The number of rows is not a square, or the factors are not of as many bands.
@@ -306,6 +307,14 @@ def hann(*, degree: int) -> Float[Array, " l"]:
 def lanczos(*, degree: int) -> Float[Array, " l"]:
     """Lanczos's window, sinc(l / (degree + 1)): the mildest of the three."""
     return jnp.asarray(np.sinc(np.arange(degree + 1) / (degree + 1)), jnp.result_type(float))
+
+
+def natural(*, degree: int) -> Float[Array, " l"]:
+    """Size of each band of natural light, 1 / (l + 1/2), in relative units.
+
+    Reference: the power spectra of natural illumination fall about so: Dror, Willsky, Adelson 2004.
+    """
+    return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
 @jax.jit

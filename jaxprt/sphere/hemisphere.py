@@ -186,6 +186,16 @@ def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     return jnp.where(inside, (2 / resolution) ** 2, 0.0)
 
 
+def parabolic_texel_area(*, resolution: int) -> Float[Array, "n n"]:
+    """Solid angle of each texel of a parabolic map whose center lies inside the unit disk, else 0.
+
+    Unlike `texel_area` without the cosine, which no map makes a constant here: d omega = 4 dx dy / (1 + x^2 + y^2)^2.
+    """
+    center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
+    square = center[:, None] ** 2 + center[None, :] ** 2
+    return jnp.where(square < 1, (4 / resolution / (1 + square)) ** 2, 0.0)
+
+
 def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Integral of cos(theta) d omega over each texel of a polar map, as `texel_area` is for a disk map; exact."""
     square = (jnp.arange(resolution + 1) / resolution) ** 2

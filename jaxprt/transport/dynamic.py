@@ -88,9 +88,9 @@ def precompute(
     Args:
         mesh: The vertices to light.
         brdfs: Of each region, in the order of their numbers: a set, or the one BRDF that it has for good, factored.
-        vectors: Principal components of a cluster of vertices; see `jaxprt.transport.clustered.precompute`, as for
-        modes: and
-        keep: . Where a small region or few terms have fewer, those are taken.
+        vectors: Principal components along the vertices of a cluster, or as many as it has.
+        modes: Principal components along the light, which all vectors and terms of a cluster share; likewise.
+        keep: Wavelets of each cluster.
         size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
         occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.

@@ -56,16 +56,16 @@ def test_a_member_of_the_set_is_its_own_table(lobes, pairs):
     for number, brdf in enumerate(SET):
         mixed = table.at(jnp.eye(3)[number])
         alone = fit(brdf)
-        np.testing.assert_allclose(mixed(wi, wo), alone(wi, wo) / wi[:, 2:], rtol=2e-3, atol=1e-5)
+        np.testing.assert_allclose(mixed(wi, wo), alone(wi, wo) / wi[:, 2:], rtol=1e-5, atol=1e-7)
 
 
 def test_between_members_lobes_are_those_of_the_model_there(lobes, pairs):
-    """Halfway in the logarithm of the roughness, as far off as at the members."""
+    """Halfway in the logarithm of the roughness: 1.13 times as far off as at the sharper member."""
     mixed = dynamic.factor(SET, lobes).at(jnp.array([0.5, 0.5, 0.0]))
     model = lobe_of(np.sqrt(ROUGH[0] * ROUGH[1]))
     wi, wo = pairs
     member = relative(fit(SET[0])(wi, wo), SET[0](wi, wo) * wi[:, 2:])
-    assert relative(mixed(wi, wo) * wi[:, 2:], model(wi, wo) * wi[:, 2:]) < member + 0.06
+    assert relative(mixed(wi, wo) * wi[:, 2:], model(wi, wo) * wi[:, 2:]) < 1.2 * member
 
 
 def test_between_fresnel_reflectances_lobes_without_light_have_no_say(pairs):
@@ -76,13 +76,16 @@ def test_between_fresnel_reflectances_lobes_without_light_have_no_say(pairs):
     steep = (wo[:, 2] > 0.6)[:, None]
     exact = jnp.where(steep, lobe_of(0.2, 0.3)(wi, wo), 0)
     alone = fit(lobe_of(0.2, 0.3))(wi, wo) / wi[:, 2:]
-    assert relative(jnp.where(steep, mixed(wi, wo), 0), exact) < 1.5 * relative(jnp.where(steep, alone, 0), exact)
+    assert relative(jnp.where(steep, mixed(wi, wo), 0), exact) < 1.05 * relative(jnp.where(steep, alone, 0), exact)
 
 
-def test_the_model_between_members_has_the_mean_of_their_parameters(lobes):
-    mixed = dynamic.factor(SET, lobes).at(jnp.array([0.5, 0.25, 0.25]))
+def test_the_model_between_members_is_as_wide_as_the_lobes_there_and_reflects_the_mean():
+    share = np.array([0.5, 0.25, 0.25])
+    members = [lobe_of(m, f0) for m, f0 in zip(ROUGH, (0.1, 0.5, 0.9), strict=True)]
+    mixed = dynamic.factor(members, None, ranks=(1, 1, 1), resolution=8).at(jnp.asarray(share))
     assert isinstance(mixed.brdf, CookTorrance)
-    np.testing.assert_allclose(mixed.brdf.roughness, np.dot([0.5, 0.25, 0.25], ROUGH), rtol=1e-6)
+    np.testing.assert_allclose(mixed.brdf.roughness, np.exp(share @ np.log(ROUGH)), rtol=1e-5)
+    np.testing.assert_allclose(mixed.brdf.f0, share @ [0.1, 0.5, 0.9], rtol=1e-6)
 
 
 @pytest.mark.parametrize("ranks", [(1, 4, 4), (2, 8, 8), (3, 24, 24)])
@@ -99,7 +102,7 @@ def test_the_error_of_a_tensor_is_that_of_what_it_reflects(ranks):
             exact = basis.T @ brdf(wi, view)
             wrong += float(jnp.sum((basis.T @ table.at(jnp.eye(3)[number])(wi, view) - exact) ** 2))
             whole += float(jnp.sum(exact**2))
-    assert np.sqrt(wrong / whole) < 1.5 * float(table.error) + 0.02
+    assert np.sqrt(wrong / whole) < 0.65 * float(table.error)
 
 
 def test_errors_fall_with_ranks():
@@ -110,18 +113,18 @@ def test_errors_fall_with_ranks():
 def test_lobes_leave_less_than_a_coarse_tensor(lobes):
     both = dynamic.factor(SET, lobes, ranks=(2, 4, 4), resolution=RESOLUTION)
     tensor = dynamic.factor(SET, None, ranks=(3, 16, 16), resolution=RESOLUTION)
-    assert both.error < 0.5 * tensor.error
+    assert both.error < 0.45 * tensor.error
 
 
 def test_turned_views_equal_views_one_by_one(monkeypatch):
     fast = dynamic.factor(SET, None, ranks=(2, 4, 4), resolution=RESOLUTION)
-    monkeypatch.setattr(lobe, "is_isotropic", lambda brdf: False)
+    monkeypatch.setattr(dynamic, "is_isotropic", lambda brdf: False)
     slow = dynamic.factor(SET, None, ranks=(2, 4, 4), resolution=RESOLUTION)
-    np.testing.assert_allclose(fast.error, slow.error, rtol=1e-3)
+    np.testing.assert_allclose(fast.error, slow.error, rtol=1e-4)
     share = jnp.array([0.2, 0.5, 0.3])
     view, other = (each.at(share).terms for each in (fast, slow))
     both = [jnp.einsum("kxyl,kuvl->xyuv", each.light_map, each.view_map) for each in (view, other)]
-    assert relative(*both) < 1e-2
+    assert relative(*both) < 1e-4
 
 
 def test_sets_of_unlike_functions_are_factored_one_by_one(pairs):
@@ -130,7 +133,7 @@ def test_sets_of_unlike_functions_are_factored_one_by_one(pairs):
     assert table.brdf is None
     assert table.at(jnp.eye(3)[0]).brdf is None
     wi, wo = pairs
-    assert relative(table.at(jnp.eye(3)[2])(wi, wo), jnp.full((400, 1), 0.2)) < 0.15
+    assert relative(table.at(jnp.eye(3)[2])(wi, wo), jnp.full((400, 1), 0.2)) < 0.011
 
 
 def test_colors_of_a_set_are_members_of_their_own(pairs):
@@ -139,7 +142,7 @@ def test_colors_of_a_set_are_members_of_their_own(pairs):
     assert table.factor.shape == (2, 3, 2)
     wi, wo = pairs
     value = table.at(jnp.array([0.5, 0.5]))(wi, wo)
-    np.testing.assert_allclose(value, jnp.broadcast_to(jnp.array([0.55, 0.25, 0.45]) / np.pi, value.shape), rtol=0.03)
+    np.testing.assert_allclose(value, jnp.broadcast_to(jnp.array([0.55, 0.25, 0.45]) / np.pi, value.shape), rtol=0.025)
 
 
 def test_published_tensor_is_exact_at_full_rank():
@@ -149,8 +152,8 @@ def test_published_tensor_is_exact_at_full_rank():
     wi = jnp.broadcast_to(direction[inside][:, None], (22, 22, 3))
     for number, brdf in enumerate(SET):
         exact = brdf(wi, wi.swapaxes(0, 1))
-        assert relative(table.at(jnp.eye(3)[number])(wi, wi.swapaxes(0, 1)), exact) < 0.02
-    assert table.error < 1e-2
+        assert relative(table.at(jnp.eye(3)[number])(wi, wi.swapaxes(0, 1)), exact) < 0.013
+    assert table.error < 6e-3
 
 
 def test_published_lobes_leave_what_a_tensor_can_carry():
@@ -170,7 +173,7 @@ def test_derivatives_by_shares(lobes, pairs):
 
     share, step = jnp.array([0.5, 0.3, 0.2]), jnp.array([0.02, -0.02, 0.0])
     slope = jax.grad(total)(share) @ step
-    assert np.isclose(slope, (total(share + step) - total(share - step)) / 2, rtol=0.02)
+    np.testing.assert_allclose(slope, (total(share + step) - total(share - step)) / 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,10 @@ SIZE = 16
 EYE = jnp.array([1.2, 1.5, 2.5])
 ROUGH = [0.25, 0.4, 0.6]
 ALBEDO = jnp.array([0.5, 0.4, 0.3])
-# Relative errors; what was measured, and half as much again.
-GLOSSY = 0.05
-GROUND = 0.03
+# Relative errors: half as much again as measured, which was .0122 at the sharpest, .0069 and .0051.
+GLOSSY = 0.018
+GROUND = 0.0105
+TENSOR = 0.0077
 
 
 @pytest.fixture(scope="module")
@@ -95,18 +96,24 @@ def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
     color = dynamic.radiance(transport, [tensor, fixed], [matter, None], light, eye=EYE)
     ball = np.asarray(mesh.region) == 0
     exact = np.asarray(reference.radiance(mesh, members[0], light, eye=EYE))
-    assert relative(np.asarray(color)[ball], exact[ball]) < 0.1
+    assert relative(np.asarray(color)[ball], exact[ball]) < TENSOR
 
 
-def test_terms_of_the_remainder_change_little_and_not_for_the_worse(mesh, family, fixed, line, light):
+def test_terms_of_the_remainder_change_little(mesh, transport, family, fixed, light):
+    """They are by a wavelet transport what lobes leave by their own: the error was 1.10 times that of lobes alone."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in ROUGH]
     more = brdfs.factor(members, family.lobe, ranks=(3, 12, 12), resolution=16)
-    transport = transports.precompute(mesh, [more, fixed], size=SIZE, progress=False)
     matter = dynamic.Material(jnp.array([0.0, 1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
     ball = np.asarray(mesh.region) == 0
     exact = np.asarray(reference.radiance(mesh, members[1], light, eye=EYE))[ball]
-    color = np.asarray(dynamic.radiance(transport, [more, fixed], [matter, None], light, eye=EYE))[ball]
-    assert relative(color, exact) < GLOSSY
+    error = []
+    for each, made in (
+        (family, transport),
+        (more, transports.precompute(mesh, [more, fixed], size=SIZE, progress=False)),
+    ):
+        color = np.asarray(dynamic.radiance(made, [each, fixed], [matter, None], light, eye=EYE))
+        error.append(relative(color[ball], exact))
+    assert 0.9 * error[0] < error[1] < 1.15 * error[0]
 
 
 def test_a_texture_on_the_diffuse_part(mesh, transport, family, fixed, line, light):
@@ -117,7 +124,7 @@ def test_a_texture_on_the_diffuse_part(mesh, transport, family, fixed, line, lig
     ]
     ball = np.asarray(mesh.region) == 0
     textured, black, white = (np.asarray(each)[ball] for each in both)
-    np.testing.assert_allclose(textured, black + texture[ball] * (white - black), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(textured, black + texture[ball] * (white - black), rtol=1e-5, atol=1e-6)
 
 
 def test_light_and_weights_are_linear(transport, family, fixed, line, light):
@@ -125,9 +132,9 @@ def test_light_and_weights_are_linear(transport, family, fixed, line, light):
         matter = material(line, 0.4, scale * np.array([0.3, 0.2, 0.1]), scale * np.array([0.5, 0.5, 0.4]))
         return dynamic.radiance(transport, [family, fixed], [matter, None], light, eye=EYE)
 
-    np.testing.assert_allclose(color(Environment(2 * light.radiance), 1.0), 2 * color(light, 1.0), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(color(Environment(2 * light.radiance), 1.0), 2 * color(light, 1.0), rtol=1e-5)
     ball = slice(0, 20)
-    np.testing.assert_allclose(color(light, 0.5)[ball], 0.5 * color(light, 1.0)[ball], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(color(light, 0.5)[ball], 0.5 * color(light, 1.0)[ball], rtol=1e-5)
 
 
 def test_staged_calls_equal_the_whole(transport, family, fixed, line, light):
@@ -171,7 +178,7 @@ def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light,
         again = transports.precompute(mesh, [family, fixed], size=SIZE, path=tmp_path, progress=False)
     materials = [material(line, 0.3), None]
     color, same = (dynamic.radiance(each, [family, fixed], materials, light, eye=EYE) for each in (transport, again))
-    np.testing.assert_allclose(color, same, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(color, same, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

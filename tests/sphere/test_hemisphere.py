@@ -99,6 +99,14 @@ def test_polar_texels_are_the_directions_that_their_centers_stand_for():
     assert jnp.all(direction[..., 2] > 0)
 
 
+def test_parabolic_texel_area_is_the_solid_angle():
+    direction = hemisphere.parabolic_texel_direction(resolution=48)
+    weight = hemisphere.parabolic_texel_area(resolution=48)
+    np.testing.assert_allclose(jnp.sum(weight), 2 * jnp.pi, rtol=5e-3)
+    np.testing.assert_allclose(jnp.sum(weight * direction[..., 2]), jnp.pi, rtol=5e-3)
+    np.testing.assert_allclose(jnp.sum(weight * direction[..., 2] ** 2), 2 * jnp.pi / 3, rtol=5e-3)
+
+
 def test_polar_texel_area_integrates_the_cosine():
     weight = hemisphere.polar_texel_area(resolution=48)
     assert jnp.sum(weight) == pytest.approx(np.pi, rel=1e-5)
