@@ -27,7 +27,7 @@ test: check ## check, then all tests, doctests and notebooks; real data where JA
 
 bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
 	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \
-		$(filter-out __init__ harness,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
+		$(filter-out __init__ harness path_tracing,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
 	$(BIN)/python -m benchmarks.$(NAME) $(ARGS)
 
 tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, about an hour: ARGS="--mesh stanford_bunny" for one

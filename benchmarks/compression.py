@@ -6,9 +6,9 @@ The bunny with Ashikhmin-Shirley (10, 100) on a diffuse ground (from JAXPRT_DATA
 not set, and with --quick), under each light and from every view against the sum over all texels. A configuration is the
 number of terms, vectors, modes and coefficients of the clustered transport, and of texels summed one by one; or a
 number of lobes, the ground's light then by spherical harmonics; the published configuration, four sparse terms with 96
-coefficients, stands beside. One line for each light: `seconds` is a
-light change (environment to radiance of all vertices), `view_seconds` a view change. The peer is the other way to make
-the picture anew: a light change by the published configuration.
+coefficients, stands beside. One line for each light: `seconds` is a light change (environment to radiance of all
+vertices), `view_seconds` a view change. The peer is the other way to make the picture anew: a light change by the
+published configuration. Mitsuba 3's pictures stand in the same plot; see `benchmarks.path_tracing`.
 """
 
 import pathlib
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import harness
+from benchmarks import harness, path_tracing
 from jaxprt.brdf import AshikhminShirley, Lambert, published, separable
 from jaxprt.brdf import lobe as lobes
 from jaxprt.relight import direct as texels
@@ -109,6 +109,13 @@ def measure(quick: bool, store: pathlib.Path | None):
         stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in seen)
         yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
     yield from measure_lobes(seen, exact, lights, views, rays, repeats, peer, quick)
+    named = dict(zip(names(lights), lights, strict=True))
+    yield from path_tracing.measure(glossy, ground, named, views[0], quick=quick)
+
+
+def names(lights: list[Environment]) -> list[str]:
+    """Of the real lights, or of the embedded ones."""
+    return list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
 
 
 def scene(quick: bool) -> tuple[Mesh, Mesh, list[Environment]]:
@@ -174,7 +181,6 @@ def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
 def report_case(name, parts: list[Part], sun, exact, lights, views, stored, precompute, repeats, peer):
     """One line for each light."""
     vertices = sum(part.visible.position.shape[0] for part in parts)
-    names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
     for number, light in enumerate(lights):
         texel, excess, rest = texels.split(light, count=sun)
         lit = [light_tuple(part.transport, rest) for part in parts]
@@ -202,7 +208,8 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 
         timing, other = harness.compare(lighten, peer[number][0], repeats=repeats)
         yield {
-            **{"benchmark": "compression", "case": f"{name}, {names[number]}", "light": names[number]},
+            **{"benchmark": "compression", "case": f"{name}, {names(lights)[number]}", "light": names(lights)[number]},
+            "method": "clustered",
             **timing.line(),
             "view_seconds": harness.measure(turn, repeats=repeats).seconds,
             "error": float(np.sqrt(wrong / whole)),
@@ -216,7 +223,6 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: bool):
     """Lines of lobes, for the glossy object and for the ground."""
     stored = sum(each.nbytes for each in seen)
-    names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
     plain = lobes.tabulate(GROUND, lobes=1, resolution=8)
     for count, sun in [(3, 4)] if quick else LOBES:
         start = time.perf_counter()
@@ -252,9 +258,10 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
                 ]
 
             timing, other = harness.compare(lighten, peer[number][0], repeats=repeats)
-            name = f"{count} lobes, {sun} texels, {names[number]}"
+            name = f"{count} lobes, {sun} texels, {names(lights)[number]}"
             yield {
-                **{"benchmark": "compression", "case": name, "light": names[number], "lobes": count},
+                **{"benchmark": "compression", "case": name, "light": names(lights)[number], "lobes": count},
+                "method": "lobes",
                 **timing.line(),
                 "view_seconds": harness.measure(turn, repeats=repeats).seconds,
                 "error": float(np.sqrt(wrong / whole)),
@@ -281,8 +288,7 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
     seconds = time.perf_counter() - start
     eye = jnp.asarray(views[0])
     view = [view_tuple(part, brdf, eye) for part, brdf in zip(parts, factored, strict=True)]
-    changes = []
-    lines = []
+    changes, lines, named = [], [], names(lights)
     for number, light in enumerate(lights):
 
         def lighten(light=light):
@@ -299,13 +305,13 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
             for at, now in enumerate(turn(eye=each)):
                 wrong += np.sum((np.asarray(now) - exact[at][number, place]) ** 2, dtype=np.float64)
                 whole_square += np.sum(exact[at][number, place] ** 2, dtype=np.float64)
-        names = list(LIGHTS) if len(lights) == len(LIGHTS) else ["daylight", "studio"]
         stored = sum(part.nbytes for part in parts)
         error = float(np.sqrt(wrong / whole_square))
         changes.append((lighten, error))
         lines.append(
             {
-                **{"benchmark": "compression", "case": f"published, {names[number]}", "light": names[number]},
+                **{"benchmark": "compression", "case": f"published, {named[number]}", "light": named[number]},
+                "method": "published",
                 **harness.measure(lighten, repeats=5).line(),
                 "view_seconds": harness.measure(turn, repeats=5).seconds,
                 "error": error,
@@ -321,15 +327,17 @@ def plot(lines: list[dict], path: pathlib.Path) -> None:
     """Error against milliseconds of a light change, one panel for each light."""
     from matplotlib import pyplot, ticker
 
-    names = list(dict.fromkeys(line["light"] for line in lines))
-    figure, axes = pyplot.subplots(1, len(names), figsize=(4.5 * len(names), 4), sharey=True, squeeze=False)
-    for panel, light in zip(axes[0], names, strict=True):
+    every = list(dict.fromkeys(line["light"] for line in lines))
+    figure, axes = pyplot.subplots(1, len(every), figsize=(4.5 * len(every), 4), sharey=True, squeeze=False)
+    for panel, light in zip(axes[0], every, strict=True):
         row = [line for line in lines if line["light"] == light]
-        for label, chosen in (
-            ("clustered, texels apart", [x for x in row if "peer" in x and "lobes" not in x]),
-            ("lobes, texels apart", [x for x in row if "lobes" in x]),
-            ("published: 4 terms of 96", [x for x in row if "peer" not in x]),
+        for label, method in (
+            ("clustered, texels apart", "clustered"),
+            ("lobes, texels apart", "lobes"),
+            ("published: 4 terms of 96", "published"),
+            (f"Mitsuba 3, {path_tracing.SAMPLES[0]} to {path_tracing.SAMPLES[-1]} samples", "Mitsuba 3"),
         ):
+            chosen = [line for line in row if line["method"] == method]
             panel.loglog([1e3 * x["seconds"] for x in chosen], [x["error"] for x in chosen], "o-", label=label)
         for rate in (60, 30, 10):
             panel.axvline(1e3 / rate, color="gray", linewidth=0.5)

@@ -9,6 +9,7 @@ transport has a term for them. The set is gray where its BRDFs are; of colored o
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -318,14 +319,18 @@ def _reflected(
 
 def _to_map(direction: Array) -> Array:
     """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
-    up = jnp.array([0, 0, 1], direction.dtype)
-    wi, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
+    smooth = jnp.asarray(_dual(), direction.dtype) @ harmonics.evaluate(direction, degree=_DEGREE).T
+    return harmonics.convolve(smooth, 1 / harmonics.natural(degree=_DEGREE))
+
+
+@lru_cache(maxsize=1)
+def _dual() -> np.ndarray:
+    """Inverse of the products of harmonics with each other and the cosine, on the hemisphere."""
+    wi, area = hemisphere.arcs(jnp.array([0.0, 0, 1]), rings=_RINGS, sectors=_SECTORS)
     light = np.asarray(harmonics.evaluate(wi, degree=_DEGREE), np.float64)
     value, vector = np.linalg.eigh(light.T @ (light * np.asarray(wi[:, 2:] * area[:, None], np.float64)))
     known = value > _NULL * value[-1]
-    inverse = jnp.asarray((vector[:, known] / value[known]) @ vector[:, known].T, direction.dtype)
-    smooth = inverse @ harmonics.evaluate(direction, degree=_DEGREE).T
-    return harmonics.convolve(smooth, 1 / harmonics.natural(degree=_DEGREE))
+    return (vector[:, known] / value[known]) @ vector[:, known].T
 
 
 def _heights(direction: Array) -> tuple[Array, np.ndarray]:

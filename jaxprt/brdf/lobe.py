@@ -20,8 +20,9 @@ from jaxprt.brdf import grid, lobe_em
 from jaxprt.linalg import mixture
 from jaxprt.sphere import harmonics, hemisphere
 
-# EM's steps, and the share that neighbors in the table have in a lobe after them.
-_ROUNDS = ((8, 0.5), (8, 0.5), (8, 0.25), (8, 0.25), (8, 0.1), (8, 0.1), (12, 0.0))
+_STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
+# How many times these, and the share that neighbors in the table have in a lobe after them.
+_ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0))
 _DEGREE = 24  # of the natural light by which a table is judged
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
 _GRAZING = 1e-3
@@ -269,8 +270,9 @@ def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array,
     gray = jnp.sum(mass, -1)
     lobe, least = lobe_em.start(wo, sample, gray, lobes=lobes)
     weight = jnp.sum(gray, 1, keepdims=True) / 2
-    for steps, share in _ROUNDS:
-        lobe, weight = lobe_em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=steps)
+    for times, share in _ROUNDS:
+        for _ in range(times):
+            lobe, weight = lobe_em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
         if share:
             lobe = lobe_em.blend(wo, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
     weight = lobe_em.weigh(sample, mass, extent, lobe, fixed, weight)
