@@ -104,7 +104,7 @@ def _run(options: argparse.Namespace) -> None:
     told = _describe(scene, options)
     print(f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in scene.parts)} vertices")
     _warn_of_backs(scene)
-    systems = options.system or (["separable", "harmonic"] if options.mesh is None else ["separable"])
+    systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["separable"])
     ready = {}
     for system in systems:
         if system == "separable":

@@ -119,8 +119,7 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
 
     Reference: Sun et al. 2007, section 4.1.
     """
-    if not brdfs:
-        raise ValueError("brdfs must be at least one, got none")
+    _check_sequence(brdfs)
     tables = [tabulate(each, lobes=lobes) if separator is None else separator(each) for each in brdfs]
     if len({each.isotropic for each in tables}) > 1:
         found = ", ".join("isotropic" if each.isotropic else "anisotropic" for each in tables)
@@ -184,6 +183,8 @@ def factor(
         return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
     direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
     area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
+    colors = brdfs[0](*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape[1]
+    check_ranks(ranks, (len(brdfs) * colors, int(jnp.sum(area > 0)), (_DEGREE + 1) ** 2))
     # All at once where they are of one kind, and else one by one.
     parts = (
         [(jax.tree.map(lambda x: x[None], grid.as_argument(each)), jnp.array([n])) for n, each in enumerate(brdfs)]
@@ -231,9 +232,7 @@ def decompose(
     """
     count, colors = tensor.shape[:2]
     inside = np.flatnonzero(np.asarray(weight))
-    most = (count * colors, len(inside), tensor.shape[3])
-    if len(ranks) != 3 or any(not 1 <= r <= n for r, n in zip(ranks, most, strict=True)):
-        raise ValueError(f"ranks must be three, from 1 to the tensor's size {most}, got {ranks}")
+    check_ranks(ranks, (count * colors, len(inside), tensor.shape[3]))
     flat = tensor.reshape(count * colors, *tensor.shape[2:])
     met = flat[:, inside] * weight[inside, None]
     found = tucker.truncated(met, ranks=ranks)
@@ -261,13 +260,26 @@ def decompose(
 
 def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None) -> None:
     """Refuses a set without BRDFs, and lobes that are not those of the set."""
-    if not brdfs:
-        raise ValueError("brdfs must be at least one, got none")
+    _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
         raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
     colors = [brdf(*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
     if len(set(colors)) > 1 or len(colors[0]) != 2 or colors[0][1] not in (1, 3):
         raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(colors)}")
+
+
+def _check_sequence(brdfs: Sequence[Callable]) -> None:
+    if not isinstance(brdfs, Sequence):
+        raise TypeError(f"brdfs must be a sequence of BRDFs, as Family.brdf is, got {type(brdfs).__name__}")
+    if not brdfs:
+        raise ValueError("brdfs must be at least one, got none")
+
+
+def check_ranks(ranks: tuple[int, int, int], most: tuple[int, int, int]) -> None:
+    """Refuses ranks that are not three whole numbers from 1 to the tensor's size."""
+    whole = len(ranks) == 3 and all(isinstance(each, int | np.integer) for each in ranks)
+    if not whole or any(not 1 <= r <= n for r, n in zip(ranks, most, strict=True)):
+        raise ValueError(f"ranks must be three whole numbers, from 1 to the tensor's size {most}, got {ranks}")
 
 
 def check_values(least: Sequence[Float[Array, " m"]]) -> None:

@@ -150,7 +150,7 @@ def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     with shares s that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
     """
     share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
-    part = share * jnp.sum(table.weight, 0) + _TINY
+    part = jnp.maximum(share * jnp.sum(table.weight, 0), 0) + _TINY
     part = part / jnp.sum(part, 1, keepdims=True)
     place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
     scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)

@@ -23,6 +23,7 @@ from scipy import spatial
 from jaxprt.brdf import models
 
 _ROUNDING = 16  # Units of rounding up to which points coincide, and triangles are lines.
+_FAR = 1e30
 _SMOOTHEST = 1e-3  # Least roughness that the models tell apart.
 _SCALE = np.array([1.0, 1.15, 1.66])  # MERL's scale of colors, which the fits of Ngan et al. lack.
 _COLUMNS = ("kd_r", "kd_g", "kd_b", "ks_r", "ks_g", "ks_b", "m", "F0")
@@ -47,12 +48,15 @@ class Line(eqx.Module):
 
     knot: Float[Array, " m"]
 
-    def share(self, coordinate: Float[Array, ""]) -> Float[Array, " m"]:
+    def share(self, coordinate: Float[ArrayLike, ""]) -> Float[Array, " m"]:
         """Share of each BRDF; not negative, their sum is one.
 
         Differentiable in the coordinate and the knots: at a knot from above, at the last one from below.
+
+        Raises:
+            ValueError: The coordinate is no single number.
         """
-        spot = _clip(coordinate, self.knot[0], self.knot[-1])
+        spot = _clip(_checked(coordinate, ()), self.knot[0], self.knot[-1])
         low = jnp.clip(jnp.searchsorted(self.knot, spot, side="right") - 1, 0, len(self.knot) - 2)
         upper = (spot - self.knot[low]) / (self.knot[low + 1] - self.knot[low])
         return jnp.zeros(len(self.knot), upper.dtype).at[low].set(1 - upper).at[low + 1].set(upper)
@@ -80,14 +84,17 @@ class Plane(eqx.Module):
     edge: Int[Array, "e 2"]
     chart: Callable[[Array], Array] = eqx.field(static=True, default=_identity)
 
-    def share(self, coordinate: Float[Array, "2"]) -> Float[Array, " m"]:
+    def share(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
         """Share of each BRDF; not negative, their sum is one, and three at most are not zero.
 
         Continuous. Differentiable in the coordinate and the points, with the triangulation fixed: the derivative is
         that of the triangle or edge which was picked, one-sided where several meet, and zero where the nearest point
         of the boundary stays at one vertex.
+
+        Raises:
+            ValueError: There are not two coordinates.
         """
-        point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, coordinate))
+        point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, _checked(coordinate, (2,))))
         # What is picked is not differentiated.
         still, fixed = jax.lax.stop_gradient((point, spot))
         weight, flat = _barycentric(still[self.triangle], fixed)
@@ -296,6 +303,15 @@ def _number(row: dict, column: str, line: int) -> float:
         required = {"m": "positive", "F0": "between 0 and 1"}.get(column, "not negative")
         raise ValueError(f"line {line}: {column} must be finite and {required}, got {value}")
     return value
+
+
+def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Coordinates as floating-point numbers; infinite ones are far away."""
+    value = jnp.asarray(coordinate, jnp.result_type(float))
+    if value.shape != shape:
+        kind = "two coordinates" if shape else "one coordinate, a number,"
+        raise ValueError(f"a point of this set has {kind} not an array of shape {list(value.shape)}")
+    return jnp.clip(value, -_FAR, _FAR)
 
 
 def _clip(value: Array, low: ArrayLike, high: ArrayLike) -> Array:

@@ -50,13 +50,13 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         the flux of the brightest texel not taken; and the environment without that.
 
     Raises:
-        ValueError: The light is a batch, or as many texels as there are are asked for, or none.
+        ValueError: The light is a batch, or as many texels as there are are asked for, or less than none.
     """
     size, colors = light.radiance.shape[-2:]
     if light.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
-    if not 1 <= count < 6 * size * size:
-        raise ValueError(f"count must be between 1 and {6 * size * size - 1}, got {count}")
+    if not 0 <= count < 6 * size * size:
+        raise ValueError(f"the number of texels must be from 0 to {6 * size * size - 1}, got {count}")
     radiance = light.radiance.reshape(-1, colors)
     flux = jnp.sum(radiance, -1) * cubemap.solid_angle(size=size).ravel()
     texel = _largest(jax.lax.stop_gradient(flux), count + 1)
@@ -94,6 +94,7 @@ def radiance(
     size = transport.size
     frame = jnp.moveaxis(transport.frame, 0, 2)
     wo = directions.normalize(jnp.stack([_along(axis, eye - transport.position) for axis in frame], -1)).T
+    facing = wo[2] > 0
     # Vertices last, which XLA's CPU code turns into vectors of them.
     value = jax.vmap(jax.vmap(brdf, in_axes=(1, 1), out_axes=1), in_axes=(1, None), out_axes=1)
 
@@ -102,7 +103,7 @@ def radiance(
         direction, area = (table(size=size).reshape(-1, 3)[texel] for table in (cubemap.direction, cubemap.vector_area))
         wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
         flux = jnp.maximum(_along(frame[2], area[:, None]), 0) * visible
-        sent = value(wi, wo) * flux
+        sent = value(wi, wo) * flux * facing
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
     count = max(1, min(_GROUP, len(texel)))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxprt.brdf.dynamic import DynamicBrdf, Mixed
 from jaxprt.brdf.models import Lambert
@@ -23,8 +23,12 @@ from jaxprt.transport.dynamic import DynamicTransport, RegionTransport
 from jaxprt.transport.lobe import LobeTransport
 
 
+def _floating(value: ArrayLike) -> Array:
+    return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
+
+
 class Material(eqx.Module):
-    """What a region is made of at present.
+    """What a region is made of at present. Numbers, lists and NumPy arrays become arrays.
 
     Attributes:
         share: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
@@ -32,9 +36,9 @@ class Material(eqx.Module):
         specular: What the BRDF of the set is multiplied by; the same.
     """
 
-    share: Float[Array, " m"]
-    diffuse: Float[Array, "*v c"]
-    specular: Float[Array, "*w d"]
+    share: Float[Array, " m"] = eqx.field(converter=_floating)
+    diffuse: Float[Array, "*v c"] = eqx.field(converter=_floating)
+    specular: Float[Array, "*w d"] = eqx.field(converter=_floating)
 
 
 class DynamicLight(eqx.Module):
@@ -107,8 +111,10 @@ def radiance(
         Differentiable in the light, the eye and the materials.
 
     Raises:
+        TypeError: The light is no Environment, or a material no Material.
         ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
-            be, shares of another number of BRDFs, or a light of another size.
+            be, shares of another number of BRDFs, weights of two or more than three colors, an eye that is not one
+            position, or a light of another size.
 
     Reference: Sun et al. 2007, equation 3 with direct lighting, and section 4.1.
     """
@@ -122,6 +128,8 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
     Arguments and errors as of `radiance`.
     """
     size = transport.size
+    if not isinstance(light, Environment):
+        raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
     if light.radiance.shape[:-1] != (6, size, size):
         raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
     texel, excess, rest = direct.split(light, count=texels)
@@ -144,6 +152,9 @@ def view_side(
 
     Arguments and errors as of `radiance`.
     """
+    eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
+    if eye.shape != (3,):
+        raise ValueError(f"the eye must be one position, [3], got an array of shape {list(eye.shape)}")
     count = len(transport.region)
     if len(brdfs) != count or len(materials) != count:
         raise ValueError(
@@ -241,11 +252,15 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
         raise ValueError(f"region {number} {'needs a material' if changes else 'has one BRDF for good: give None'}")
     if material is None:
         return
-    if len(material.share) != brdf.size:
-        raise ValueError(f"the shares of region {number} must be of its {brdf.size} BRDFs, got {len(material.share)}")
+    if not isinstance(material, Material):
+        raise TypeError(f"the material of region {number} must be a Material, got {type(material).__name__}")
+    if material.share.shape != (brdf.size,):
+        shape = list(material.share.shape)
+        raise ValueError(f"the shares of region {number} must be one for each of its {brdf.size} BRDFs, got {shape}")
     for name in ("diffuse", "specular"):
         shape = getattr(material, name).shape
-        if len(shape) > 2 or (len(shape) == 2 and shape[0] != vertices):
+        if len(shape) > 2 or (len(shape) == 2 and shape[0] != vertices) or shape[-1] not in (1, 3):
             raise ValueError(
-                f"{name} of region {number} must be a color or one for each of {vertices} vertices, got {list(shape)}"
+                f"{name} of region {number} must be gray [1], a color [3] or one of either for each of {vertices} "
+                f"vertices, got {list(shape)}"
             )

@@ -31,8 +31,8 @@ def radiance(
 
     Args:
         mesh: The vertices.
-        brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions; a new function object,
-            as a lambda in a loop, compiles anew.
+        brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions, of which values below
+            the horizon do not count; a new function object, as a lambda in a loop, compiles anew.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
         occluder: What casts shadows; the mesh itself if None.
@@ -101,7 +101,7 @@ def integrate(
         value = brdf(directions.to_local(axes, direction), jnp.broadcast_to(wo, direction.shape))
         if jnp.ndim(value) != 2 or value.shape[0] != len(direction):
             raise ValueError(f"the BRDF must return [{len(direction)}, c] here, got {list(jnp.shape(value))}")
-        value = value * flux[:, None]
+        value = value * (flux * (wo[2] > 0))[:, None]
         value = jnp.broadcast_to(value, (value.shape[0], max(value.shape[1], table.shape[-1])))
         return jnp.einsum("...dc,dc->...c", table, value)
 

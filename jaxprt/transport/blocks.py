@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import tqdm
+from threadpoolctl import threadpool_limits
 
 from jaxprt.files.arrays import BlockStore, Layout
 
@@ -97,6 +98,9 @@ def _run(job, todo, store, executor, result, bar) -> None:
     _jobs[key] = job
     own = None if executor is not None else ThreadPoolExecutor(os.cpu_count())
     pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]
+    # Where each core has a block, threads of LAPACK's own wait by spinning: beside other work blocks took a hundred
+    # times as long.
+    limit = None if own is None else threadpool_limits(limits=1, user_api="blas")
     future = {}
     rays = 0
     try:
@@ -114,7 +118,9 @@ def _run(job, todo, store, executor, result, bar) -> None:
                 _place(result, block, array, job)
                 rays += count
                 bar.update(_count(job, block))
-                bar.set_postfix_str(f"{rays / max(bar.format_dict['elapsed'], 1e-9) / 1e6:.1f} Mrays/s", refresh=False)
+                if rays:
+                    speed = rays / max(bar.format_dict["elapsed"], 1e-9)
+                    bar.set_postfix_str(f"{speed / 1e6:.1f} Mrays/s", refresh=False)
             # Workers that did not know the job get it with their next block.
             future = {pool.submit(_work, key, job, block): block for block in again}
     except BrokenExecutor as error:
@@ -125,6 +131,8 @@ def _run(job, todo, store, executor, result, bar) -> None:
             each.cancel()
         if own is not None:
             own.shutdown(wait=True, cancel_futures=True)
+        if limit is not None:
+            limit.restore_original_limits()
         _jobs.pop(key, None)
 
 

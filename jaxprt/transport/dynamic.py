@@ -101,11 +101,13 @@ def precompute(
         The transport; 3 kB of bits a vertex, 3 kB more of pyramids where there are lobes, and the terms.
 
     Raises:
-        TypeError: A BRDF is neither a set nor factored.
+        TypeError: `brdfs` is no sequence, or one of them neither a set nor factored.
         ValueError: Not one BRDF for each region, light maps per color, or as in `jaxprt.transport.direct.precompute`.
 
     Reference: Sun et al. 2007, sections 3.3 and 4.3, direct lighting.
     """
+    if not isinstance(brdfs, Sequence):
+        raise TypeError(f"brdfs must be a sequence, one for each region, got {type(brdfs).__name__}")
     numbers = np.unique(np.asarray(mesh.region))
     if len(brdfs) != len(numbers):
         raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")

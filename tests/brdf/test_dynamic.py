@@ -164,6 +164,24 @@ def test_published_lobes_leave_what_a_tensor_can_carry():
     assert with_lobes.error < without.error
 
 
+def test_shares_of_either_sign_are_finite(lobes, pairs):
+    assert bool(jnp.isfinite(dynamic.factor(SET, lobes).at(jnp.array([-1.0, 1.0, 1.0]))(*pairs)).all())
+
+
+@pytest.mark.parametrize("brdfs", [SET[0], dynamic.factor])
+def test_what_is_no_sequence_is_refused(brdfs, unchecked):
+    with pytest.raises(TypeError, match="must be a sequence of BRDFs"):
+        dynamic.separate(brdfs)
+    with pytest.raises(TypeError, match="must be a sequence of BRDFs"):
+        dynamic.factor(brdfs, None, ranks=(1, 1, 1))
+
+
+@pytest.mark.parametrize("ranks", [(2.0, 1, 1), (1, 1)])
+def test_ranks_that_are_not_three_whole_numbers_are_refused(ranks, unchecked):
+    with pytest.raises(ValueError, match=r"three whole numbers, from 1 to the tensor's size \(3, 52, 625"):
+        dynamic.factor(SET, None, ranks=ranks, resolution=8)
+
+
 def test_derivatives_by_shares(lobes, pairs):
     table = dynamic.factor(SET, lobes, ranks=(2, 4, 4), resolution=RESOLUTION)
     wi, wo = pairs

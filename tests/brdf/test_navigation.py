@@ -127,6 +127,20 @@ def nearest(plane, spot, samples=4000):
     return border[index], distance, 1.5 / samples
 
 
+@pytest.mark.parametrize("coordinate", [0.3, [0.3], [0.3, 0.1, 0.1], [[0.3, 0.1]]])
+def test_a_place_in_a_plane_has_two_coordinates(coordinate, unchecked):
+    with pytest.raises(ValueError, match="a point of this set has two coordinates not an array of shape"):
+        cook_torrance().navigation.share(coordinate)
+    with pytest.raises(ValueError, match="a point of this set has one coordinate, a number, not an array of shape"):
+        Line(jnp.array([1.0, 2.0])).share([1.5])
+
+
+def test_infinite_coordinates_are_far_away(unchecked):
+    plane = cook_torrance().navigation
+    np.testing.assert_array_equal(plane.share([np.inf, 0.2]), plane.share([1e30, 0.2]))
+    np.testing.assert_array_equal(Line(jnp.array([1.0, 2.0])).share(-np.inf), [1, 0])
+
+
 # Lines.
 
 

@@ -163,9 +163,15 @@ def test_none_have_no_radiance(mesh, transport, part):
     assert not np.asarray(color).any()
 
 
-@pytest.mark.parametrize("count", [0, -1, ALL])
+def test_none_may_be_taken(transport, sky):
+    texel, excess, rest = direct.split(sky, count=0)
+    np.testing.assert_array_equal(rest.radiance, sky.radiance)
+    assert not np.asarray(direct.radiance(transport, GLOSSY, texel, excess, eye=EYE)).any()
+
+
+@pytest.mark.parametrize("count", [-1, ALL])
 def test_an_impossible_number_of_texels_is_refused(sky, count):
-    with pytest.raises(ValueError, match=f"count must be between 1 and {ALL - 1}, got {count}"):
+    with pytest.raises(ValueError, match=f"number of texels must be from 0 to {ALL - 1}, got {count}"):
         direct.split(sky, count=count)
 
 
@@ -228,6 +234,8 @@ def test_what_looks_away_from_the_eye_is_black(transport, sky):
     color = np.asarray(direct.radiance(transport, GLOSSY, texel, excess, eye=-EYE))
     away = np.einsum("vi,vi->v", transport.frame[:, 2], -EYE - transport.position) < 0
     assert not color[away].any()
+    anywhere = jax.tree_util.Partial(lambda wi, wo: jnp.ones_like(wi[..., :1]))  # Above the horizon or below.
+    assert not np.asarray(direct.radiance(transport, anywhere, texel, excess, eye=-EYE))[away].any()
     assert away.sum() > 10
     assert color[~away].any()
 

@@ -189,11 +189,15 @@ def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light,
         (lambda t, b, m: (t, b, [None, None]), "region 0 needs a material"),
         (lambda t, b, m: (t, b, [m[0], m[0]]), "region 1 has one BRDF for good"),
         (lambda t, b, m: (t, [b[1], b[0]], [None, m[0]]), "must be the one that its transport was made for"),
-        (lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.share, m[0], jnp.ones(2)), None]), "of its 3 BRDFs, got 2"),
+        (
+            lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.share, m[0], jnp.ones(2)), None]),
+            r"of its 3 BRDFs, got \[2\]",
+        ),
         (
             lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.diffuse, m[0], jnp.ones((5, 3))), None]),
-            "one for each of .* vertices",
+            "one of either for each of .* vertices",
         ),
+        (lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.specular, m[0], jnp.ones(2)), None]), "a color "),
     ],
 )
 def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, change, message):
@@ -204,6 +208,24 @@ def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, cha
 def test_a_light_of_another_size_is_refused(transport):
     with pytest.raises(ValueError, match=r"one environment \[6, 16, 16, c\]"):
         dynamic.light_side(transport, builtin.daylight(size=8))
+
+
+def test_arguments_of_other_kinds_are_refused(transport, family, fixed, line, light, unchecked):
+    materials = [material(line, 0.3), None]
+    with pytest.raises(ValueError, match=r"the eye must be one position, \[3\], got an array of shape \[2, 3\]"):
+        dynamic.view_side(transport, [family, fixed], materials, eye=jnp.ones((2, 3)))
+    with pytest.raises(TypeError, match="the light must be an Environment, got ArrayImpl"):
+        dynamic.light_side(transport, light.radiance)
+    with pytest.raises(TypeError, match="the material of region 0 must be a Material, got list"):
+        dynamic.view_side(transport, [family, fixed], [[0.3, 0.1], None], eye=EYE)
+
+
+def test_numbers_and_lists_make_a_material(transport, family, fixed, line, light, unchecked):
+    gray, plain = dynamic.Material([0, 1, 0], 0.3, 1), dynamic.Material(jnp.eye(3)[1], jnp.full(3, 0.3), jnp.ones(3))
+    color, same = (
+        dynamic.radiance(transport, [family, fixed], [each, None], light, eye=EYE.tolist()) for each in (gray, plain)
+    )
+    np.testing.assert_allclose(color, same, rtol=1e-6)
 
 
 def test_regions_without_a_brdf_are_refused(mesh, family):
