@@ -28,6 +28,8 @@ SIDEWAYS = {
     ("*", "dynamic", "separable"),  # Its terms are separable ones, with view maps that change.
     ("brdf", "measured", "models"),
     ("brdf", "navigation", "models"),
+    ("brdf", "paths", "dynamic"),
+    ("brdf", "paths", "separable"),
     ("brdf", "published", "dynamic"),
     ("brdf", "published", "models"),
     ("brdf", "published", "separable"),
@@ -44,6 +46,7 @@ SIDEWAYS = {
     ("sphere", "hemisphere", "directions"),
     ("sphere", "rotation", "harmonics"),
     ("scene", "occluder", "mesh"),
+    ("transport", "bounce", "visibility"),
     ("transport", "clustered", "blocks"),
     ("transport", "clustered", "direct"),
     ("transport", "clustered", "separable"),

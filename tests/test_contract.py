@@ -84,7 +84,11 @@ HOST = {
     "brdf.dynamic.decompose": "the same",
     "brdf.dynamic.check": "the same",
     "brdf.dynamic.check_values": "the same",
+    "brdf.dynamic.check_ranks": "the same",
     "brdf.dynamic.stacked": "looks at types",
+    "brdf.paths.basis": "counts colors by values",
+    "brdf.paths.fixed_weights": "the same",
+    "transport.bounce.rays": "traces rays",
     "brdf.navigation.triangulate": "by SciPy, where data enters",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
@@ -442,6 +446,10 @@ EXAMPLES = {
         lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
     ),
     "transport.dynamic.light_factors": example(lambda draw: call(draw.changing())),
+    "brdf.paths.weights": example(
+        lambda draw: call(draw.changing(), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
+        gradient=("share", "diffuse", "specular"),
+    ),
     "brdf.lobe.Remainder": example(
         lambda draw: call(
             brdf.lobe.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
@@ -479,6 +487,26 @@ EXAMPLES = {
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
     # Frames have derivatives along rotations only; see sphere.rotation.
+    "transport.bounce.respond": example(
+        lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), gradient=("basis",), edge=2
+    ),
+    "transport.bounce.respond_again": example(
+        lambda draw: call(draw.normal(2, 4, 3), draw.rotation(2), draw.separable()),
+        gradient=("arriving", "basis"),
+        size=4,
+    ),
+    "transport.bounce.arrive": example(
+        lambda draw: call(
+            draw.normal(5, 4, 2),
+            draw.rotation(5),
+            draw.separable(),
+            draw.integer(5, 2, 3, 3),
+            draw.uniform(2, 3, 3),
+            draw.unit(2, 3),
+            draw.normal(2, 3, 4),
+        ),
+        gradient=("response", "basis", "weight", "measure"),
+    ),
     "transport.harmonic.transfer": example(lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2),
     "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "transport.harmonic.right_handed": example(lambda draw: call(draw.rotation(4))),

@@ -1,0 +1,83 @@
+"""BRDFs along light paths: a few functions of which all BRDFs that a region can have are sums.
+
+    f_h(wi, wo) ~ sum_p H(h, p) f_p(wi, wo),    f_p(wi, wo) = sum_k g_kp(wo) u_k(wi)
+
+Light that has been reflected is linear in the weights H of every surface that it met, so that transport along paths of
+functions p serves all BRDFs. Each function is factored over the two directions: a bounce is then gathers and products.
+What the functions are of a set of BRDFs is principal components, in the norm that `jaxprt.brdf.dynamic.factor` has.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf.dynamic import DynamicBrdf
+from jaxprt.brdf.separable import SeparableBrdf
+
+_NOTHING = 1e-3  # of the largest singular value: a color that is a multiple of another
+
+
+def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
+    """The functions f_p, in place of the colors of a factored BRDF.
+
+    Args:
+        brdf: A set with terms, of which each rank of the set makes a function, and a constant one for the diffuse part
+            follows; or one BRDF, of which one function is made if all its colors are multiples of one.
+
+    Returns:
+        View factors of all functions on light factors that they share.
+
+    Raises:
+        ValueError: The set has no terms, or the BRDF's light maps are per color.
+
+    Reference: Sun et al. 2007, section 3.1.
+    """
+    if isinstance(brdf, SeparableBrdf):
+        return SeparableBrdf(brdf.light_map, brdf.view_map @ fixed_weights(brdf).T, brdf.error, brdf.coordinates)
+    if not brdf.core.size:
+        raise ValueError("a set needs terms for light paths: factor it with ranks, and without lobes")
+    view = jnp.einsum("hoi,oyx->iyxh", brdf.core, brdf.view_map)
+    edge = brdf.light_map.shape[-1]
+    light = jnp.concatenate([brdf.light_map, jnp.ones_like(brdf.light_map[:1])])[..., None]
+    diffuse = jnp.full((1, edge, edge, 1), 1 / np.pi, view.dtype)
+    view = jnp.concatenate(
+        [
+            jnp.concatenate([view, jnp.zeros_like(view[..., :1])], -1),
+            jnp.concatenate([jnp.zeros((1, edge, edge, view.shape[-1]), view.dtype), diffuse], -1),
+        ]
+    )
+    return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
+
+
+def weights(
+    brdf: DynamicBrdf, share: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
+) -> Float[Array, "p e"]:
+    """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
+
+    Args:
+        brdf: The set.
+        share: Of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
+        diffuse: Albedo of the diffuse part.
+        specular: What the BRDF of the set is multiplied by.
+
+    Returns:
+        The weights, the diffuse part's last. Differentiable in all but the set.
+    """
+    sharp = jnp.einsum("m,mch->hc", share, brdf.factor) * specular
+    colors = max(sharp.shape[1], len(diffuse))
+    rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]
+    return jnp.concatenate(rows)
+
+
+def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
+    """Weights of the functions of one BRDF, which does not change: as few as its colors need, and orthonormal.
+
+    Raises:
+        ValueError: Light maps per color.
+    """
+    if brdf.light_map.shape[-1] != 1:
+        raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
+    size = jnp.sqrt(jnp.mean(brdf.light_map**2, (1, 2, 3), keepdims=True))
+    rows = np.asarray(brdf.view_map * size, np.float64)
+    _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
+    return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)

@@ -1,0 +1,160 @@
+"""Reflected light along paths of functions: what arrives at vertices after light met surfaces of given functions.
+
+One bounce is a tensor over the light's texels l, the function p of the surface and the harmonic s of what arrives; it
+is made of the response of each light factor at the hit points, which is direct transport, by gathers and products. The
+response to light that has been reflected itself makes the next bounce of the same steps. See `jaxprt.brdf.paths`.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.sphere import cubemap, directions, haar, harmonics
+from jaxprt.transport import visibility
+
+_HITS = 64  # that are shaded at once: their responses should stay in the cache
+_GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
+
+
+@functools.partial(jax.jit, static_argnames=("edge",))
+def respond(
+    seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, edge: int
+) -> Float[Array, "b l k"]:
+    """What light factors make of light from each texel of coarse faces: direct light.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces, from `jaxprt.brdf.paths.basis`.
+        edge: Edge of the light's faces, a divisor of the visibility's.
+
+    Returns:
+        Integrals over each coarse texel of light factor x visibility x cosine.
+    """
+    size = haar.face_edge(seen.shape[1])
+    fold = size // edge
+
+    def one(argument):
+        visible, axes = argument
+        met = _met(axes, basis, size) * (visible / visibility.LEVELS)[:, None].astype(axes.dtype)
+        return jnp.sum(met.reshape(6, edge, fold, edge, fold, -1), (2, 4)).reshape(6 * edge * edge, -1)
+
+    return jax.lax.map(one, (seen, frame))
+
+
+@functools.partial(jax.jit, static_argnames=("size",))
+def respond_again(
+    arriving: Float[Array, "b s q"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, size: int = 16
+) -> Float[Array, "b q k"]:
+    """What light factors make of light that arrives as harmonics, one response for each kind q of it.
+
+    Args:
+        arriving: SH coefficients of radiance in world directions.
+        frame: Rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces.
+        size: Edge of the faces over whose texels is summed.
+    """
+    degree = harmonics.degree_of(arriving.shape[1])
+    light = harmonics.evaluate(cubemap.direction(size=size).reshape(-1, 3), degree=degree)
+    return jax.lax.map(lambda a: a[0].T @ (light.T @ _met(a[1], basis, size)), (arriving, frame))
+
+
+@jax.jit
+def arrive(
+    response: Float[Array, "v l k"],
+    frame: Float[Array, "v 3 3"],
+    basis: SeparableBrdf,
+    corner: Int[Array, "b h 3"],
+    weight: Float[Array, "b h 3"],
+    direction: Float[Array, "b h 3"],
+    measure: Float[Array, "b h s"],
+) -> Float[Array, "b s p l"]:
+    """What surfaces send to some points, summed over the rays of each by some measures.
+
+    Args:
+        response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`.
+        frame: Of these vertices.
+        basis: Functions of the surfaces.
+        corner: Vertices of the triangle that each ray meets.
+        weight: Barycentric weights in it; zero for a ray that meets none.
+        direction: Directions of the rays.
+        measure: What each ray counts: harmonics times solid angle, or cosine times solid angle over pi.
+
+    Returns:
+        For each measure, function and light.
+    """
+    spare = -corner.shape[1] % _HITS
+
+    def one(argument):
+        rows = [jnp.pad(each, ((0, spare), (0, 0))) for each in argument]
+        groups = [each.reshape(-1, _HITS, each.shape[-1]) for each in rows]
+
+        def add(total, group):
+            corner, weight, direction, measure = group
+            wo = jnp.sum(frame[corner] * -direction[:, None, None], -1)
+            wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
+            view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
+            sent = jnp.einsum("hckp,hclk->hpl", view, response[corner])
+            return total + jnp.einsum("hs,hpl->spl", measure, sent), None
+
+        shape = (measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+        return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
+
+    return jax.lax.map(one, (corner, weight, direction, measure))
+
+
+def rays(
+    occluder: visibility.Occluder,
+    start: np.ndarray,
+    normal: np.ndarray,
+    frame: np.ndarray,
+    region: np.ndarray,
+    *,
+    size: int = 16,
+) -> dict[int, tuple[np.ndarray, ...]]:
+    """Where rays through the texels above some vertices' horizons meet the fronts of surfaces, by region of these.
+
+    Args:
+        occluder: The scene.
+        start: Points where rays start.
+        normal: Normals of the vertices.
+        frame: Frames of the scene's vertices.
+        region: Of each of the scene's vertices.
+        size: Edge of the faces through whose texels rays are sent.
+
+    Returns:
+        For each region that is met, corners, weights and directions as `arrive` takes them, and the texels, all padded
+        to the largest number of rays of a vertex; weights of what is padded are zero.
+    """
+    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
+    every = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
+    vertex, texel = np.nonzero(normal @ area.T > 0)
+    triangle, _, share = occluder.hit(start[vertex], every[texel])
+    met = np.flatnonzero(triangle >= 0)
+    vertex, texel, share, corner = vertex[met], texel[met], share[met], occluder.face[triangle[met]]
+    at = occluder.position[corner]
+    across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    side = np.sum(across * np.sum(frame[corner, 2], 1), -1)
+    front = side * np.sum(across * every[texel], -1) < 0
+    result = {}
+    for number in np.unique(region[corner[front, 0]]).tolist():
+        own = np.flatnonzero(front & (region[corner[:, 0]] == number))
+        count = np.bincount(vertex[own], minlength=len(start))
+        place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+        shape = (len(start), int(count.max()))
+        padded = [np.zeros((*shape, *each.shape[1:]), each.dtype) for each in (corner, share, every, texel)]
+        for whole, each in zip(padded, (corner[own], share[own], every[texel[own]], texel[own]), strict=True):
+            whole[vertex[own], place] = each
+        result[number] = tuple(padded)
+    return result
+
+
+def _met(axes: Array, basis: SeparableBrdf, size: int) -> Array:
+    """Light factor times cosine times solid angle of all texels, [d, k]."""
+    direction, area = (x(size=size).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
+    flux = jnp.maximum(area @ axes[2], 0)
+    return basis.light(directions.to_local(axes, direction))[..., 0] * flux[:, None]

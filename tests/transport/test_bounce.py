@@ -1,0 +1,148 @@
+"""Light that has been reflected: against another system's bounces, and against loops over rays."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import AshikhminShirley, Lambert, dynamic, paths, separable
+from jaxprt.brdf.models import CookTorrance
+from jaxprt.scene import builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.sphere import cubemap, directions, harmonics
+from jaxprt.transport import bounce, direct, harmonic, interreflection, visibility
+
+SIZE = 16
+EDGE = 4
+ALBEDO = np.array([[0.9, 0.5, 0.2], [0.3, 0.6, 0.8]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A ball over the ground, two regions that light each other."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    return join([ball, ground_plane(ball, vertices=64)])
+
+
+@pytest.fixture(scope="module")
+def frame(mesh):
+    return directions.frame(mesh.normal, mesh.tangent)
+
+
+@pytest.fixture(scope="module")
+def seen(mesh):
+    visible = direct.precompute(mesh, size=SIZE, progress=False)
+    return jnp.asarray(visible.seen(np.arange(len(mesh.position))))
+
+
+@pytest.fixture(scope="module")
+def met(mesh, frame):
+    """Rays of all vertices, and what each texel's ray counts by cosine."""
+    occluder = visibility.Occluder(mesh)
+    start = visibility.start_points(mesh, occluder)
+    region = np.asarray(mesh.region)
+    found = bounce.rays(occluder, start, np.asarray(mesh.normal), np.asarray(frame), region, size=SIZE)
+    area = np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)
+    flux = np.maximum(np.asarray(mesh.normal) @ area.T, 0) / np.pi
+    return {number: (*each, np.take_along_axis(flux, each[3], 1)[..., None]) for number, each in found.items()}
+
+
+def arrived(response, frame, basis, rays):
+    corner, weight, way, _, measure = rays
+    return np.asarray(bounce.arrive(response, frame, basis, corner, weight, way, measure))
+
+
+def relative(value, exact):
+    return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
+
+
+def test_bounces_between_diffuse_regions_are_those_of_the_harmonic_system(mesh, seen, frame, met):
+    """Under constant light, of which both systems hold everything: what differs is the factored white, by 1.5e-4."""
+    white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+    response = jnp.sum(bounce.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
+    found = sum(arrived(response, frame, white, met[r])[:, 0, 0] * ALBEDO[r] for r in (0, 1))
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
+    options = {"bounces": 1, "size": SIZE, "progress": False}
+    once = interreflection.interreflect_diffuse(mesh, plain, ALBEDO, **options)
+    exact = np.asarray(once.vector - plain.vector)[0].T * np.sqrt(4 * np.pi)
+    assert np.abs(exact).max() > 0.1
+    assert relative(found, exact) < 3e-4
+
+
+def test_what_arrives_is_a_loop_over_rays(mesh, seen, frame, met):
+    """Of a glossy BRDF in three colors, one of which is a multiple of another."""
+    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3, nu=5, nv=9), terms=6)
+    basis, weight = paths.basis(glossy), paths.fixed_weights(glossy)
+    response = bounce.respond(seen, frame, basis, edge=EDGE)
+    corner, share, way, texel, _ = met[1]
+    vertex = int(np.argmax((share.sum(-1) > 0).sum(1)))
+    area = np.asarray(cubemap.solid_angle(size=SIZE)).ravel()
+    shining = harmonics.evaluate(jnp.asarray(way), degree=2) * area[texel][..., None]
+    found = bounce.arrive(response, frame, basis, corner, share, way, shining)[vertex]
+    colored = np.einsum("spl,pc->slc", found, weight)
+    light = cubemap.direction(size=SIZE).reshape(-1, 3)
+    exact = np.zeros_like(colored)
+    for ray in np.flatnonzero(share[vertex].sum(-1) > 0):
+        for place, part in zip(corner[vertex, ray], share[vertex, ray], strict=True):
+            axes = frame[place]
+            flux = jnp.maximum(cubemap.vector_area(size=SIZE).reshape(-1, 3) @ axes[2], 0) * seen[place] / 16
+            wo = axes @ -way[vertex, ray]
+            wo = directions.normalize(wo.at[2].max(1e-3))
+            sent = glossy(directions.to_local(axes, light), jnp.broadcast_to(wo, light.shape)) * flux[:, None]
+            sent = np.asarray(sent).reshape(6, EDGE, 4, EDGE, 4, 3).sum((2, 4)).reshape(-1, 3)
+            exact += part * np.asarray(shining)[vertex, ray][:, None, None] * sent
+    assert relative(colored, exact) < 1e-5
+
+
+def test_two_bounces_are_nearly_those_of_the_harmonic_system(mesh, seen, frame, met):
+    """What arrives first is held by 16 harmonics, which is where they differ."""
+    white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+    response = jnp.sum(bounce.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
+    area = np.asarray(cubemap.solid_angle(size=SIZE)).ravel()
+    arriving = 0
+    for number, (corner, share, way, texel, _) in met.items():
+        basis = harmonics.evaluate(jnp.asarray(way), degree=3) * area[texel][..., None]
+        tensor = bounce.arrive(response, frame, white, corner, share, way, basis)
+        arriving = arriving + np.einsum("bsl,c->bslc", tensor[:, :, 0], ALBEDO[number])
+    again = bounce.respond_again(jnp.asarray(arriving[:, :, 0]), frame, white, size=SIZE)
+    found = sum(arrived(again, frame, white, met[r])[:, 0, 0] * ALBEDO[r] for r in (0, 1))
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
+    options = {"size": SIZE, "progress": False}
+    one, two = (interreflection.interreflect_diffuse(mesh, plain, ALBEDO, bounces=n, **options) for n in (1, 2))
+    exact = np.asarray(two.vector - one.vector)[0].T * np.sqrt(4 * np.pi)
+    assert relative(found, exact) < 0.011
+
+
+def test_functions_of_a_set_make_its_brdfs():
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
+    table = dynamic.factor(members, None, ranks=(2, 8, 8), resolution=12)
+    share, diffuse, specular = jnp.array([0.3, 0.7]), jnp.array([0.1, 0.2, 0.3]), jnp.array([0.5, 0.4, 0.3])
+    random = np.random.default_rng(0).normal(size=(2, 50, 3))
+    random[..., 2] = np.abs(random[..., 2]) + 0.2
+    wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.float32)
+    value = paths.basis(table)(wi, wo) @ paths.weights(table, share, diffuse, specular)
+    np.testing.assert_allclose(value, table.at(share)(wi, wo) * specular + diffuse / np.pi, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("brdf", "functions"), [(Lambert(0.3), 1), (Lambert([0.9, 0.3, 0.1]), 1), (Lambert([0.0, 0.0, 0.0]), 0)]
+)
+def test_one_brdf_has_as_few_functions_as_its_colors_need(brdf, functions):
+    factored = separable.factor(brdf, terms=1, resolution=8)
+    weight = paths.fixed_weights(factored)
+    assert weight.shape == (functions, factored.view_map.shape[-1])
+    assert paths.basis(factored).view_map.shape[-1] == functions
+
+
+def test_colors_of_their_own_are_functions_of_their_own():
+    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3), terms=4, resolution=12)
+    weight = paths.fixed_weights(glossy)
+    assert weight.shape == (2, 3)  # Diffuse color and white gloss.
+    wi = wo = jnp.array([[0.6, 0.0, 0.8], [0.0, 0.3, np.sqrt(0.91)]], jnp.float32)
+    np.testing.assert_allclose(paths.basis(glossy)(wi, wo) @ weight, glossy(wi, wo), rtol=1e-5)
+
+
+def test_a_set_without_terms_makes_no_functions():
+    members = [Lambert(0.5)]
+    table = dynamic.factor(members, dynamic.separate(members, lobes=1))
+    with pytest.raises(ValueError, match="a set needs terms for light paths"):
+        paths.basis(table)
