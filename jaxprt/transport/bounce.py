@@ -6,6 +6,7 @@ response to light that has been reflected itself makes the next bounce of the sa
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.sphere import cubemap, directions, haar, harmonics
 from jaxprt.transport import visibility
 
-_HITS = 64  # that are shaded at once: their responses should stay in the cache
+_HITS = 64  # in a group: their responses should stay in the cache
 _GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
 
 
@@ -63,15 +64,34 @@ def respond_again(
     return jax.lax.map(lambda a: a[0].T @ (light.T @ _met(a[1], basis, size)), (arriving, frame))
 
 
-@jax.jit
+class Rays(NamedTuple):
+    """Rays that meet surfaces, in groups of those of one point; where a group has fewer, weights are zero.
+
+    Attributes:
+        owner: The point of each group.
+        corner: Vertices of the triangle that each ray meets.
+        weight: Barycentric weights in it.
+        texel: Through which each ray is sent.
+    """
+
+    owner: np.ndarray
+    corner: np.ndarray
+    weight: np.ndarray
+    texel: np.ndarray
+
+
+@functools.partial(jax.jit, static_argnames=("points",))
 def arrive(
     response: Float[Array, "v l k"],
     frame: Float[Array, "v 3 3"],
     basis: SeparableBrdf,
-    corner: Int[Array, "b h 3"],
-    weight: Float[Array, "b h 3"],
-    direction: Float[Array, "b h 3"],
-    measure: Float[Array, "b h s"],
+    owner: Int[Array, " g"],
+    corner: Int[Array, "g h 3"],
+    weight: Float[Array, "g h 3"],
+    direction: Float[Array, "g h 3"],
+    measure: Float[Array, "g h s"],
+    *,
+    points: int,
 ) -> Float[Array, "b s p l"]:
     """What surfaces send to some points, summed over the rays of each by some measures.
 
@@ -79,32 +99,28 @@ def arrive(
         response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`.
         frame: Of these vertices.
         basis: Functions of the surfaces.
+        owner: Of each group of rays the point that they arrive at; this and more as `Rays` has it.
         corner: Vertices of the triangle that each ray meets.
-        weight: Barycentric weights in it; zero for a ray that meets none.
+        weight: Barycentric weights in it.
         direction: Directions of the rays.
         measure: What each ray counts: harmonics times solid angle, or cosine times solid angle over pi.
+        points: Number of points.
 
     Returns:
-        For each measure, function and light.
+        For each point, measure, function and light.
     """
-    spare = -corner.shape[1] % _HITS
 
-    def one(argument):
-        rows = [jnp.pad(each, ((0, spare), (0, 0))) for each in argument]
-        groups = [each.reshape(-1, _HITS, each.shape[-1]) for each in rows]
+    def add(total, group):
+        owner, corner, weight, direction, measure = group
+        wo = jnp.sum(frame[corner] * -direction[:, None, None], -1)
+        wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
+        view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
+        sent = jnp.einsum("hckp,hclk->hpl", view, response[corner])
+        return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent)), None
 
-        def add(total, group):
-            corner, weight, direction, measure = group
-            wo = jnp.sum(frame[corner] * -direction[:, None, None], -1)
-            wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
-            view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
-            sent = jnp.einsum("hckp,hclk->hpl", view, response[corner])
-            return total + jnp.einsum("hs,hpl->spl", measure, sent), None
-
-        shape = (measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
-        return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
-
-    return jax.lax.map(one, (corner, weight, direction, measure))
+    shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+    groups = (owner, corner, weight, direction, measure)
+    return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
 
 
 def rays(
@@ -115,27 +131,26 @@ def rays(
     region: np.ndarray,
     *,
     size: int = 16,
-) -> dict[int, tuple[np.ndarray, ...]]:
-    """Where rays through the texels above some vertices' horizons meet the fronts of surfaces, by region of these.
+) -> dict[int, Rays]:
+    """Where rays through the texels above some points' horizons meet the fronts of surfaces.
 
     Args:
         occluder: The scene.
         start: Points where rays start.
-        normal: Normals of the vertices.
+        normal: Normals there.
         frame: Frames of the scene's vertices.
         region: Of each of the scene's vertices.
         size: Edge of the faces through whose texels rays are sent.
 
     Returns:
-        For each region that is met, corners, weights and directions as `arrive` takes them, and the texels, all padded
-        to the largest number of rays of a vertex; weights of what is padded are zero.
+        The rays that meet each region that is met.
     """
     area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
     every = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
-    vertex, texel = np.nonzero(normal @ area.T > 0)
-    triangle, _, share = occluder.hit(start[vertex], every[texel])
+    point, texel = np.nonzero(normal @ area.T > 0)
+    triangle, _, share = occluder.hit(start[point], every[texel])
     met = np.flatnonzero(triangle >= 0)
-    vertex, texel, share, corner = vertex[met], texel[met], share[met], occluder.face[triangle[met]]
+    point, texel, share, corner = point[met], texel[met], share[met], occluder.face[triangle[met]]
     at = occluder.position[corner]
     across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
     side = np.sum(across * np.sum(frame[corner, 2], 1), -1)
@@ -143,13 +158,14 @@ def rays(
     result = {}
     for number in np.unique(region[corner[front, 0]]).tolist():
         own = np.flatnonzero(front & (region[corner[:, 0]] == number))
-        count = np.bincount(vertex[own], minlength=len(start))
+        count = np.bincount(point[own], minlength=len(start))
         place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
-        shape = (len(start), int(count.max()))
-        padded = [np.zeros((*shape, *each.shape[1:]), each.dtype) for each in (corner, share, every, texel)]
-        for whole, each in zip(padded, (corner[own], share[own], every[texel[own]], texel[own]), strict=True):
-            whole[vertex[own], place] = each
-        result[number] = tuple(padded)
+        groups = -(-count // _HITS)
+        group = (np.cumsum(groups) - groups)[point[own]] + place // _HITS
+        padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, share, texel)]
+        for whole, each in zip(padded, (corner[own], share[own], texel[own]), strict=True):
+            whole[group, place % _HITS] = each
+        result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
 
 

@@ -36,19 +36,31 @@ def seen(mesh):
 
 @pytest.fixture(scope="module")
 def met(mesh, frame):
-    """Rays of all vertices, and what each texel's ray counts by cosine."""
+    """Rays of all vertices."""
     occluder = visibility.Occluder(mesh)
     start = visibility.start_points(mesh, occluder)
     region = np.asarray(mesh.region)
-    found = bounce.rays(occluder, start, np.asarray(mesh.normal), np.asarray(frame), region, size=SIZE)
+    return bounce.rays(occluder, start, np.asarray(mesh.normal), np.asarray(frame), region, size=SIZE)
+
+
+def arrived(response, frame, basis, rays, measure):
+    """What arrives by some measure of all texels, [d s] of all points or [v d s] of each."""
+    way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)[rays.texel]
+    each = measure[rays.texel] if measure.ndim == 2 else measure[rays.owner[:, None], rays.texel]
+    fixed = (rays.owner, rays.corner, rays.weight, way, each)
+    return np.asarray(bounce.arrive(response, frame, basis, *fixed, points=len(frame)))
+
+
+def flux(mesh):
+    """Cosine times solid angle over pi."""
     area = np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)
-    flux = np.maximum(np.asarray(mesh.normal) @ area.T, 0) / np.pi
-    return {number: (*each, np.take_along_axis(flux, each[3], 1)[..., None]) for number, each in found.items()}
+    return np.maximum(np.asarray(mesh.normal) @ area.T, 0)[..., None] / np.pi
 
 
-def arrived(response, frame, basis, rays):
-    corner, weight, way, _, measure = rays
-    return np.asarray(bounce.arrive(response, frame, basis, corner, weight, way, measure))
+def shining(degree):
+    """Harmonics times solid angle."""
+    area = np.asarray(cubemap.solid_angle(size=SIZE)).reshape(-1, 1)
+    return np.asarray(harmonics.evaluate(cubemap.direction(size=SIZE).reshape(-1, 3), degree=degree)) * area
 
 
 def relative(value, exact):
@@ -59,7 +71,7 @@ def test_bounces_between_diffuse_regions_are_those_of_the_harmonic_system(mesh, 
     """Under constant light, of which both systems hold everything: what differs is the factored white, by 1.5e-4."""
     white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
     response = jnp.sum(bounce.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
-    found = sum(arrived(response, frame, white, met[r])[:, 0, 0] * ALBEDO[r] for r in (0, 1))
+    found = sum(arrived(response, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
     options = {"bounces": 1, "size": SIZE, "progress": False}
     once = interreflection.interreflect_diffuse(mesh, plain, ALBEDO, **options)
@@ -73,23 +85,21 @@ def test_what_arrives_is_a_loop_over_rays(mesh, seen, frame, met):
     glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3, nu=5, nv=9), terms=6)
     basis, weight = paths.basis(glossy), paths.fixed_weights(glossy)
     response = bounce.respond(seen, frame, basis, edge=EDGE)
-    corner, share, way, texel, _ = met[1]
-    vertex = int(np.argmax((share.sum(-1) > 0).sum(1)))
-    area = np.asarray(cubemap.solid_angle(size=SIZE)).ravel()
-    shining = harmonics.evaluate(jnp.asarray(way), degree=2) * area[texel][..., None]
-    found = bounce.arrive(response, frame, basis, corner, share, way, shining)[vertex]
-    colored = np.einsum("spl,pc->slc", found, weight)
+    rays, basis_2 = met[1], shining(2)
+    vertex = int(np.bincount(rays.owner).argmax())
+    colored = np.einsum("spl,pc->slc", arrived(response, frame, basis, rays, basis_2)[vertex], weight)
     light = cubemap.direction(size=SIZE).reshape(-1, 3)
     exact = np.zeros_like(colored)
-    for ray in np.flatnonzero(share[vertex].sum(-1) > 0):
-        for place, part in zip(corner[vertex, ray], share[vertex, ray], strict=True):
+    for group, ray in zip(*np.nonzero((rays.owner == vertex)[:, None] & (rays.weight.sum(-1) > 0)), strict=True):
+        texel = rays.texel[group, ray]
+        for place, part in zip(rays.corner[group, ray], rays.weight[group, ray], strict=True):
             axes = frame[place]
-            flux = jnp.maximum(cubemap.vector_area(size=SIZE).reshape(-1, 3) @ axes[2], 0) * seen[place] / 16
-            wo = axes @ -way[vertex, ray]
+            met_by = jnp.maximum(cubemap.vector_area(size=SIZE).reshape(-1, 3) @ axes[2], 0) * seen[place] / 16
+            wo = axes @ -light[texel]
             wo = directions.normalize(wo.at[2].max(1e-3))
-            sent = glossy(directions.to_local(axes, light), jnp.broadcast_to(wo, light.shape)) * flux[:, None]
+            sent = glossy(directions.to_local(axes, light), jnp.broadcast_to(wo, light.shape)) * met_by[:, None]
             sent = np.asarray(sent).reshape(6, EDGE, 4, EDGE, 4, 3).sum((2, 4)).reshape(-1, 3)
-            exact += part * np.asarray(shining)[vertex, ray][:, None, None] * sent
+            exact += part * basis_2[texel][:, None, None] * sent
     assert relative(colored, exact) < 1e-5
 
 
@@ -97,14 +107,9 @@ def test_two_bounces_are_nearly_those_of_the_harmonic_system(mesh, seen, frame, 
     """What arrives first is held by 16 harmonics, which is where they differ."""
     white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
     response = jnp.sum(bounce.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
-    area = np.asarray(cubemap.solid_angle(size=SIZE)).ravel()
-    arriving = 0
-    for number, (corner, share, way, texel, _) in met.items():
-        basis = harmonics.evaluate(jnp.asarray(way), degree=3) * area[texel][..., None]
-        tensor = bounce.arrive(response, frame, white, corner, share, way, basis)
-        arriving = arriving + np.einsum("bsl,c->bslc", tensor[:, :, 0], ALBEDO[number])
-    again = bounce.respond_again(jnp.asarray(arriving[:, :, 0]), frame, white, size=SIZE)
-    found = sum(arrived(again, frame, white, met[r])[:, 0, 0] * ALBEDO[r] for r in (0, 1))
+    arriving = sum(arrived(response, frame, white, met[r], shining(3))[:, :, 0] * ALBEDO[r] for r in (0, 1))
+    again = bounce.respond_again(jnp.asarray(arriving), frame, white, size=SIZE)
+    found = sum(arrived(again, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
     options = {"size": SIZE, "progress": False}
     one, two = (interreflection.interreflect_diffuse(mesh, plain, ALBEDO, bounces=n, **options) for n in (1, 2))
