@@ -89,6 +89,8 @@ HOST = {
     "brdf.paths.basis": "counts colors by values",
     "brdf.paths.fixed_weights": "the same",
     "transport.bounce.rays": "traces rays",
+    "transport.transfer.precompute": "traces rays",
+    "transport.transfer.compress": "gives half precision, and vectors of either sign",
     "brdf.navigation.triangulate": "by SciPy, where data enters",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
@@ -487,6 +489,7 @@ EXAMPLES = {
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
     # Frames have derivatives along rotations only; see sphere.rotation.
+    "transport.transfer.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "transport.bounce.respond": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), gradient=("basis",), edge=2
     ),
