@@ -47,6 +47,7 @@ SIDEWAYS = {
     ("sphere", "rotation", "harmonics"),
     ("scene", "occluder", "mesh"),
     ("transport", "bounce", "visibility"),
+    ("transport", "interreflection", "bounce"),
     ("transport", "transfer", "blocks"),
     ("transport", "transfer", "bounce"),
     ("transport", "transfer", "clustered"),

@@ -89,6 +89,8 @@ HOST = {
     "brdf.paths.basis": "counts colors by values",
     "brdf.paths.fixed_weights": "the same",
     "transport.bounce.rays": "traces rays",
+    "transport.bounce.hits": "traces rays",
+    "transport.bounce.front": "NumPy on what rays meet",
     "transport.transfer.precompute": "traces rays",
     "transport.transfer.compress": "gives half precision, and vectors of either sign",
     "brdf.navigation.triangulate": "by SciPy, where data enters",

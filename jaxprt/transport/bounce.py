@@ -145,19 +145,12 @@ def rays(
     Returns:
         The rays that meet each region that is met.
     """
-    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
-    every = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
-    point, texel = np.nonzero(normal @ area.T > 0)
-    triangle, _, share = occluder.hit(start[point], every[texel])
-    met = np.flatnonzero(triangle >= 0)
-    point, texel, share, corner = point[met], texel[met], share[met], occluder.face[triangle[met]]
-    at = occluder.position[corner]
-    across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
-    side = np.sum(across * np.sum(frame[corner, 2], 1), -1)
-    front = side * np.sum(across * every[texel], -1) < 0
+    point, texel, corner, share, _ = hits(occluder, start, normal, size=size)
+    way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
+    seen = front(occluder, frame[:, 2], corner, way)
     result = {}
-    for number in np.unique(region[corner[front, 0]]).tolist():
-        own = np.flatnonzero(front & (region[corner[:, 0]] == number))
+    for number in np.unique(region[corner[seen, 0]]).tolist():
+        own = np.flatnonzero(seen & (region[corner[:, 0]] == number))
         count = np.bincount(point[own], minlength=len(start))
         place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
         groups = -(-count // _HITS)
@@ -167,6 +160,35 @@ def rays(
             whole[group, place % _HITS] = each
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
+
+
+def hits(
+    occluder: visibility.Occluder, start: np.ndarray, normal: np.ndarray, *, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Where rays through the texels above some points' horizons meet a scene.
+
+    Arguments as of `rays`.
+
+    Returns:
+        Of each hit the point, the texel, the triangle's corners and the weights of these; and the number of rays.
+    """
+    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
+    direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
+    point, texel = np.nonzero(normal @ area.T > 0)
+    triangle, _, share = occluder.hit(start[point], direction[texel])
+    met = np.flatnonzero(triangle >= 0)
+    return point[met], texel[met], occluder.face[triangle[met]], share[met], len(point)
+
+
+def front(occluder: visibility.Occluder, normal: np.ndarray, corner: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Whether rays meet the fronts of triangles, which alone send light.
+
+    That is the side of the corners' normals together, since one of these may look away where the others are seen.
+    """
+    at = occluder.position[corner]
+    across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    side = np.sum(across * np.sum(normal[corner], 1), -1)
+    return side * np.sum(across * direction, -1) < 0
 
 
 def _met(axes: Array, basis: SeparableBrdf, size: int) -> Array:

@@ -20,7 +20,7 @@ from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
-from jaxprt.transport import blocks, visibility
+from jaxprt.transport import blocks, bounce, visibility
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector, check
 
 _RAYS = 1 << 12  # hits that are shaded at once
@@ -186,7 +186,9 @@ class _BounceJob(visibility.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = _hits(self, part)
+        vertex, texel, corner, weight, count = bounce.hits(
+            self.rays, self.start[part], self.frame[part, 2], size=self.size
+        )
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         leaving = np.zeros((len(part), len(direction), self.rows.shape[1], self.rows.shape[3]), np.float32)
         for first in range(0, len(vertex), _RAYS):
@@ -215,32 +217,16 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = _hits(self, part)
+        vertex, texel, corner, weight, count = bounce.hits(
+            self.rays, self.start[part], self.frame[part, 2], size=self.size
+        )
         area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
         flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
-        # The front of a surface alone sends light: that of the triangle, on the side of its vertices' normals, since
-        # one of these may look away where the others are seen.
-        at = np.asarray(self.occluder.position)[corner]
-        across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
-        side = np.sum(across * np.sum(self.frame[corner, 2], 1), -1)
-        front = side * np.sum(across * area[texel], -1) < 0
-        leaving = np.einsum("mk,mkli->mli", weight * (front * flux)[:, None], self.rows[corner])
+        seen = bounce.front(self.rays, self.frame[:, 2], corner, area[texel])
+        leaving = np.einsum("mk,mkli->mli", weight * (seen * flux)[:, None], self.rows[corner])
         total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
         np.add.at(total, vertex, leaving)
         return {"vector": total.transpose(2, 1, 0)}, count
-
-
-def _hits(
-    job: visibility.VisibilityJob, part: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """Where rays through the upper texels meet the mesh: vertex of the block, texel, corners, weights; ray count."""
-    area = np.asarray(cubemap.vector_area(size=job.size), np.float32).reshape(-1, 3)
-    direction = np.asarray(cubemap.direction(size=job.size), np.float32).reshape(-1, 3)
-    vertex, texel = np.nonzero(job.frame[part, 2] @ area.T > 0)
-    triangle, _, weight = job.rays.hit(job.start[part][vertex], direction[texel])
-    met = np.flatnonzero(triangle >= 0)
-    corner = np.asarray(job.occluder.face)[triangle[met]]
-    return vertex[met], texel[met], corner, weight[met], len(vertex)
 
 
 def _check(mesh: Mesh, vertices: int, materials: int, bounces: int) -> None:
