@@ -109,8 +109,8 @@ def measure(quick: bool, store: pathlib.Path | None):
         stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in seen)
         yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
     yield from measure_lobes(seen, exact, lights, views, rays, repeats, peer, quick)
-    named = dict(zip(names(lights), lights, strict=True))
-    yield from path_tracing.measure(glossy, ground, named, views[0], quick=quick)
+    by_name = dict(zip(names(lights), lights, strict=True))
+    yield from path_tracing.measure(glossy, ground, by_name, views[0], quick=quick)
 
 
 def names(lights: list[Environment]) -> list[str]:
@@ -180,7 +180,7 @@ def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
 
 def report_case(name, parts: list[Part], sun, exact, lights, views, stored, precompute, repeats, peer):
     """One line for each light."""
-    vertices = sum(part.visible.position.shape[0] for part in parts)
+    vertices, named = sum(part.visible.position.shape[0] for part in parts), names(lights)
     for number, light in enumerate(lights):
         texel, excess, rest = texels.split(light, count=sun)
         lit = [light_tuple(part.transport, rest) for part in parts]
@@ -208,7 +208,7 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 
         timing, other = harness.compare(lighten, peer[number][0], repeats=repeats)
         yield {
-            **{"benchmark": "compression", "case": f"{name}, {names(lights)[number]}", "light": names(lights)[number]},
+            **{"benchmark": "compression", "case": f"{name}, {named[number]}", "light": named[number]},
             "method": "clustered",
             **timing.line(),
             "view_seconds": harness.measure(turn, repeats=repeats).seconds,
@@ -222,7 +222,7 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 
 def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: bool):
     """Lines of lobes, for the glossy object and for the ground."""
-    stored = sum(each.nbytes for each in seen)
+    stored, named = sum(each.nbytes for each in seen), names(lights)
     plain = lobes.tabulate(GROUND, lobes=1, resolution=8)
     for count, sun in [(3, 4)] if quick else LOBES:
         start = time.perf_counter()
@@ -258,9 +258,9 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
                 ]
 
             timing, other = harness.compare(lighten, peer[number][0], repeats=repeats)
-            name = f"{count} lobes, {sun} texels, {names(lights)[number]}"
+            name = f"{count} lobes, {sun} texels, {named[number]}"
             yield {
-                **{"benchmark": "compression", "case": name, "light": names(lights)[number], "lobes": count},
+                **{"benchmark": "compression", "case": name, "light": named[number], "lobes": count},
                 "method": "lobes",
                 **timing.line(),
                 "view_seconds": harness.measure(turn, repeats=repeats).seconds,

@@ -1,8 +1,8 @@
 """What a path tracer makes of the same view: Mitsuba 3's error and time by samples per pixel, for the front's plot.
 
 The same meshes under the same light from the same place, direct light alone; the object is half diffuse, half a rough
-conductor as wide as Ashikhmin-Shirley (10, 100), for which Mitsuba has no plugin. Half a picture's error is noise that
-another picture does not share: it is told from two pictures of unlike seeds, so no converged one is needed.
+conductor as wide as Ashikhmin-Shirley (10, 100), for which Mitsuba has no plugin. A picture's error is its noise, which
+a picture of another seed does not share: their difference is sqrt(2) of it, so no converged one is needed.
 """
 
 import time

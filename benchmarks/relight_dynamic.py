@@ -191,7 +191,7 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
         )[0]
 
     result: dict[float, list] = {roughness: [] for roughness in ROUGHNESS[: len(triples)]}
-    for turn, triple, matter in zip(itertools.cycle(ROUGHNESS), triples, material):
+    for number, (triple, matter) in enumerate(zip(triples, material, strict=True)):
         f0, roughness = triple.coordinate.tolist()
         eye = jnp.asarray(triple.eye)
         color = relight.radiance(transport, brdfs, matter, triple.light, eye=eye, texels=TEXELS)
@@ -209,7 +209,7 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
         whole, by_brdf, base = sums
         norm = np.linalg.norm(whole)
         wrong = (np.asarray(color)[vertex] - whole, by_brdf - whole, np.asarray(matte)[vertex] - base)
-        result[turn].append([float(np.linalg.norm(each) / norm) for each in wrong])
+        result[ROUGHNESS[number % len(ROUGHNESS)]].append([float(np.linalg.norm(each) / norm) for each in wrong])
     return result
 
 

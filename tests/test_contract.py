@@ -52,6 +52,7 @@ HOST = {
     "relight.lobe.scales": "NumPy tables",
     "relight.lobe.look": "gives indices beside shares, compiled in steps; relight.lobe.radiance has them all",
     "transport.clustered.cluster": "sorts on the host, where data enters",
+    "transport.clustered.places": "a NumPy table of rows",
     "transport.clustered.precompute": "runs workers and writes files",
     "transport.clustered.compress": "gives half precision, and vectors of either sign: no one dtype, no one answer",
     "transport.sparse.rms": "counts on the host, after precomputation",

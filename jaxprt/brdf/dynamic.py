@@ -173,17 +173,16 @@ def factor(
     """
     if resolution < 4:
         raise ValueError(f"resolution must be at least 4, got {resolution}")
-    check(brdfs, lobe)
+    colors = check(brdfs, lobe)
     together = stacked(brdfs)
     if ranks is None:
         if lobe is None:
             raise ValueError("a set needs lobes, or ranks of a tensor, or both; got neither")
-        colors, dtype = len(lobe.weight), lobe.scale.dtype
-        core, along, maps = (jnp.zeros(x, dtype) for x in ((0, 0, 0), (len(brdfs), colors, 0), (0, 4, 4)))
+        shapes = ((0, 0, 0), (len(brdfs), len(lobe.weight), 0), (0, 4, 4))
+        core, along, maps = (jnp.zeros(each, lobe.scale.dtype) for each in shapes)
         return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
     direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
     area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
-    colors = brdfs[0](*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape[1]
     check_ranks(ranks, (len(brdfs) * colors, int(jnp.sum(area > 0)), (_DEGREE + 1) ** 2))
     # All at once where they are of one kind, and else one by one.
     parts = (
@@ -258,14 +257,15 @@ def decompose(
     )
 
 
-def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None) -> None:
-    """Refuses a set without BRDFs, and lobes that are not those of the set."""
+def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None) -> int:
+    """Refuses a set without BRDFs, and lobes that are not those of the set; returns the number of colors."""
     _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
         raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
-    colors = [brdf(*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
-    if len(set(colors)) > 1 or len(colors[0]) != 2 or colors[0][1] not in (1, 3):
-        raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(colors)}")
+    shapes = [brdf(*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] not in (1, 3):
+        raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(shapes)}")
+    return shapes[0][1]
 
 
 def _check_sequence(brdfs: Sequence[Callable]) -> None:

@@ -28,24 +28,18 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
         View factors of all functions on light factors that they share.
 
     Raises:
-        ValueError: The set has no terms, or the BRDF's light maps are per color.
+        ValueError: The set has no terms, or lobes, or the BRDF's light maps are per color.
 
     Reference: Sun et al. 2007, section 3.1.
     """
     if isinstance(brdf, SeparableBrdf):
         return SeparableBrdf(brdf.light_map, brdf.view_map @ fixed_weights(brdf).T, brdf.error, brdf.coordinates)
-    if not brdf.core.size:
-        raise ValueError("a set needs terms for light paths: factor it with ranks, and without lobes")
+    if brdf.lobe is not None or not brdf.core.size:
+        found = "those of what its lobes leave" if brdf.core.size else "none"
+        raise ValueError(f"light paths need terms of whole BRDFs, from ranks and without lobes, got {found}")
     view = jnp.einsum("hoi,oyx->iyxh", brdf.core, brdf.view_map)
-    edge = brdf.light_map.shape[-1]
     light = jnp.concatenate([brdf.light_map, jnp.ones_like(brdf.light_map[:1])])[..., None]
-    diffuse = jnp.full((1, edge, edge, 1), 1 / np.pi, view.dtype)
-    view = jnp.concatenate(
-        [
-            jnp.concatenate([view, jnp.zeros_like(view[..., :1])], -1),
-            jnp.concatenate([jnp.zeros((1, edge, edge, view.shape[-1]), view.dtype), diffuse], -1),
-        ]
-    )
+    view = jnp.pad(view, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
     return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
 
 

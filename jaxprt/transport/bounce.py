@@ -1,8 +1,12 @@
 """Reflected light along paths of functions: what arrives at vertices after light met surfaces of given functions.
 
-One bounce is a tensor over the light's texels l, the function p of the surface and the harmonic s of what arrives; it
-is made of the response of each light factor at the hit points, which is direct transport, by gathers and products. The
-response to light that has been reflected itself makes the next bounce of the same steps. See `jaxprt.brdf.paths`.
+    R_y(l, k) = int_l u_k(w) V_y(w) (w . n) dw
+    T_x(s, p, l) = sum_rays m_s sum_y b_y sum_k g_kp(wo) R_y(l, k)
+
+One bounce T is a tensor over measures s of what arrives, such as harmonics, the function p of the surface, and the
+light's texels l. It is made of the responses R of light factors u at the corners y of the triangles that rays meet,
+with their barycentric weights b, by gathers and products. The response to light that has been reflected itself makes
+the next bounce of the same steps. Functions are those of `jaxprt.brdf.paths`.
 """
 
 import functools
@@ -11,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.sphere import cubemap, directions, haar, harmonics
@@ -58,6 +62,9 @@ def respond_again(
         frame: Rows are tangent, bitangent, normal.
         basis: Functions of the surfaces.
         size: Edge of the faces over whose texels is summed.
+
+    Returns:
+        Integrals over the horizon of light factor x radiance x cosine.
     """
     degree = harmonics.degree_of(arriving.shape[1])
     light = harmonics.evaluate(cubemap.direction(size=size).reshape(-1, 3), degree=degree)
@@ -74,10 +81,10 @@ class Rays(NamedTuple):
         texel: Through which each ray is sent.
     """
 
-    owner: np.ndarray
-    corner: np.ndarray
-    weight: np.ndarray
-    texel: np.ndarray
+    owner: Int[np.ndarray, " g"]
+    corner: Int[np.ndarray, "g h 3"]
+    weight: Float[np.ndarray, "g h 3"]
+    texel: Int[np.ndarray, "g h"]
 
 
 @functools.partial(jax.jit, static_argnames=("points",))
@@ -125,10 +132,10 @@ def arrive(
 
 def rays(
     occluder: visibility.Occluder,
-    start: np.ndarray,
-    normal: np.ndarray,
-    frame: np.ndarray,
-    region: np.ndarray,
+    start: Float[np.ndarray, "b 3"],
+    normal: Float[np.ndarray, "b 3"],
+    frame: Float[np.ndarray, "v 3 3"],
+    region: Int[np.ndarray, " v"],
     *,
     size: int = 16,
 ) -> dict[int, Rays]:
@@ -143,28 +150,29 @@ def rays(
         size: Edge of the faces through whose texels rays are sent.
 
     Returns:
-        The rays that meet each region that is met.
+        The rays that meet each region that is met; where a triangle has corners of several, each region has its own.
     """
     point, texel, corner, share, _ = hits(occluder, start, normal, size=size)
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
     seen = front(occluder, frame[:, 2], corner, way)
     result = {}
-    for number in np.unique(region[corner[seen, 0]]).tolist():
-        own = np.flatnonzero(seen & (region[corner[:, 0]] == number))
+    for number in np.unique(region[corner[seen]]).tolist():
+        inside = region[corner] == number
+        own = np.flatnonzero(seen & inside.any(1))
         count = np.bincount(point[own], minlength=len(start))
         place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
         groups = -(-count // _HITS)
         group = (np.cumsum(groups) - groups)[point[own]] + place // _HITS
         padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, share, texel)]
-        for whole, each in zip(padded, (corner[own], share[own], texel[own]), strict=True):
+        for whole, each in zip(padded, (corner[own], (share * inside)[own], texel[own]), strict=True):
             whole[group, place % _HITS] = each
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
 
 
 def hits(
-    occluder: visibility.Occluder, start: np.ndarray, normal: np.ndarray, *, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    occluder: visibility.Occluder, start: Float[np.ndarray, "b 3"], normal: Float[np.ndarray, "b 3"], *, size: int
+) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " h"], Int[np.ndarray, "h 3"], Float[np.ndarray, "h 3"], int]:
     """Where rays through the texels above some points' horizons meet a scene.
 
     Arguments as of `rays`.
@@ -180,7 +188,12 @@ def hits(
     return point[met], texel[met], occluder.face[triangle[met]], share[met], len(point)
 
 
-def front(occluder: visibility.Occluder, normal: np.ndarray, corner: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def front(
+    occluder: visibility.Occluder,
+    normal: Float[np.ndarray, "v 3"],
+    corner: Int[np.ndarray, "h 3"],
+    direction: Float[np.ndarray, "h 3"],
+) -> Bool[np.ndarray, " h"]:
     """Whether rays meet the fronts of triangles, which alone send light.
 
     That is the side of the corners' normals together, since one of these may look away where the others are seen.

@@ -181,9 +181,7 @@ def precompute(
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
     index, mode, core = (jnp.asarray(result[name]) for name in ("index", "mode", "core"))
     weight = jnp.asarray(result["weight"]).reshape(*member.shape, vectors)
-    row = member.ravel()
-    place = np.zeros(len(direct.position), np.int32)
-    place[row] = np.arange(row.size)
+    row, place = member.ravel(), places(member)
     rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
     return ClusteredTransport(
         index,
@@ -205,6 +203,34 @@ def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clust
         offset = each - each.mean(0)
         coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
     return clustering.bisect(np.concatenate(coordinate, 1), clusters=clusters)
+
+
+def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:
+    """A row of each vertex among the members of all clusters, one after another; those in several are in the last."""
+    row = member.ravel()
+    result = np.zeros(row.max() + 1, np.int32)
+    result[row] = np.arange(row.size)
+    return result
+
+
+class ClusterJob(blocks.Job):
+    """A job whose blocks are clusters.
+
+    Attributes:
+        member: Vertices of each cluster.
+    """
+
+    member: np.ndarray
+
+    @property
+    def vertices(self) -> int:
+        """Number of members of all clusters."""
+        return self.member.size
+
+    @property
+    def step(self) -> int:
+        """Number of members of a cluster."""
+        return self.member.shape[1]
 
 
 @partial(jax.jit, static_argnames=("vectors", "modes", "keep"))
@@ -286,8 +312,8 @@ def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) ->
 
 
 @dataclass(frozen=True)
-class _Job(blocks.Job):
-    """Clusters as blocks; see `blocks.Job`."""
+class _Job(ClusterJob):
+    """Transport of the terms of a BRDF; see `blocks.Job`."""
 
     direct: DirectTransport
     brdf: SeparableBrdf
@@ -310,14 +336,6 @@ class _Job(blocks.Job):
             "mode": Layout((1, self.count, self.modes), 0, "float16"),
             "core": Layout((1, self.modes, self.vectors, self.brdf.terms), 0, "float16"),
         }
-
-    @property
-    def vertices(self) -> int:
-        return self.member.size
-
-    @property
-    def step(self) -> int:
-        return self.member.shape[1]
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         member = self.member[block]

@@ -146,8 +146,22 @@ def test_colors_of_their_own_are_functions_of_their_own():
     np.testing.assert_allclose(paths.basis(glossy)(wi, wo) @ weight, glossy(wi, wo), rtol=1e-5)
 
 
-def test_a_set_without_terms_makes_no_functions():
+@pytest.mark.parametrize(("ranks", "found"), [(None, "none"), ((1, 1, 1), "those of what its lobes leave")])
+def test_a_set_without_terms_of_whole_brdfs_makes_no_functions(ranks, found):
     members = [Lambert(0.5)]
-    table = dynamic.factor(members, dynamic.separate(members, lobes=1))
-    with pytest.raises(ValueError, match="a set needs terms for light paths"):
+    table = dynamic.factor(members, dynamic.separate(members, lobes=1), ranks=ranks, resolution=8)
+    with pytest.raises(ValueError, match=f"without lobes, got {found}"):
         paths.basis(table)
+
+
+def test_triangles_between_regions_send_what_each_corner_does(mesh, seen, frame, met):
+    """Every third vertex of another region of the same material: together they send what they did."""
+    white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+    response = bounce.respond(seen, frame, white, edge=EDGE)
+    whole = sum(arrived(response, frame, white, met[r], flux(mesh)) for r in (0, 1))
+    occluder = visibility.Occluder(mesh)
+    start, mixed = visibility.start_points(mesh, occluder), np.arange(len(mesh.position)) % 3
+    found = bounce.rays(occluder, start, np.asarray(mesh.normal), np.asarray(frame), mixed, size=SIZE)
+    parts = [arrived(response, frame, white, found[r], flux(mesh)) for r in (0, 1, 2)]
+    assert min(np.abs(part).max() for part in parts) > 0.01
+    np.testing.assert_allclose(sum(parts), whole, rtol=1e-5, atol=1e-7)

@@ -100,5 +100,7 @@ def test_a_stopped_precomputation_goes_on(mesh, bases, tmp_path):
 def test_regions_without_functions_are_refused(mesh, bases):
     with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
         transfer.precompute(mesh, bases[:1], progress=False)
-    with pytest.raises(ValueError, match="must be at least 1, got 0, 64, 8 and 16"):
+    with pytest.raises(ValueError, match="a power of two, got 0, 64, 8 and 16"):
         transfer.precompute(mesh, bases, components=0, progress=False)
+    with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
+        transfer.precompute(mesh, bases, edge=6, progress=False)
