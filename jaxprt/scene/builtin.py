@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh, grid_face, join, make_mesh
+from jaxprt.scene.mesh import Mesh, join
+from jaxprt.scene.shapes import Part, assemble, curve, patch, sweep
 from jaxprt.sphere import cubemap
 
 _SECTORS = 40
-_STEP = 0.085  # Longest step along a curve, in squares of the board,
-_TURN = 0.7  # and largest turn, in radians.
+_FINE = {"step": 0.085, "turn": 0.7}  # Of curves, in squares of the board and radians.
 # Curves of (radius over that of the base, height), from the board up.
 _BASE = [[(0.87, 0), (0.9, 0.03), (0.87, 0.075)], [(0.87, 0.075), (0.78, 0.085)]]
 _PAWN = [
@@ -113,7 +113,7 @@ def chess() -> Mesh:
     for radius, curves, (x, z) in _PIECES:
         place = np.array([x, _GAP, z])
         pieces += [(position + place, face, normal) for position, face, normal in _piece(radius, curves)]
-    return join([_assemble(parts) for parts in (pieces, *_board())])
+    return join([assemble(parts) for parts in (pieces, *_board())])
 
 
 def sphere(*, rings: int = 32, sectors: int = 64) -> Mesh:
@@ -134,7 +134,7 @@ def sphere(*, rings: int = 32, sectors: int = 64) -> Mesh:
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     radius = np.where(np.arange(rings + 1) % rings == 0, 0, np.cos(latitude))
     height = np.sin(latitude)
-    return _assemble([_sweep(np.stack([radius, height], -1), np.stack([-height, radius], -1), sectors=sectors)])
+    return assemble([sweep(np.stack([radius, height], -1), np.stack([-height, radius], -1), sectors=sectors)])
 
 
 def plane(*, cells: int = 16) -> Mesh:
@@ -151,7 +151,7 @@ def plane(*, cells: int = 16) -> Mesh:
     """
     if cells < 1:
         raise ValueError(f"cells must be at least 1, got {cells}")
-    return _assemble([_patch([[[-1, 0, -1], [1, 0, -1]], [[-1, 0, 1], [1, 0, 1]]], cells, cells)])
+    return assemble([patch([[[-1, 0, -1], [1, 0, -1]], [[-1, 0, 1], [1, 0, 1]]], rows=cells, columns=cells)])
 
 
 def daylight(*, size: int = 64) -> Environment:
@@ -230,12 +230,13 @@ def _exposed(radiance: np.ndarray, size: int) -> np.ndarray:
     return mean * np.pi / (mean * cosine).sum((0, 1, 2)).mean()
 
 
-def _piece(radius: float, curves: list) -> list:
+def _piece(radius: float, curves: list) -> list[Part]:
     """The parts of a turned piece that stands in the origin."""
-    parts = [_sweep(np.array([[0, 0], [radius * curves[0][0][0], 0]]), np.array([[1, 0], [1, 0]]))]
+    bottom = np.array([[0, 0], [radius * curves[0][0][0], 0]])
+    parts = [sweep(bottom, np.array([[1.0, 0], [1, 0]]), sectors=_SECTORS)]
     chains = []
-    for number, curve in enumerate(curves):
-        point, slope = _curve([(radius * r, y) for r, y in curve])
+    for number, control in enumerate(curves):
+        point, slope = curve([(radius * r, y) for r, y in control], **_FINE)
         teeth = np.full(len(point), float(curves is _QUEEN and number in _CORONET[0]))
         if chains and np.cross([*chains[-1][1][-1], 0], [*slope[0], 0])[2] < 0:
             before = chains.pop()
@@ -243,7 +244,10 @@ def _piece(radius: float, curves: list) -> list:
             chains.append([np.concatenate([a[:-1], b]) for a, b in zip(before, (point, slope, teeth), strict=True)])
         else:
             chains.append([point, slope, teeth])
-    parts += [_sweep(point, slope, teeth=teeth[:, None]) for point, slope, teeth in chains]
+    parts += [
+        sweep(point, slope, sectors=_SECTORS, lift=_lift(point, slope, teeth), waves=_SECTORS // 4)
+        for point, slope, teeth in chains
+    ]
     if curves is _ROOK:
         parts += _battlement(radius)
     if curves is _KING:
@@ -251,26 +255,33 @@ def _piece(radius: float, curves: list) -> list:
     return parts
 
 
-def _battlement(radius: float) -> list:
+def _lift(point: np.ndarray, slope: np.ndarray, teeth: np.ndarray) -> np.ndarray:
+    """How far the crests of the coronet's teeth rise, and how fast along the curve; zero where there are none."""
+    _, low, high, depth = _CORONET
+    above = teeth * np.maximum(point[:, 1] - low, 0) / (high - low)
+    return depth * np.stack([above**2, 2 * above / (high - low) * slope[:, 1]], -1)
+
+
+def _battlement(radius: float) -> list[Part]:
     """The rook's merlons and the floor between them, around the platform."""
     (outer, floor), (inner, _) = _ROOK[-2][-1], _ROOK[-1][0]
     edge = [(radius * r, y) for r, y in ((outer, floor), (outer, _TOP), (inner, _TOP), (inner, floor))]
-    front, top, back = (_curve(list(ends)) for ends in itertools.pairwise(edge))
-    notch = _curve([edge[0], edge[3]])
+    front, top, back = (curve(list(ends), **_FINE) for ends in itertools.pairwise(edge))
+    notch = curve([edge[0], edge[3]], **_FINE)
     parts = []
     for first in range(0, _SECTORS, _MERLON + _NOTCH):
         last = first + _MERLON
-        parts += [_sweep(*curve, first=first, last=last) for curve in (front, top, back)]
-        parts.append(_sweep(*notch, first=last, last=last + _NOTCH))
+        parts += [sweep(*run, sectors=_SECTORS, first=first, last=last) for run in (front, top, back)]
+        parts.append(sweep(*notch, sectors=_SECTORS, first=last, last=last + _NOTCH))
         for column, order in ((first, -1), (last, 1)):
             turn = 2 * np.pi * column / _SECTORS
             (a, b), (d, c) = edge[1:3][::order], edge[::3][::order]
             corner = [[[r * np.cos(turn), y, r * np.sin(turn)] for r, y in row] for row in ((b, a), (c, d))]
-            parts.append(_patch(corner, len(front[0]) - 1, len(top[0]) - 1))
+            parts.append(patch(corner, rows=len(front[0]) - 1, columns=len(top[0]) - 1))
     return parts
 
 
-def _cross(height: float) -> list:
+def _cross(height: float) -> list[Part]:
     """The king's cross with flared arms, standing at a height."""
     narrow, wide, arm, depth, parts = 0.019, 0.036, 0.105, 0.02, 2
     result = []
@@ -279,7 +290,7 @@ def _cross(height: float) -> list:
         rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # About z, by quarter turns.
 
         def add(corner, rotation=rotation):
-            position, face, normal = _patch(corner, parts, parts)
+            position, face, normal = patch(corner, rows=parts, columns=parts)
             result.append((position @ rotation.T + np.array([0, height + arm, 0]), face, normal @ rotation.T))
 
         for z in (depth, -depth):
@@ -295,106 +306,17 @@ def _cross(height: float) -> list:
     return result
 
 
-def _board() -> tuple[list, list]:
+def _board() -> tuple[list[Part], list[Part]]:
     """Parts of the light squares, and of the dark squares and the board's side."""
     light, dark = color = [], []
     line = np.arange(_SQUARES + 1) - _SQUARES / 2
     for i in range(_SQUARES):
         for j in range(_SQUARES):
             corner = [[[x, 0, z] for x in line[j : j + 2]] for z in line[i : i + 2]]
-            color[(i + j) % 2].append(_patch(corner, _CELLS, _CELLS))
+            color[(i + j) % 2].append(patch(corner, rows=_CELLS, columns=_CELLS))
     half = _SQUARES / 2
     around = [(-half, half), (half, half), (half, -half), (-half, -half), (-half, half)]
     for (x0, z0), (x1, z1) in itertools.pairwise(around):
         corner = [[[x0, y, z0], [x1, y, z1]] for y in (0, -_THICKNESS)]
-        dark.append(_patch(corner, 1, _SQUARES * _CELLS))
+        dark.append(patch(corner, rows=1, columns=_SQUARES * _CELLS))
     return light, dark
-
-
-def _curve(control: list) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit tangents of a smooth curve through control points, denser where it bends; straight through two.
-
-    A Hermite spline over chord length. Where it meets the axis it is horizontal, the middle of a smooth surface.
-    """
-    point = np.array(control, float)
-    if point[-1, 0] == 0:
-        point = np.concatenate([point, point[-2:-1] * [-1, 1]])
-    chord = np.linalg.norm(np.diff(point, axis=0), axis=1)
-    slope = np.diff(point, axis=0) / chord[:, None]
-    inner = (slope[:-1] * chord[1:, None] + slope[1:] * chord[:-1, None]) / (chord[1:] + chord[:-1])[:, None]
-    ends = (slope[[0, -1]] * 3 - inner[[0, -1]]) / 2 if len(inner) else slope[[0, -1]]
-    derivative = np.concatenate([ends[:1], inner, ends[1:]])
-    segments = len(control) - 1
-
-    def hermite(place):
-        k = np.minimum(place.astype(int), segments - 1)
-        t, h = (place - k)[:, None], chord[k, None]
-        a, b, m, n = point[k], point[k + 1], derivative[k] * h, derivative[k + 1] * h
-        value = a + t**2 * (3 - 2 * t) * (b - a) + t * (1 - t) * ((1 - t) * m - t * n)
-        speed = 6 * t * (1 - t) * (b - a) + (1 - t) * (1 - 3 * t) * m + t * (3 * t - 2) * n
-        return value, speed / np.linalg.norm(speed, axis=1, keepdims=True)
-
-    place = np.linspace(0, segments, 64 * segments + 1)
-    value, tangent = hermite(place)
-    turn = np.abs(np.diff(np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))))
-    effort = np.cumsum(np.linalg.norm(np.diff(value, axis=0), axis=1) / _STEP + turn / _TURN)
-    effort = np.concatenate([[0], effort])
-    steps = max(1, int(np.ceil(effort[-1] - 1e-9)))
-    return hermite(np.interp(np.linspace(0, effort[-1], steps + 1), effort, place))
-
-
-def _sweep(
-    point: np.ndarray,
-    slope: np.ndarray,
-    *,
-    sectors: int = _SECTORS,
-    first: int = 0,
-    last: int | None = None,
-    teeth: np.ndarray | float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, faces and normals of a curve turned about y, between two of the sectors' borders.
-
-    The curve has its outside on the right. Where it starts or ends on the axis stands one vertex.
-    """
-    columns = sectors if last is None else last - first + 1
-    turn = 2 * np.pi * (first + np.arange(columns)) / sectors
-    cosine, sine = np.cos(turn), np.sin(turn)
-    radius, height = point[:, :1], point[:, 1:]
-    lift = lift_along = lift_around = np.zeros_like(radius)
-    if np.any(teeth):
-        _, low, high, depth = _CORONET
-        above = teeth * np.maximum(height - low, 0) / (high - low)
-        wave, count = depth * np.cos(_SECTORS / 4 * turn), _SECTORS / 4
-        lift, lift_along = above**2 * wave, 2 * above / (high - low) * slope[:, 1:] * wave
-        lift_around = -(above**2) * count * depth * np.sin(count * turn) / np.maximum(radius, 1e-9)
-    position = np.stack(np.broadcast_arrays(radius * cosine, height + lift, radius * sine), -1)
-    climb = slope[:, 1:] + lift_along
-    along = np.stack(np.broadcast_arrays(slope[:, :1] * cosine, climb, slope[:, :1] * sine), -1)
-    around = np.stack(np.broadcast_arrays(-sine, lift_around, cosine), -1)
-    normal = np.cross(along, around)
-
-    index = np.arange(len(point) * columns).reshape(-1, columns)
-    index = np.where(radius == 0, index[:, :1], index)
-    index = np.concatenate([index, index[:, :1]], 1) if last is None else index
-    face = index.ravel()[grid_face(rows=len(index), columns=index.shape[1])]
-    face = face[(face != np.roll(face, 1, 1)).all(1)]
-    used, face = np.unique(face, return_inverse=True)
-    return position.reshape(-1, 3)[used], face.reshape(-1, 3), normal.reshape(-1, 3)[used]
-
-
-def _patch(corner: list, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, faces and normals of a flat quadrangle; its front is where (next row) x (next column) points."""
-    (a, b), (c, d) = np.array(corner, float)
-    v, u = np.meshgrid(np.arange(rows + 1) / rows, np.arange(columns + 1) / columns, indexing="ij")
-    v, u = v.reshape(-1, 1), u.reshape(-1, 1)
-    position = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
-    normal = np.cross(c - a + d - b, b - a + d - c)
-    return position, grid_face(rows=rows + 1, columns=columns + 1), np.broadcast_to(normal, position.shape)
-
-
-def _assemble(parts: list) -> Mesh:
-    """One mesh of several parts (positions, faces, normals)."""
-    start = np.cumsum([0, *(len(position) for position, _, _ in parts)])
-    position, face, normal = zip(*parts, strict=True)
-    face = np.concatenate([part + first for part, first in zip(face, start[:-1], strict=True)])
-    return make_mesh(np.concatenate(position), face, normal=np.concatenate(normal))

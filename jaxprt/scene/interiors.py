@@ -1,0 +1,289 @@
+"""Scenes made by formula whose surfaces light each other: two sides of chess, a room, a corner, a ring on a table.
+
+Light comes from afar, so each is open somewhere. Three rules keep light that is known at vertices clean: things that
+stand on others leave a gap; vertices are just outside the foot of a thing rather than beneath it, where they would
+spread its darkness over their triangles; and where regions meet in a groove it is round or slanted, since a vertex
+that lies in the plane of another region's faces would start its rays in them once the regions are relit apart.
+
+Reference: Sun, Zhou, Chen, Lin, Shi, Guo 2007, section 5, has such scenes.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxprt.scene import builtin
+from jaxprt.scene.mesh import Mesh, bounds, grid_face, join, split
+from jaxprt.scene.shapes import Part, assemble, curve, patch, sweep
+
+_CELL = 0.1  # Spacing of the room's vertices, by which floor and walls share those where they meet.
+_GAP = 0.003  # Between things in the room and on the table, about 5e-4 of the diagonals.
+_DIGITS = 9  # Places are rounded, so that the same place is the same number on every side.
+_CLEAR = 0.01  # By which things stop short of the lines of the grid.
+_ROUND = 0.01  # Radius between floor, walls and ceiling.
+_WALLS = np.array([[-2, 0, -2], [2, 2.5, 2]])
+_WINDOW = (0.8, -0.4), (2.1, 1.2)  # Lowest and highest (y, z), in the wall at -x.
+_REVEAL = 0.2  # Depth of the window.
+_RUG = (-1.3, -0.8), (1.3, 0.6)  # Lowest and highest (x, z).
+_PILE = 0.02  # Height of the rug, and width of its slanted hem.
+_VASE = [(0.042, 0), (0.062, 0.03), (0.105, 0.12), (0.085, 0.21), (0.045, 0.27), (0.058, 0.32)]
+_VASE_INSIDE = [(0.05, 0.32), (0.037, 0.27), (0.076, 0.205), (0.096, 0.12), (0.054, 0.035), (0, 0.02)]
+
+_CORNER_GAP = 5e-4  # Of the object's diagonal, as in `ground_plane`.
+_CORNER_ROUND = 5e-3  # Of the object's longest side: radius between floor and walls.
+_NEAR, _FAR = 0.3, 0.9  # From the object to the walls, and to the open edges of the floor, over its longest side.
+_ABOVE = 0.4  # Of the walls over the object's top, likewise.
+
+_RING = 0.93, 1.0, 0.5  # Inner and outer radius, height.
+_RING_SECTORS, _RING_STEP = 96, 0.042
+_TABLE = 2.4, 0.12  # Radius and thickness.
+_SHELLS = 24, 18  # Circles of vertices inside the ring and around it.
+
+_Sides = Sequence[tuple[int, int]]  # Of a box: their axis, and 0 for its lower end or 1 for the higher.
+
+
+def chess_sides() -> Mesh:
+    """The scene of `builtin.chess` with the pieces on the two sides of the board's diagonal apart.
+
+    Returns:
+        16,778 vertices in four regions: 0 one side's pieces (king, queen, bishop), 1 the other's (rook, two pawns),
+        2 the board's light squares, 3 the dark ones and its side.
+    """
+    pieces, light, dark = split(builtin.chess())
+    x, _, z = np.asarray(pieces.position).T
+    side = jnp.asarray(z > x, jnp.int32)  # No piece stands on the diagonal.
+    return join([Mesh(pieces.position, pieces.face, pieces.normal, pieces.tangent, side), light, dark])
+
+
+def room() -> Mesh:
+    """A furnished room, 4 x 4 and 2.5 high, open to +z, with a window in the wall at -x.
+
+    Floor, walls and ceiling are seen from inside only, but stop light from both sides. Their cells are
+    0.1 wide. The sun of `builtin.daylight` falls through the window on rug, table and sofa.
+
+    Returns:
+        14,364 vertices in twelve regions: 0 floor and 1 sofa, which are meant to change; 2 the wall with the window,
+        3 the back wall, 4 the wall at +x, 5 ceiling, 6 rug, 7 table, 8 lamp, 9 vase, 10 picture, 11 cushions.
+    """
+    floor, wall, back, right, ceiling = _shell(_WALLS, _ROUND, _CELL, ((1, 0), (0, 0), (2, 0), (0, 1), (1, 1)))
+    rug, sofa, table = _rug(), _sofa(), _table()
+    picture = [_block((-0.69, 1.31, -2 + _GAP), (0.69, 1.99, -1.95), 0.01)]
+    vase = [_moved(part, (0.3, 0.42 + _GAP, -0.1)) for part in _vase()]
+    lamp = [_moved(part, (1.55, _GAP, -1.55)) for part in _lamp()]
+    shell = [_without(floor, (0, 2), *_RUG)], [_without(wall, (1, 2), *_WINDOW), *_reveal()], [back], [right], [ceiling]
+    parts = [shell[0], sofa, *shell[1:], rug, table, lamp, vase, picture, _cushions()]
+    return join([assemble(each) for each in parts])
+
+
+def corner(mesh: Mesh, *, cells: int = 64) -> Mesh:
+    """An object in a corner: on a floor, before a wall at -z and one at +x.
+
+    Floor and walls are scaled to the longest side of the object's bounds. The floor lies 5e-4 of the
+    object's diagonal below its lowest face, and extends further to -x and +z, where the corner is open.
+
+    Args:
+        mesh: The object; vertices without faces do not count for its bounds.
+        cells: Parts of the floor's longer edge; all cells have about this size.
+
+    Returns:
+        The object's vertices first, with all it had of regions as 0; 1 the floor, 2 the wall at -z, 3 the wall at +x.
+
+    Raises:
+        ValueError: Fewer than 1 cell.
+    """
+    if cells < 1:
+        raise ValueError(f"cells must be at least 1, got {cells}")
+    low, high = bounds(mesh)
+    unit = float(max(high - low)) or 1.0
+    low = low - unit * np.array([_FAR, 0, _NEAR]) - [0, _CORNER_GAP * float(np.linalg.norm(high - low)), 0]
+    high = high + unit * np.array([_NEAR, _ABOVE, _FAR])
+    cell = max(high[0] - low[0], high[2] - low[2]) / cells
+    sides = _shell(np.stack([low, high]), _CORNER_ROUND * unit, cell, ((1, 0), (2, 0), (0, 1)))
+    whole = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, jnp.zeros_like(mesh.region))
+    return join([whole, *(assemble([side]) for side in sides)])
+
+
+def ring() -> Mesh:
+    """A metal ring that lies on a round table, on whose top its inside gathers light to a caustic.
+
+    The ring's radius is 1 and its height 0.5, the table's radius 2.4. The top's vertices stand on
+    circles, none of them beneath the ring; inside it their spacing is 0.038.
+
+    Returns:
+        10,969 vertices in two regions: 0 the ring, closed, and 1 the table, its top and its side.
+    """
+    inner, outer, height = _RING
+    profile = [(inner, _GAP), (outer, _GAP), (outer, _GAP + height), (inner, _GAP + height)]
+    inside, around = _SHELLS
+    edge, thickness = _TABLE
+    growth = np.linspace(0, 1, around) ** 1.3  # Finest beside the ring.
+    clear = outer + _CLEAR
+    radius = [np.linspace(0, inner - _CLEAR, inside + 1), clear + (edge - clear) * growth]
+    side, slope = curve([(edge, -thickness), (edge, 0)], step=thickness, turn=1.0)
+    table = [_disk(np.concatenate(radius)), sweep(side, slope, sectors=8 * (inside + around))]
+    return join([assemble(_band(profile, _RING_SECTORS, _RING_STEP)), assemble(table)])
+
+
+def _reveal() -> list[Part]:
+    """The window's four sides."""
+    (y0, z0), (y1, z1) = _WINDOW
+    inside = np.array([[_WALLS[0][0], y, z] for y, z in ((y0, z0), (y0, z1), (y1, z1), (y1, z0))])
+    return _between(inside, inside - [_REVEAL, 0, 0])
+
+
+def _rug() -> list[Part]:
+    """The rug with its hem, whose rim shares its places with the floor's."""
+    (x0, z0), (x1, z1) = _RUG
+    rim = np.array([[x0, 0, z1], [x1, 0, z1], [x1, 0, z0], [x0, 0, z0]])
+    top = rim + _PILE * np.array([[1, 1, -1], [-1, 1, -1], [-1, 1, 1], [1, 1, 1]])
+    return [_panel([[top[3], top[2]], [top[0], top[1]]]), *_between(top, rim)]
+
+
+def _sofa() -> list[Part]:
+    """Base, arms, back and two seats, against the back wall."""
+    inner = 0.9 - _CLEAR
+    arms = [_block((x, _GAP, -1.89), (x + 0.2 - 2 * _CLEAR, 0.58, -1.01), 0.04) for x in (-1.09, 0.91)]
+    seats = [_block((x, 0.263, -1.65), (x + inner - _GAP / 2, 0.45, -0.99), 0.05) for x in (-inner, _GAP / 2)]
+    base = _block((-inner, 0.06, -1.87), (inner, 0.26, -1.02), 0.02)
+    back = _block((-inner, 0.263, -1.87), (inner, 0.86, -1.65 - _GAP), 0.06)
+    return [base, back, *arms, *seats]
+
+
+def _cushions() -> list[Part]:
+    """Two cushions that lean against the sofa's back."""
+    parts = []
+    for x, lean, turn in ((-0.6, 0.3, 0.25), (0.58, 0.24, -0.2)):
+        position, face, normal = _block((-0.2, -0.2, -0.07), (0.2, 0.2, 0.07), 0.07, step=0.06)
+        # About z, then backward about x.
+        c, s, d, t = np.cos(turn), np.sin(turn), np.cos(lean), np.sin(lean)
+        rotation = np.array([[1, 0, 0], [0, d, t], [0, -t, d]]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        position = position @ rotation.T
+        low = position.min(0)
+        place = (x, 0.45 + _GAP - low[1], -1.65 + _GAP - low[2])
+        parts.append(_moved((position, face, normal @ rotation.T), place))
+    return parts
+
+
+def _table() -> list[Part]:
+    """A low table on the rug, its legs between the rug's vertices."""
+    legs = [
+        _block((x - 0.025, _PILE + _GAP, z - 0.025), (x + 0.025, 0.36 - _GAP, z + 0.025), 0.01)
+        for x in (-0.45 - _CLEAR, 0.45 + _CLEAR)
+        for z in (-0.35, 0.15)
+    ]
+    return [_block((-0.55, 0.36, -0.45), (0.55, 0.42, 0.25), 0.015), *legs]
+
+
+def _lamp() -> list[Part]:
+    """A standing lamp of a foot with a pole, a bulb and a shade."""
+    pole = [[(0.13, 0), (0.13, 0.025)], [(0.13, 0.025), (0.018, 0.035)], [(0.018, 0.035), (0.018, 1.3)]]
+    bulb = [(0.02, 1.31), (0.055, 1.36), (0.045, 1.41), (0, 1.44)]
+    runs = [[(0.13, 0), (0, 0)][::-1], *pole, [(0.018, 1.3), (0, 1.3)], [(0, 1.31), (0.02, 1.31)], bulb]
+    shade = [(0.19, 1.25), (0.2, 1.25), (0.15, 1.6), (0.14, 1.6)]
+    return [_turned(run, 20) for run in runs] + _band(shade, 32, 0.06)
+
+
+def _vase() -> list[Part]:
+    """A vase, hollow, with a foot and a lip."""
+    lip = [_VASE[-1], _VASE_INSIDE[0]]
+    return [_turned(run, 32, step=0.025) for run in ([(0, 0), _VASE[0]], _VASE, lip, _VASE_INSIDE)]
+
+
+def _turned(control: list, sectors: int, *, step: float = 0.07) -> Part:
+    """A smooth run of a turned thing."""
+    if control[0][0] == 0:
+        point = np.array(control, float)
+        return sweep(point, np.array([[1.0, 0], [1, 0]]), sectors=sectors)
+    return sweep(*curve(control, step=step, turn=0.5), sectors=sectors)
+
+
+def _band(profile: list, sectors: int, step: float) -> list[Part]:
+    """A closed band of four corners turned about y, sharp at each; they run outward at the bottom."""
+    around = itertools.pairwise([*profile, profile[0]])
+    return [sweep(*curve(list(ends), step=step, turn=1.0), sectors=sectors) for ends in around]
+
+
+def _disk(radius: np.ndarray) -> Part:
+    """A disk that faces up, its vertices on circles about one in the middle, eight more on each.
+
+    A square grid of which concentric squares have become circles: cells have about one size.
+    """
+    count = len(radius) - 1
+    z, x = np.meshgrid(*[np.arange(-count, count + 1)] * 2, indexing="ij")
+    shell = np.maximum(np.abs(x), np.abs(z))
+    # Place along the square, 0 to 8 times its number from the middle of the side at +x to +z.
+    along = np.select([(x == shell) & (z > -shell), z == shell, x == -shell], [z, 2 * shell - x, 4 * shell - z])
+    along = np.where((z == -shell) & (x > -shell), 6 * shell + x, along)
+    turn = np.pi / 4 * along / np.maximum(shell, 1)
+    position = np.stack([radius[shell] * np.cos(turn), 0 * turn, radius[shell] * np.sin(turn)], -1).reshape(-1, 3)
+    up = np.broadcast_to([0.0, 1, 0], position.shape)
+    return position, grid_face(rows=2 * count + 1, columns=2 * count + 1), up
+
+
+def _between(first: np.ndarray, second: np.ndarray) -> list[Part]:
+    """Four panels from one rectangle to another."""
+    edges = (itertools.pairwise([*corner, corner[0]]) for corner in (first, second))
+    return [_panel([above, below]) for above, below in zip(*edges, strict=True)]
+
+
+def _panel(corner: list) -> Part:
+    """A flat quadrangle of the room in its cells, in places that do not depend on which corner is named first."""
+    (a, b), (c, _) = np.array(corner, float)
+    rows, columns = (max(1, round(float(np.linalg.norm(edge)) / _CELL)) for edge in (c - a, b - a))
+    position, face, normal = patch(corner, rows=rows, columns=columns)
+    return np.round(position, _DIGITS), face, normal
+
+
+def _without(part: Part, axes: tuple[int, int], low: tuple[float, float], high: tuple[float, float]) -> Part:
+    """A part less the faces in a rectangle across two axes."""
+    position, face, normal = part
+    middle = position[face].mean(1)[:, axes]
+    used, face = np.unique(face[~((middle > low) & (middle < high)).all(1)], return_inverse=True)
+    return position[used], face.reshape(-1, 3), normal[used]
+
+
+def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> Part:
+    """A closed box with rounded edges, smooth all around."""
+    sides = _sides(np.array([low, high], float), np.full((2, 3), radius), step, list(np.ndindex(3, 2)))
+    start = np.cumsum([0, *(len(position) for position, _, _ in sides)])
+    position, face, normal = zip(*sides, strict=True)
+    face = np.concatenate([part + first for part, first in zip(face, start[:-1], strict=True)])
+    position, first, place = np.unique(np.concatenate(position), axis=0, return_index=True, return_inverse=True)
+    return position, place.reshape(-1)[face], np.concatenate(normal)[first]
+
+
+def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[Part]:
+    """Some sides of a box that face inward; round where they meet, and straight elsewhere."""
+    rounding = np.zeros((2, 3))
+    for axis, end in sides:
+        rounding[end, axis] = radius
+    parts = _sides(box, rounding, cell, sides)
+    return [(position, face[:, ::-1], -normal) for position, face, normal in parts]
+
+
+def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> list[Part]:
+    """Sides of a box that face outward, with a line of vertices on both sides of the rounding at each end."""
+    line = []
+    for (a, b), (r, s) in zip(box.T, radius.T, strict=True):
+        inner = np.linspace(a, b, max(1, round((b - a) / cell)) + 1)
+        line.append(np.unique(np.round([a + r, b - s, *inner], _DIGITS)))
+    parts = []
+    for axis, end in sides:
+        row, column = [(axis + 1) % 3, (axis + 2) % 3][:: 2 * end - 1]
+        position = np.empty((len(line[row]), len(line[column]), 3))
+        position[..., axis] = line[axis][-end]
+        position[..., row], position[..., column] = line[row][:, None], line[column]
+        core = np.clip(position, box[0] + radius[0], box[1] - radius[1])
+        normal = position - core
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        face = grid_face(rows=len(line[row]), columns=len(line[column]))
+        parts.append(((core + radius.max() * normal).reshape(-1, 3), face, normal.reshape(-1, 3)))
+    return parts
+
+
+def _moved(part: Part, place: tuple[float, float, float]) -> Part:
+    """A part shifted."""
+    position, face, normal = part
+    return position + np.array(place), face, normal
