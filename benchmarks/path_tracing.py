@@ -1,19 +1,32 @@
-"""What a path tracer makes of the same view: Mitsuba 3's error and time by samples per pixel, for the front's plot.
+"""What a path tracer makes of the same view: Mitsuba 3's error and time by samples per pixel, and pictures to judge by.
 
-The same meshes under the same light from the same place, direct light alone; the object is half diffuse, half a rough
-conductor as wide as Ashikhmin-Shirley (10, 100), for which Mitsuba has no plugin. A picture's error is its noise, which
-a picture of another seed does not share: their difference is sqrt(2) of it, so no converged one is needed.
+`measure` is for the front's plot: the same meshes under the same light from the same place, direct light alone; the
+object is half diffuse, half a rough conductor as wide as Ashikhmin-Shirley (10, 100), for which Mitsuba has no plugin.
+A picture's error is its noise, which a picture of another seed does not share: their difference is sqrt(2) of it, so
+no converged one is needed.
+
+`picture` traces paths through a scene with jaxprt's own materials, for judging interreflection. It compiles for the
+processor with LLVM, which must be installed; `available` tells.
 """
 
+import functools
+import math
 import time
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.scene import Environment, Mesh, environment
+from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.image import raster
+from jaxprt.scene import Camera, Environment, Mesh, environment
 
 EDGE = 256  # pixels: about as many as there are vertices
 SAMPLES = (4, 16, 64, 256, 1024)
+_LLVM = 17  # the first that has minima of floats on x86: the process ends where an older one meets them
+_PATHS = 1 << 22  # traced at once: some 200 bytes each
+_SMOOTHEST = 1e-3  # least roughness, as jaxprt.brdf has it
 _ROUGHNESS = {"alpha_u": (2 / 12) ** 0.5, "alpha_v": (2 / 102) ** 0.5}  # of Blinn's distribution with these exponents
 
 
@@ -57,9 +70,186 @@ def measure(glossy: Mesh, ground: Mesh, lights: dict[str, Environment], eye: np.
             }
 
 
-def _shape(mitsuba, mesh: Mesh, bsdf: dict):
+def available() -> bool:
+    """Whether `picture` can run: where drjit finds LLVM 17 or newer, which DRJIT_LIBLLVM_PATH may name."""
+    import drjit
+
+    return bool(drjit.has_backend(drjit.JitBackend.LLVM)) and drjit.detail.llvm_version()[0] >= _LLVM
+
+
+def picture(
+    mesh: Mesh,
+    materials: Sequence[CookTorrance | Lambert],
+    light: Environment,
+    camera: Camera,
+    *,
+    depth: int,
+    samples: int,
+    seed: int = 0,
+) -> np.ndarray:
+    """Radiance towards a camera, by path tracing in Mitsuba 3's variant llvm_ad_rgb, which is left as the current one.
+
+    Needs LLVM 17 or newer, see `available`. Pixels are means over their squares. Other materials, lights, cameras and
+    seeds do not compile anew.
+
+    Args:
+        mesh: The scene, which shadows and lights itself; a face is of its first corner's region.
+        materials: The material of each region, black on the back.
+        light: One environment, hidden from the camera.
+        camera: From where; the rays are those of `jaxprt.image`.
+        depth: How many segments a path from the eye to the light has at most: 2 is direct light, 3 one bounce.
+        samples: Paths per pixel, jittered in a grid: best a square, and for large pictures a multiple of 64.
+        seed: Pictures of two seeds have independent noise.
+
+    Returns:
+        Linear radiance [h, w, 3], zero where nothing is seen.
+
+    Raises:
+        ValueError: A region without a material or a material of another kind, a batch of lights, no sample, or a
+            depth below 2.
+        RuntimeError: There is no LLVM of at least version 17.
+    """
+    region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
+    used = np.unique(region)
+    if used[-1] >= len(materials):
+        raise ValueError(f"materials must have one for each region, got {len(materials)} and region {used[-1]}")
+    if light.radiance.ndim != 4:
+        raise ValueError(f"light must be one environment, got a batch {list(light.radiance.shape[:-4])}")
+    if depth < 2 or samples < 1:
+        raise ValueError(f"depth must be at least 2 and samples at least 1, got {depth} and {samples}")
+    if not available():
+        raise RuntimeError(f"picture needs LLVM {_LLVM} or newer; DRJIT_LIBLLVM_PATH may name its shared library")
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_rgb")
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            # Russian roulette would only add noise at depths that are looked at.
+            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 100, "hide_emitters": True},
+            "sensor": _sensor(mitsuba, camera),
+            "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(_latlong(light))},
+            **{
+                f"region{number}": _shape(mitsuba, _part(mesh, region == number), _bsdf(mitsuba, materials[number]))
+                for number in used
+            },
+        }
+    )
+    # Squares, as which the sampler jitters; other counts it rounds up, with a warning.
+    most = max(1, math.isqrt(_PATHS // (camera.width * camera.height))) ** 2
+    counts = [min(most, samples - first) for first in range(0, samples, most)]
+    seeds = np.random.SeedSequence(seed).generate_state(len(counts))
+    total = np.zeros((camera.height, camera.width, 3))
+    for count, each in zip(counts, seeds, strict=True):
+        total += count * np.array(mitsuba.render(scene, spp=count, seed=mitsuba.UInt32(int(each))))
+    return (total / samples).astype(np.float32)
+
+
+def _sensor(mitsuba, camera: Camera) -> dict:
+    """Mitsuba's camera of the same rays; it looks along +z with +x to the left."""
+    eye, target = np.asarray(camera.eye, float), np.asarray(camera.target, float)
+    _, up, forward = np.asarray(raster.view_axes(camera), float)
+    view = mitsuba.ScalarTransform4f().look_at(origin=eye.tolist(), target=(eye + forward).tolist(), up=up.tolist())
+    size = {"width": camera.width, "height": camera.height}
+    distance = float(np.linalg.norm(target - eye))
+    return {
+        "type": "perspective",
+        "fov": float(np.degrees(camera.field_of_view)),
+        "fov_axis": "y",
+        "near_clip": 1e-4 * distance,
+        "far_clip": 1e4 * distance,
+        "to_world": view,
+        "sampler": {"type": "multijitter"},  # as fast as independent samples, with half their noise
+        "film": {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+    }
+
+
+def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
+    """Some faces of a mesh with their vertices."""
+    face = np.asarray(mesh.face)[chosen]
+    used, face = np.unique(face, return_inverse=True)
+    position, normal, tangent, region = (
+        jnp.asarray(np.asarray(field)[used]) for field in (mesh.position, mesh.normal, mesh.tangent, mesh.region)
+    )
+    return Mesh(position, jnp.asarray(face.reshape(-1, 3), jnp.int32), normal, tangent, region)
+
+
+def _bsdf(mitsuba, material: CookTorrance | Lambert):
+    if isinstance(material, CookTorrance):
+        return _cook_torrance(mitsuba)(material)
+    if isinstance(material, Lambert):
+        albedo = np.broadcast_to(material.albedo, 3).tolist()
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+    raise ValueError(f"materials must be CookTorrance or Lambert, got {type(material).__name__}")
+
+
+@functools.cache
+def _cook_torrance(mitsuba: Any):
+    """The class of Cook and Torrance's model: made once, and only when a variant is set, of which it inherits."""
+    import drjit
+
+    class Plugin(mitsuba.BSDF):
+        """The formula in the docstring of `jaxprt.brdf.CookTorrance`, with none of its code.
+
+        Directions are drawn half by the cosine, half as mirrored at a half vector of Beckmann's distribution.
+        """
+
+        def __init__(self, material: CookTorrance):
+            super().__init__(mitsuba.Properties())
+            color = (material.diffuse, material.specular, material.f0)
+            self.diffuse, self.specular, self.f0 = (mitsuba.Color3f(np.broadcast_to(c, 3).tolist()) for c in color)
+            self.roughness = mitsuba.Float(max(float(material.roughness), _SMOOTHEST))
+            # Else they would be constants of the program, and other materials compile anew.
+            drjit.make_opaque(self.diffuse, self.specular, self.f0, self.roughness)
+            self.m_components = [
+                mitsuba.BSDFFlags.GlossyReflection | mitsuba.BSDFFlags.DiffuseReflection | mitsuba.BSDFFlags.FrontSide
+            ]
+            self.m_flags = self.m_components[0]
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            # Half vectors with tan^2 = -m^2 log(u) have the density D times their cosine.
+            tangent = self.roughness * drjit.safe_sqrt(-drjit.log(1 - sample2.x))
+            sine, cosine = drjit.sincos(2 * drjit.pi * sample2.y)
+            half = drjit.normalize(mitsuba.Vector3f(tangent * cosine, tangent * sine, 1))
+            matte = mitsuba.warp.square_to_cosine_hemisphere(sample2)
+            result = drjit.zeros(mitsuba.BSDFSample3f)
+            result.wo = drjit.select(sample1 < 0.5, matte, 2 * drjit.dot(half, si.wi) * half - si.wi)
+            result.eta, result.sampled_component = 1.0, 0
+            result.sampled_type = mitsuba.UInt32(+mitsuba.BSDFFlags.GlossyReflection)
+            value, result.pdf = self.eval_pdf(ctx, si, result.wo, active)
+            return result, drjit.select(result.pdf > 0, value / result.pdf, 0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            cos_i, cos_o = si.wi.z, wo.z
+            half = drjit.normalize(si.wi + wo)
+            cos_h, cos_d = half.z, drjit.dot(half, wo)
+            lit = active & (cos_i > 0) & (cos_o > 0)
+            tilt = (half.x**2 + half.y**2) / (self.roughness * cos_h) ** 2
+            d = drjit.exp(-tilt) / (drjit.pi * self.roughness**2 * cos_h**4)
+            g = drjit.minimum(1, 2 * cos_h * drjit.minimum(cos_i, cos_o) / cos_d)
+            f = self.f0 + (1 - self.f0) * (1 - cos_d) ** 5
+            value = (self.diffuse + self.specular * (d * g / (cos_i * cos_o)) * f) / drjit.pi * cos_o
+            pdf = (cos_o / drjit.pi + d * cos_h / (4 * cos_d)) / 2
+            return drjit.select(lit, value, 0), drjit.select(lit, pdf, 0)
+
+        def eval(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def traverse(self, callback):
+            pass
+
+        def to_string(self):
+            return "CookTorrance"
+
+    return Plugin
+
+
+def _shape(mitsuba, mesh: Mesh, bsdf):
     props = mitsuba.Properties()
-    props["bsdf"] = mitsuba.load_dict(bsdf)
+    props["bsdf"] = mitsuba.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     shape = mitsuba.Mesh("mesh", len(mesh.position), len(mesh.face), has_vertex_normals=True, props=props)
     parameters = mitsuba.traverse(shape)
     parameters["vertex_positions"] = np.asarray(mesh.position).ravel()
