@@ -18,8 +18,8 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "report", "inverse", "plan", "relight", "image", "transport", "brdf", "scene", "linalg", "sphere"]
-ROOMS += ["files"]
+ROOMS = ["__main__", "animation", "report", "inverse", "plan", "relight", "image", "transport", "brdf", "scene"]
+ROOMS += ["linalg", "sphere", "files"]
 SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.
@@ -37,7 +37,11 @@ SIDEWAYS = {
     ("linalg", "tucker", "eigen"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),
+    ("scene", "builtin", "shapes"),
     ("scene", "camera", "mesh"),
+    ("scene", "interiors", "builtin"),
+    ("scene", "interiors", "mesh"),
+    ("scene", "interiors", "shapes"),
     ("scene", "mesh", "mesh_file"),
     ("brdf", "published", "lobe"),
     ("brdf", "published", "lobe_em"),
@@ -46,12 +50,18 @@ SIDEWAYS = {
     ("sphere", "hemisphere", "directions"),
     ("sphere", "rotation", "harmonics"),
     ("scene", "occluder", "mesh"),
+    ("scene", "shapes", "mesh"),
     ("transport", "bounce", "visibility"),
     ("transport", "interreflection", "bounce"),
+    ("transport", "bounce", "paths"),
+    ("relight", "transfer", "dynamic"),
     ("transport", "transfer", "blocks"),
-    ("transport", "transfer", "bounce"),
     ("transport", "transfer", "clustered"),
-    ("transport", "transfer", "visibility"),
+    ("transport", "transfer", "transfer_job"),
+    ("transport", "transfer_job", "blocks"),
+    ("transport", "transfer_job", "bounce"),
+    ("transport", "transfer_job", "clustered"),
+    ("transport", "transfer_job", "visibility"),
     ("transport", "clustered", "blocks"),
     ("transport", "clustered", "direct"),
     ("transport", "clustered", "separable"),

@@ -38,6 +38,7 @@ JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
     "report": "measures, and writes files",
+    "animation": "the same",
     "files": "reads and writes files",
     "transport.visibility": "traces rays",
     "transport.blocks": "runs workers and writes files",
@@ -93,7 +94,7 @@ HOST = {
     "transport.bounce.hits": "traces rays",
     "transport.bounce.front": "NumPy on what rays meet",
     "transport.transfer.precompute": "traces rays",
-    "transport.transfer.compress": "gives half precision, and vectors of either sign",
+    "transport.transfer_job": "traces rays, and gives half precision and vectors of either sign",
     "brdf.navigation.triangulate": "by SciPy, where data enters",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
@@ -103,6 +104,12 @@ HOST = {
     "relight.dynamic.light_side": "gives indices; relight.dynamic.radiance has them all",
     "relight.dynamic.view_side": "the same",
     "relight.dynamic.combine": "takes indices; the same",
+    "relight.transfer.light_side": "takes half precision; relight.transfer.radiance has them all",
+    "relight.transfer.arriving": "takes indices; the same",
+    "relight.transfer.view_side": "takes indices; the same",
+    "relight.transfer.collect": "takes half precision; the same",
+    "relight.transfer.weights": "takes half precision; the same",
+    "relight.transfer.combine": "takes indices; the same",
     "brdf.lobe_em": "the steps of brdf.lobe.tabulate, and tested through it",
     "brdf.published": "checks values",
     "brdf.separable.sample_error": "draws its own directions",
@@ -113,6 +120,8 @@ HOST = {
     "scene.mesh_file": "reads files",
     "scene.occluder": "simplifies meshes on the host",
     "scene.builtin": "builds meshes and lights",
+    "scene.shapes": "builds meshes",
+    "scene.interiors": "builds meshes",
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",
     "scene.environment.environment_from_image": "checks values",
@@ -250,6 +259,25 @@ class Draw:
         terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
         return transport.DynamicTransport((transport.dynamic.RegionTransport(terms, small, row),), row)
 
+    def transfer(self, vertices):
+        """Bounces of ``changing``, with what is stored in half precision in the one under test."""
+        row, both = jnp.arange(vertices), transport.transfer.SecondBounce
+        second = both(self.normal(1, vertices, 2), jnp.zeros((1, 2, 6, 3, 3), jnp.float16), self.uniform(1))
+        tensor = transport.TransferTensor(
+            self.normal(1, vertices, 2),
+            jnp.zeros((1, 3, 2, 16, 3), jnp.float16),
+            self.normal(1, 24, 3),
+            row,
+            0 * row,
+            jnp.arange(3),
+            (self.normal(2, 1, 2),),
+            second,
+            self.uniform(1),
+            self.uniform(2),
+        )
+        cores = self.normal(1, 3, 2, 16, 3), self.normal(1, 2, 6, 3, 3)
+        return eqx.tree_at(lambda each: (each.core, each.second.core), tensor, cores)
+
     def mixture(self, lobes=2):
         """Wide lobes on the sphere."""
         return linalg.mixture.Mixture(self.uniform(lobes), self.unit(lobes), self.uniform(lobes, low=1, high=9))
@@ -373,6 +401,7 @@ EXAMPLES = {
     ),
     "linalg.mixture.log_peak": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
     "linalg.mixture.drop": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
+    "linalg.mixture.bands": example(lambda draw: call(draw.uniform(5, low=0.5, high=9)), degree=3),
     "linalg.mixture.concentration_of": example(lambda draw: call(draw.uniform(5))),
     "linalg.mixture.fit": example(
         lambda draw: call(draw.unit(9), draw.uniform(9), draw.mixture(), extent=draw.uniform(9, low=0.01, high=0.02)),
@@ -452,9 +481,9 @@ EXAMPLES = {
     ),
     "transport.dynamic.light_factors": example(lambda draw: call(draw.changing())),
     "brdf.paths.weights": example(
-        lambda draw: call(draw.changing(), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
-        gradient=("share", "diffuse", "specular"),
+        lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
     ),
+    "brdf.paths.project": example(lambda draw: call(draw.separable()), degree=2),
     "brdf.lobe.Remainder": example(
         lambda draw: call(
             brdf.lobe.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
@@ -492,14 +521,12 @@ EXAMPLES = {
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
     # Frames have derivatives along rotations only; see sphere.rotation.
-    "transport.transfer.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "transport.bounce.respond": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), gradient=("basis",), edge=2
     ),
     "transport.bounce.respond_again": example(
-        lambda draw: call(draw.normal(2, 4, 3), draw.rotation(2), draw.separable()),
+        lambda draw: call(draw.normal(4, 3, 2), draw.rotation(2), draw.separable()),
         gradient=("arriving", "basis"),
-        size=4,
     ),
     "transport.bounce.arrive": example(
         lambda draw: call(
@@ -560,6 +587,19 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
+    "relight.transfer.radiance": example(
+        lambda draw: call(
+            each := draw.regions(),
+            draw.transfer(len(each.place)),
+            (draw.changing(),),
+            (relight.dynamic.Material(draw.uniform(2), draw.uniform(3), draw.uniform(3, 3)),),
+            draw.light(8),
+            eye=draw.above(each.region[0].terms),
+        ),
+        gradient=("materials", "light", "eye"),
+        texels=3,
+    ),
+    "relight.transfer.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "relight.lobe.prefilter": example(lambda draw: call(draw.light(8))),
     "relight.lobe.combine": example(
         lambda draw: call(

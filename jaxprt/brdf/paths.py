@@ -7,13 +7,18 @@ functions p serves all BRDFs. Each function is factored over the two directions:
 What the functions are of a set of BRDFs is principal components, in the norm that `jaxprt.brdf.dynamic.factor` has.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.brdf.dynamic import DynamicBrdf
 from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.sphere import harmonics, hemisphere
 
+_RINGS, _SECTORS = 32, 64  # of a quadrature of what is bilinear on a map times a few harmonics
 _NOTHING = 1e-3  # of the largest singular value: a color that is a multiple of another
 
 
@@ -43,13 +48,26 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
     return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
 
 
+@partial(jax.jit, static_argnames=("degree",))
+def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
+    """What light factors make of harmonics in the local frame: integrals over the hemisphere with the cosine.
+
+    Reference: Sun et al. 2007, section 3.3, the matrix C of one-bounce interreflection.
+    """
+    up = jnp.zeros(3, basis.light_map.dtype).at[2].set(1)
+    direction, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
+    met = basis.light(direction)[..., 0] * (direction[:, 2] * area)[:, None]
+    return harmonics.evaluate(direction, degree=degree).T @ met
+
+
+@jax.jit
 def weights(
-    brdf: DynamicBrdf, share: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
+    factor: Float[Array, "m f h"], share: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
 ) -> Float[Array, "p e"]:
     """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
 
     Args:
-        brdf: The set.
+        factor: The set's `jaxprt.brdf.dynamic.DynamicBrdf.factor`.
         share: Of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
         diffuse: Albedo of the diffuse part.
         specular: What the BRDF of the set is multiplied by.
@@ -57,7 +75,7 @@ def weights(
     Returns:
         The weights, the diffuse part's last. Differentiable in all but the set.
     """
-    sharp = jnp.einsum("m,mch->hc", share, brdf.factor) * specular
+    sharp = jnp.einsum("m,mch->hc", share, factor) * specular
     colors = max(sharp.shape[1], len(diffuse))
     rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]
     return jnp.concatenate(rows)

@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _NEWTON = 4  # steps from an approximation that is right to a percent
+_SHARP = 5.0  # concentration from which a recurrence of Bessel functions is stable, and
+_BESSEL = 16  # orders above those asked for where a continued fraction begins
 
 
 class Mixture(eqx.Module):
@@ -74,6 +76,27 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     safe = jnp.where(small, 1, concentration)
     far = 1 / safe - 2 * jnp.exp(-2 * safe) / -jnp.expm1(-2 * safe)
     return jnp.where(small, 1 - concentration / 3 + concentration**3 / 45, far)
+
+
+@partial(jax.jit, static_argnames=("degree",))
+def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l *b"]:
+    """What a von Mises-Fisher lobe leaves of each band of the harmonics that it is averaged over: 1, coth k - 1/k, ...
+
+    Ratios of modified spherical Bessel functions: by their recurrence for sharp lobes, where it is stable, and for wide
+    ones by their continued fraction.
+    """
+    sharp = concentration > _SHARP
+    safe = jnp.where(sharp, concentration, _SHARP)
+    known = [jnp.ones_like(safe), 1 - drop(safe)]
+    for l in range(1, degree):
+        known.append(known[-2] - (2 * l + 1) / safe * known[-1])
+    safe = jnp.where(sharp, _SHARP, concentration)
+    ratio, factor = [jnp.zeros_like(safe)], [jnp.ones_like(safe)]
+    for l in range(degree + _BESSEL, 0, -1):
+        ratio.append(1 / ((2 * l + 1) / safe + ratio[-1]))
+    for each in ratio[::-1][:degree]:
+        factor.append(factor[-1] * each)
+    return jnp.stack([jnp.where(sharp, a, b) for a, b in zip(known, factor, strict=False)])
 
 
 @jax.jit

@@ -11,6 +11,7 @@ from jaxprt.transport import (
     quantized,
     separable,
     sparse,
+    transfer,
     visibility,
 )
 from jaxprt.transport.clustered import ClusteredTransport
@@ -20,6 +21,7 @@ from jaxprt.transport.harmonic import TransferMatrix, TransferVector
 from jaxprt.transport.lobe import LobeTransport
 from jaxprt.transport.quantized import QuantizedTransport
 from jaxprt.transport.sparse import SparseTransport
+from jaxprt.transport.transfer import TransferTensor
 
 __all__ = [
     "ClusteredTransport",
@@ -29,6 +31,7 @@ __all__ = [
     "QuantizedTransport",
     "SparseTransport",
     "TransferMatrix",
+    "TransferTensor",
     "TransferVector",
     "blocks",
     "clustered",
@@ -40,5 +43,6 @@ __all__ = [
     "quantized",
     "separable",
     "sparse",
+    "transfer",
     "visibility",
 ]

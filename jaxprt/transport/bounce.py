@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxprt.brdf import paths
 from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.sphere import cubemap, directions, haar, harmonics
+from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.transport import visibility
 
 _HITS = 64  # in a group: their responses should stay in the cache
@@ -51,9 +52,9 @@ def respond(
     return jax.lax.map(one, (seen, frame))
 
 
-@functools.partial(jax.jit, static_argnames=("size",))
+@jax.jit
 def respond_again(
-    arriving: Float[Array, "b s q"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, size: int = 16
+    arriving: Float[Array, "s q b"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf
 ) -> Float[Array, "b q k"]:
     """What light factors make of light that arrives as harmonics, one response for each kind q of it.
 
@@ -61,14 +62,12 @@ def respond_again(
         arriving: SH coefficients of radiance in world directions.
         frame: Rows are tangent, bitangent, normal.
         basis: Functions of the surfaces.
-        size: Edge of the faces over whose texels is summed.
 
     Returns:
         Integrals over the horizon of light factor x radiance x cosine.
     """
-    degree = harmonics.degree_of(arriving.shape[1])
-    light = harmonics.evaluate(cubemap.direction(size=size).reshape(-1, 3), degree=degree)
-    return jax.lax.map(lambda a: a[0].T @ (light.T @ _met(a[1], basis, size)), (arriving, frame))
+    local = rotation.rotate_each(arriving, frame)
+    return jnp.einsum("sqb,sk->bqk", local, paths.project(basis, degree=harmonics.degree_of(len(arriving))))
 
 
 class Rays(NamedTuple):

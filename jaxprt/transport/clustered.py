@@ -26,7 +26,7 @@ from jaxprt.sphere import haar
 from jaxprt.transport import blocks, separable
 from jaxprt.transport.direct import DirectTransport
 
-_SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
+SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
 _SAMPLE = 24  # vertices of a cluster that choose its coefficients
 
 
@@ -259,7 +259,7 @@ def compress(
         whole, after 0, 1, ... vectors, and after all vectors and 0, 1, ... modes.
     """
     size = haar.face_edge(seen.shape[1])
-    importance = jnp.tile(haar.area(size=size).ravel(), 6) ** _SPECTRUM
+    importance = jnp.tile(haar.area(size=size).ravel(), 6) ** SPECTRUM
 
     def transport(argument):
         visible, axes = argument

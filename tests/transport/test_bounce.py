@@ -7,7 +7,7 @@ import pytest
 from jaxprt.brdf import AshikhminShirley, Lambert, dynamic, paths, separable
 from jaxprt.brdf.models import CookTorrance
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, harmonics
 from jaxprt.transport import bounce, direct, harmonic, interreflection, visibility
 
@@ -108,13 +108,32 @@ def test_two_bounces_are_nearly_those_of_the_harmonic_system(mesh, seen, frame, 
     white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
     response = jnp.sum(bounce.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
     arriving = sum(arrived(response, frame, white, met[r], shining(3))[:, :, 0] * ALBEDO[r] for r in (0, 1))
-    again = bounce.respond_again(jnp.asarray(arriving), frame, white, size=SIZE)
+    again = bounce.respond_again(jnp.asarray(np.moveaxis(arriving, 0, -1)), frame, white)
     found = sum(arrived(again, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
     options = {"size": SIZE, "progress": False}
     one, two = (interreflection.interreflect_diffuse(mesh, plain, ALBEDO, bounces=n, **options) for n in (1, 2))
     exact = np.asarray(two.vector - one.vector)[0].T * np.sqrt(4 * np.pi)
     assert relative(found, exact) < 0.011
+
+
+def test_in_a_closed_furnace_light_falls_as_the_geometric_series():
+    """A hollow sphere, seen from inside: after n bounces of albedo .7 light is .7^n of what shone at first."""
+    ball = builtin.sphere(rings=16, sectors=24)
+    hollow = make_mesh(ball.position, ball.face[:, ::-1], normal=-ball.normal)
+    axes = directions.frame(hollow.normal, hollow.tangent)
+    occluder = visibility.Occluder(hollow)
+    start, inside = visibility.start_points(hollow, occluder), np.zeros(len(axes), int)
+    (rays,) = bounce.rays(occluder, start, np.asarray(hollow.normal), np.asarray(axes), inside, size=SIZE).values()
+    grey = separable.factor(Lambert(0.7), terms=1, resolution=8)
+    basis, weight = paths.basis(grey), float(paths.fixed_weights(grey)[0, 0])
+    arriving = np.zeros((16, 1, len(axes)), np.float32)
+    arriving[0] = np.sqrt(4 * np.pi)
+    for number in (1, 2, 3):
+        response = bounce.respond_again(jnp.asarray(arriving), axes, basis)
+        irradiance = weight * arrived(response, axes, basis, rays, flux(hollow))[:, 0, 0, 0]
+        np.testing.assert_allclose(irradiance, 0.7**number, rtol=0.01)
+        arriving = weight * arrived(response, axes, basis, rays, shining(3)).transpose(1, 2, 3, 0)[:, 0]
 
 
 def test_functions_of_a_set_make_its_brdfs():
@@ -124,7 +143,7 @@ def test_functions_of_a_set_make_its_brdfs():
     random = np.random.default_rng(0).normal(size=(2, 50, 3))
     random[..., 2] = np.abs(random[..., 2]) + 0.2
     wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.float32)
-    value = paths.basis(table)(wi, wo) @ paths.weights(table, share, diffuse, specular)
+    value = paths.basis(table)(wi, wo) @ paths.weights(table.factor, share, diffuse, specular)
     np.testing.assert_allclose(value, table.at(share)(wi, wo) * specular + diffuse / np.pi, rtol=1e-5, atol=1e-6)
 
 

@@ -1,16 +1,20 @@
-"""Transfer tensors: what is decomposed is what arrives, linear in the light and in the weights of all functions."""
+"""Transfer tensors: what is decomposed is what arrives, after one bounce and two."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, Lambert, paths, separable
-from jaxprt.scene import builtin
-from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.sphere import cubemap, harmonics
-from jaxprt.transport import harmonic, interreflection, transfer
+from jaxprt.brdf import AshikhminShirley, Lambert, dynamic, paths, separable
+from jaxprt.brdf.models import CookTorrance
+from jaxprt.relight import transfer as relight
+from jaxprt.relight.transfer import LitTransfer
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join, make_mesh
+from jaxprt.sphere import cubemap, directions, haar, harmonics
+from jaxprt.transport import bounce, direct, harmonic, interreflection, transfer, visibility
 
 EDGE, SIZE = 4, 16
+ALL = 10**6
 
 
 @pytest.fixture(scope="module")
@@ -20,87 +24,241 @@ def mesh():
 
 
 @pytest.fixture(scope="module")
-def bases():
-    glossy = separable.factor(AshikhminShirley(diffuse=0.3, specular=0.5, nu=6, nv=6), terms=4, resolution=12)
-    return [paths.basis(glossy), paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))]
+def brdfs():
+    """Colors that need two functions, and one."""
+    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.5, nu=6, nv=6), terms=4)
+    return [glossy, separable.factor(Lambert([0.9, 0.3, 0.1]), terms=1, resolution=8)]
 
 
 @pytest.fixture(scope="module")
-def whole(mesh, bases):
+def whole(mesh, brdfs):
     """Nothing left out but by half precision."""
-    return transfer.precompute(mesh, bases, components=10**6, modes=10**6, edge=EDGE, size=SIZE, progress=False)
+    return transfer.precompute(mesh, brdfs, components=ALL, modes=ALL, edge=EDGE, size=SIZE, progress=False)
+
+
+def light(seed, edge=EDGE):
+    """Random texels, constant over the texels of two bounces."""
+    value = np.random.default_rng(seed).uniform(size=(6, 2, 1, 2, 1, 3))
+    return Environment(jnp.asarray(np.broadcast_to(value, (6, 2, edge // 2, 2, edge // 2, 3)), jnp.float32).reshape(
+        6, edge, edge, 3
+    ))  # fmt: skip
+
+
+def arriving(tensor, environment, weight=None):
+    """SH coefficients of one bounce, and radiance of two, [v s c] and [v c]."""
+    lit = relight.light_side(tensor, environment)
+    weight = relight.weights(tensor, [None] * len(tensor.factor)) if weight is None else weight
+    both, one = (np.asarray(relight.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
+    return one.transpose(2, 0, 1), (both - one)[0].T / np.sqrt(4 * np.pi)
 
 
 def relative(value, exact):
     return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
 
 
-def test_what_arrives_under_constant_light_is_the_harmonic_systems_bounce(mesh):
-    """Irradiance of the harmonics that arrive: all but what lies beyond degree three."""
-    white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+def test_bounces_under_constant_light_are_those_of_the_harmonic_system(mesh):
+    """Irradiance: all but what harmonics beyond degree three bring, of what arrives first."""
     albedo = np.array([[0.9, 0.5, 0.2], [0.3, 0.6, 0.8]], np.float32)
-    tensor = transfer.precompute(mesh, [white, white], components=10**6, modes=10**6, edge=EDGE, progress=False)
+    fixed = [separable.factor(Lambert(each), terms=1, resolution=8) for each in albedo]
+    tensor = transfer.precompute(mesh, fixed, components=ALL, modes=ALL, edge=EDGE, progress=False)
     assert tensor.error.max() < 1e-3
-    light = jnp.ones((6 * EDGE**2, 3))
-    arriving = tensor.arriving(light, jnp.asarray(albedo))
+    once, twice = arriving(tensor, Environment(jnp.ones((6, EDGE, EDGE, 3))))
     cosine = np.pi * np.array([1, 2 / 3, 1 / 4, 0])[[0, *[1] * 3, *[2] * 5, *[3] * 7]]
     at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
-    found = np.einsum("vs,vsc->vc", at, arriving)
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
-    once = interreflection.interreflect_diffuse(mesh, plain, albedo, bounces=1, size=SIZE, progress=False)
-    exact = np.asarray(once.vector - plain.vector)[0].T * np.sqrt(4 * np.pi)
-    assert relative(found, exact) < 0.014
+    options = {"size": SIZE, "progress": False}
+    one, two = (interreflection.interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
+    exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
+    assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
+    assert relative(twice, exact[1]) < 0.011
+    bright = albedo.max(1, keepdims=True)
+    one, two = (interreflection.interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
+    brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
+    np.testing.assert_allclose(tensor.worth, np.sqrt(np.mean(np.square(brought), (1, 2))), rtol=0.02)
 
 
-def test_linear_in_the_light_and_in_the_weights(whole):
+def test_two_bounces_are_a_loop_over_rays_of_rays(brdfs):
+    """From one texel, by glossy and diffuse surfaces, without harmonics between: these leave some percent."""
+    ball = builtin.sphere(rings=5, sectors=6)
+    mesh = join([ball, ground_plane(ball, vertices=25)])
+    whole = transfer.precompute(mesh, brdfs, components=ALL, modes=ALL, edge=EDGE, size=SIZE, progress=False)
+    visible = direct.precompute(mesh, size=SIZE, progress=False)
+    seen = visible.seen(np.arange(len(mesh.position)))
+    frame = np.asarray(directions.frame(mesh.normal, mesh.tangent))
+    occluder = visibility.Occluder(mesh)
+    start, normal = visibility.start_points(mesh, occluder), np.asarray(mesh.normal)
+    region, way = np.asarray(mesh.region), np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
+    texel = 6  # Of 24, from the side of +y.
+    sent = np.asarray(cubemap.vector_area(size=SIZE)).reshape(6, 2, 8, 2, 8, 3)
+    inside = np.zeros((6, 2, 2), bool)
+    inside.reshape(-1)[texel] = True
+    mask = np.broadcast_to(inside[:, :, None, :, None], (6, 2, 8, 2, 8)).reshape(-1)
+    area = sent.reshape(-1, 3)
+
+    def leaving(radiance, vertex, wo):
+        """What vertices [h 3] send along local wo of radiance [v d c] that arrives by texels."""
+        result = np.zeros((*wo.shape[:2], 3))
+        for number, brdf in enumerate(brdfs):
+            own = np.argwhere(region[vertex] == number)
+            for first in range(0, len(own), 512):
+                h, corner = own[first : first + 512].T
+                v = vertex[h, corner]
+                wi = np.einsum("vij,dj->vdi", frame[v], way)
+                flux = np.maximum(np.einsum("vj,dj->vd", frame[v, 2], area), 0)
+                out = np.broadcast_to(wo[h, corner][:, None], wi.shape)
+                value = np.asarray(brdf(jnp.asarray(wi, jnp.float32), jnp.asarray(out, jnp.float32)))
+                result[h, corner] = np.einsum("vdc,vdc,vd->vc", value, radiance[v], flux)
+        return result
+
+    def gather(radiance):
+        """Radiance [v d c] that arrives after one more reflection."""
+        point, through, corner, share, _ = bounce.hits(occluder, start, normal, size=SIZE)
+        front = bounce.front(occluder, normal, corner, way[through])
+        point, through, corner, share = (each[front] for each in (point, through, corner, share))
+        wo = np.einsum("hkij,hj->hki", frame[corner], -way[through])
+        wo[..., 2] = np.maximum(wo[..., 2], 1e-3)
+        wo /= np.linalg.norm(wo, axis=-1, keepdims=True)
+        result = np.zeros_like(radiance)
+        result[point, through] = np.einsum("hk,hkc->hc", share, leaving(radiance, corner, wo))
+        return result
+
+    once = gather(np.where(mask[:, None], np.asarray(seen)[..., None] / 16 * np.ones(3), 0))
+    twice = np.einsum("vdc,vd->vc", gather(once), np.maximum(normal @ area.T, 0)) / np.pi
+    lamp = Environment(jnp.asarray(np.where(mask, 1.0, 0).reshape(6, SIZE, SIZE, 1), jnp.float32))
+    _, found = arriving(whole, lamp)
+    assert np.abs(twice).max() > 1e-3
+    assert relative(found, twice) < TWICE
+
+
+# What 16 harmonics leave of the first bounce, in the second.
+TWICE = 0.03
+
+
+def test_linear_in_the_light(whole):
+    first, second = light(0), light(1)
+    both = Environment(first.radiance + 2 * second.radiance)
+    for found, a, b in zip(*(arriving(whole, each) for each in (both, first, second)), strict=True):
+        np.testing.assert_allclose(found, a + 2 * b, atol=2e-6)
+
+
+def test_one_bounce_is_linear_in_the_weights_and_two_are_quadratic(whole):
     random = np.random.default_rng(0)
-    light = jnp.asarray(random.uniform(size=(2, 6 * EDGE**2, 3)), jnp.float32)
-    weight = jnp.asarray(random.uniform(size=(2, 2, 3)), jnp.float32)
-    both = whole.arriving(light[0] + 2 * light[1], weight[0])
-    np.testing.assert_allclose(
-        both, whole.arriving(light[0], weight[0]) + 2 * whole.arriving(light[1], weight[0]), atol=1e-6
-    )
-    both = whole.arriving(light[0], weight[0] - weight[1])
-    np.testing.assert_allclose(
-        both, whole.arriving(light[0], weight[0]) - whole.arriving(light[0], weight[1]), atol=1e-6
-    )
+    a, b = (jnp.asarray(random.uniform(size=(3, 3)), jnp.float32) for _ in range(2))
+    found = {name: arriving(whole, light(2), x) for name, x in {"a": a, "b": b, "+": a + b, "-": a - b}.items()}
+    np.testing.assert_allclose(found["+"][0], found["a"][0] + found["b"][0], atol=1e-6)
+    parallelogram = found["+"][1] + found["-"][1]
+    np.testing.assert_allclose(parallelogram, 2 * (found["a"][1] + found["b"][1]), atol=1e-6)
+    np.testing.assert_allclose(arriving(whole, light(2), 3 * a)[1], 9 * found["a"][1], rtol=1e-4, atol=1e-6)
 
 
-def test_fewer_components_and_modes_err_as_they_say(mesh, bases, whole):
-    cut = transfer.precompute(mesh, bases, components=20, modes=24, edge=EDGE, size=SIZE, progress=False)
+def test_diffuse_surfaces_exchange_light_reciprocally():
+    """Two parallel squares of unlike size: area times form factor is the same both ways."""
+    small, large = builtin.plane(cells=8), builtin.plane(cells=16)
+    up = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    down = up * [[1], [-1], [-1]]
+    scale = (0.5, 1.0)
+    parts = []
+    for each, size, axes, height in zip((small, large), scale, (down, up), (0.6, 0.0), strict=True):
+        position = np.asarray(each.position) * size @ axes.T + [0, height, 0]
+        parts.append((position.astype(np.float32), np.asarray(each.face), np.asarray(each.normal) @ axes.T, size))
+    scene = join([make_mesh(p, f, normal=n.astype(np.float32)) for p, f, n, _ in parts])
+    frame = directions.frame(scene.normal, scene.tangent)
+    white = paths.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+    occluder = visibility.Occluder(scene)
+    start = visibility.start_points(scene, occluder)
+    size = 32
+    found = bounce.rays(
+        occluder, start, np.asarray(scene.normal), np.asarray(frame), np.asarray(scene.region), size=size
+    )
+    way, area = (np.asarray(x(size=size)).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
+    flux = np.maximum(np.asarray(scene.normal) @ area.T, 0) / np.pi
+    weight = float(paths.fixed_weights(separable.factor(Lambert(1.0), terms=1, resolution=8))[0, 0])
+    received = []
+    for number, (_, _, _, edge) in enumerate(parts):
+        shining = np.zeros((len(start), 1, 1), np.float32) + np.float32(np.pi) / np.float32(
+            np.asarray(white.light_map).mean()
+        )
+        rays = found[1 - number]
+        each = flux[rays.owner[:, None], rays.texel][..., None]
+        fixed = (rays.owner, rays.corner, rays.weight, way[rays.texel], each)
+        arrived = np.asarray(bounce.arrive(jnp.asarray(shining), frame, white, *fixed, points=len(start)))
+        own = np.asarray(scene.region) == number
+        cells = round(np.sqrt(own.sum()))
+        line = np.ones(cells)
+        line[[0, -1]] = 0.5  # the trapezoidal rule
+        mean = np.average(arrived[own, 0, 0, 0], weights=np.outer(line, line).ravel()) * weight
+        received.append((2 * edge) ** 2 * mean)
+    assert received[0] > 0.1
+    np.testing.assert_allclose(received[0], received[1], rtol=0.02)
+
+
+def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
+    options = {"edge": EDGE, "size": SIZE, "progress": False}
+    cut = transfer.precompute(mesh, brdfs, components=20, modes=24, bounces=1, **options)
     assert cut.nbytes < whole.nbytes / 10
+    assert cut.second is None
     wrong = total = 0.0
-    for texel in range(6 * EDGE**2):
-        light = jnp.zeros((6 * EDGE**2, 1)).at[texel].set(1.0)
-        for function in range(2):
-            weight = jnp.zeros((2, 1)).at[function].set(1.0)
-            exact, found = (np.asarray(each.arriving(light, weight)) for each in (whole, cut))
+    spectrum = jnp.tile(haar.area(size=EDGE).ravel(), 6) ** 0.4
+    for wavelet in range(6 * EDGE**2):
+        faces = jnp.zeros((6 * EDGE**2, 1)).at[wavelet].set(spectrum[wavelet]).reshape(6, EDGE, EDGE, 1)
+        lamp = Environment(haar.inverse(faces))
+        for function in range(3):
+            weight = jnp.zeros((3, 1)).at[function].set(1.0)
+            exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
             wrong, total = wrong + np.sum((found - exact) ** 2), total + np.sum(exact**2)
     assert float(cut.error[0]) > 0.01
     np.testing.assert_allclose(np.sqrt(wrong / total), float(cut.error[0]), rtol=1e-3)
+    shorter = whole.keep(20, modes=24)
+    np.testing.assert_allclose(shorter.error, cut.error, rtol=0.02)
+    exact, short, found = (arriving(each, light(3))[0] for each in (whole, shorter, cut))
+    np.testing.assert_allclose(relative(short, exact), relative(found, exact), rtol=0.05)
+    with pytest.raises(ValueError, match=r"at most \(136, 96\), got 0, 3"):
+        whole.keep(0, modes=3)
+
+
+def test_what_brings_little_is_left_out_and_told(mesh, capsys):
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
+    changing = dynamic.factor(members, None, ranks=(2, 6, 6), resolution=12)
+    dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
+    options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
+    every = transfer.precompute(mesh, [changing, dark], progress=False, **options)
+    few = transfer.precompute(mesh, [changing, dark], least=0.05, **options)
+    assert len(every.function) == 4
+    assert every.second is not None
+    assert few.second is None
+    assert len(few.function) < 4
+    assert few.nbytes < every.nbytes
+    told = capsys.readouterr()
+    assert "left out the second bounce" in told.out + told.err
+    assert f"of {len(every.function)} functions" in told.out + told.err
+    np.testing.assert_allclose(few.worth[0], every.worth[0], rtol=1e-5)
+    assert few.worth[1] < 0.05
 
 
 def test_a_coarse_light_has_the_flux_of_the_light():
-    light = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
-    small = transfer.coarse(light, edge=4)
-    fine, rough = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (16, 4))
-    np.testing.assert_allclose(np.sum(small * rough, 0), np.sum(light.reshape(-1, 3) * fine, 0), rtol=1e-5)
+    fine = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
+    small = relight.coarse(fine, edge=4)
+    wide, narrow = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (4, 16))
+    np.testing.assert_allclose(np.sum(small * wide, 0), np.sum(fine.reshape(-1, 3) * narrow, 0), rtol=1e-5)
     with pytest.raises(ValueError, match="must divide the light's 16, got 5"):
-        transfer.coarse(light, edge=5)
+        relight.coarse(fine, edge=5)
 
 
-def test_a_stopped_precomputation_goes_on(mesh, bases, tmp_path):
+def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
     options = {"components": 8, "modes": 8, "edge": 2, "size": 8, "progress": False, "path": tmp_path / "bounce"}
-    first, again = (transfer.precompute(mesh, bases, **options) for _ in range(2))
+    first, again = (transfer.precompute(mesh, brdfs, **options) for _ in range(2))
     np.testing.assert_array_equal(first.core, again.core)
+    np.testing.assert_array_equal(first.second.core, again.second.core)
     with pytest.raises(ValueError, match="something else"):
-        transfer.precompute(mesh, bases[::-1], **options)
+        transfer.precompute(mesh, brdfs[::-1], **options)
 
 
-def test_regions_without_functions_are_refused(mesh, bases):
+def test_what_makes_no_tensor_is_refused(mesh, brdfs):
     with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
-        transfer.precompute(mesh, bases[:1], progress=False)
+        transfer.precompute(mesh, brdfs[:1], progress=False)
     with pytest.raises(ValueError, match="a power of two, got 0, 64, 8 and 16"):
-        transfer.precompute(mesh, bases, components=0, progress=False)
+        transfer.precompute(mesh, brdfs, components=0, progress=False)
     with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
-        transfer.precompute(mesh, bases, edge=6, progress=False)
+        transfer.precompute(mesh, brdfs, edge=6, progress=False)
+    with pytest.raises(ValueError, match="bounces must be 1 or 2, got 3"):
+        transfer.precompute(mesh, brdfs, bounces=3, progress=False)

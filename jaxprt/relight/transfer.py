@@ -1,0 +1,302 @@
+"""Relighting with light that has been reflected once and twice, while light, view and materials are free.
+
+    B(x, wo) = sum_s E_x(s, wo) sum_l L(l) sum_q H(q) T1_x(l, q, s) + E_x(0, wo) sqrt(4 pi) I2_x
+
+A change of light redoes `light_side`, one of materials `arriving` and what follows, one of the view only `view_side`;
+`combine` makes radiance. What lobes of a BRDF and its other terms make of harmonics is exact: von Mises-Fisher lobes
+are zonal, so that a lobe's width is a factor for each band.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial, reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import paths
+from jaxprt.brdf.dynamic import DynamicBrdf
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.linalg import mixture
+from jaxprt.relight import dynamic
+from jaxprt.relight.dynamic import DynamicView, Material
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import cubemap, directions, harmonics, rotation
+from jaxprt.transport.dynamic import DynamicTransport
+from jaxprt.transport.transfer import TransferTensor
+
+_DEGREE = 3  # of the harmonics that arrive
+
+
+class LitTransfer(eqx.Module):
+    """What bounces make of a light, for all materials.
+
+    Attributes:
+        first: Of each cluster: components, harmonics and functions.
+        second: Components, and functions of both bounces; None without a second bounce.
+    """
+
+    first: Float[Array, "g n s q c"]
+    second: Float[Array, "g o q q c"] | None
+
+
+class Arriving(eqx.Module):
+    """Reflected light that arrives at the rows of a region.
+
+    Attributes:
+        local: SH coefficients of its radiance, in the frame of each row.
+        irradiance: Its irradiance over pi: what a white diffuse surface sends on.
+    """
+
+    local: Float[Array, "s c q"]
+    irradiance: Float[Array, "c q"]
+
+
+class ReflectedView(eqx.Module):
+    """What a region sends to the eye of light that arrives.
+
+    Attributes:
+        coefficient: Of each harmonic in the frame of each row.
+        specular: What that is multiplied by.
+        diffuse: Of irradiance over pi.
+    """
+
+    coefficient: Float[Array, "s e q"]
+    specular: Float[Array, "d _"]
+    diffuse: Float[Array, "f q"]
+
+
+def radiance(
+    transport: DynamicTransport,
+    tensor: TransferTensor,
+    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    materials: Sequence[Material | None],
+    light: Environment,
+    *,
+    eye: Float[Array, "3"],
+    texels: int = 16,
+) -> Float[Array, "v c"]:
+    """Radiance that each vertex sends to the eye, of direct light and of light that other surfaces reflect.
+
+    Args:
+        transport: Precomputed transport of direct light.
+        tensor: Precomputed bounces, of the same mesh.
+        brdfs: Of each region, those that the transport was made for.
+        materials: Of each region, what it is made of at present; None where that does not change. Light that a textured
+            region sends to others has the texture's mean.
+        light: The environment.
+        eye: Position of the viewer in world units.
+        texels: How many of the brightest texels light the vertices directly one by one, exactly.
+
+    Returns:
+        Linear radiance per vertex in the light's units; slightly negative values occur at shadow boundaries.
+        Differentiable in the light, the eye and the materials.
+
+    Raises:
+        TypeError: The light is no Environment, or a material no Material.
+        ValueError: As of `jaxprt.relight.dynamic.radiance`; or the tensor is not of the transport's mesh or of sets as
+            large as these.
+
+    Reference: Sun et al. 2007, equations 3 and 4.
+    """
+    view = dynamic.view_side(transport, brdfs, materials, eye=eye)
+    direct = dynamic.combine(transport, dynamic.light_side(transport, light, texels=texels), view)
+    arrived = arriving(transport, tensor, light_side(tensor, light), materials)
+    return direct + combine(transport, arrived, view_side(transport, view))
+
+
+def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
+    """What changes with the light.
+
+    Raises:
+        TypeError: The light is no Environment.
+        ValueError: It is a batch, or its faces are no multiple of those of the tensor's light.
+    """
+    if not isinstance(light, Environment):
+        raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
+    return _lit(tensor, light.radiance)
+
+
+def arriving(
+    transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, materials: Sequence[Material | None]
+) -> tuple[Arriving, ...]:
+    """What arrives at the rows of each region under a light and with all materials; no view changes it.
+
+    Arguments and errors as of `radiance`.
+    """
+    weight = weights(tensor, materials)
+    if len(tensor.place) != len(transport.place):
+        raise ValueError(
+            f"the tensor must be of the transport's {len(transport.place)} vertices, got {len(tensor.place)}"
+        )
+    whole = collect(tensor, light, weight)
+    return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
+
+
+def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Float[Array, "q c"]:
+    """Weights of all functions that the tensor keeps, region after region.
+
+    Errors as of `radiance`.
+    """
+    if len(materials) != len(tensor.factor):
+        raise ValueError(f"there must be a material for each of {len(tensor.factor)} regions, got {len(materials)}")
+    rows = []
+    for number, (factor, material) in enumerate(zip(tensor.factor, materials, strict=True)):
+        if (factor.ndim == 3) != (material is not None):
+            needs = "needs a material" if factor.ndim == 3 else "has one BRDF for good: give None"
+            raise ValueError(f"region {number} {needs}")
+        if material is None:
+            rows.append(factor)
+            continue
+        if material.share.shape != factor.shape[:1]:
+            raise ValueError(
+                f"the shares of region {number} must be one for each of the tensor's {len(factor)} BRDFs, got "
+                f"{list(material.share.shape)}"
+            )
+        diffuse, specular = (_mean(each, tensor.region == number) for each in (material.diffuse, material.specular))
+        rows.append(paths.weights(factor, material.share, diffuse, specular))
+    colors = max(each.shape[1] for each in rows)
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
+
+
+@jax.jit
+def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"]) -> Float[Array, "s c v"]:
+    """SH coefficients, in world directions, of the radiance that arrives at each vertex.
+
+    Args:
+        tensor: The bounces.
+        light: From `light_side`.
+        weight: From `weights`.
+    """
+    colors = max(light.first.shape[-1], weight.shape[1])
+    weight = jnp.broadcast_to(weight, (len(weight), colors))
+    met = jnp.einsum("gnsqc,qc->gscn", light.first, weight)
+    rows = jnp.einsum("gscn,gmn->scgm", met, tensor.weight)
+    if light.second is not None and tensor.second is not None:
+        twice = jnp.einsum("goqpc,qc,pc->gco", light.second, weight, weight)
+        more = jnp.einsum("gco,gmo->cgm", twice, tensor.second.weight)
+        rows = rows.at[0].add(more * np.sqrt(4 * np.pi))  # of a function that is one everywhere
+    return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
+
+
+def view_side(transport: DynamicTransport, view: DynamicView) -> tuple[ReflectedView, ...]:
+    """What changes with the view and the materials.
+
+    Args:
+        transport: As of `radiance`.
+        view: From `jaxprt.relight.dynamic.view_side`.
+    """
+    result = []
+    for own, each in zip(transport.region, view.region, strict=True):
+        position, frame = own.seen.position, own.seen.frame
+        if isinstance(each.brdf, SeparableBrdf):
+            one = jnp.ones((1, 1), position.dtype)
+            result.append(ReflectedView(_by_terms(each.brdf, position, frame, view.eye), one, 0 * position[:, :1].T))
+            continue
+        assert each.diffuse is not None
+        assert each.specular is not None
+        coefficient, base = _by_lobes(each.brdf.lobe, position, frame, view.eye)
+        if each.brdf.terms.terms:
+            coefficient = coefficient + _by_terms(each.brdf.terms, position, frame, view.eye)
+        specular = each.specular.T
+        result.append(ReflectedView(coefficient, specular, each.diffuse.T + base * specular))
+    return tuple(result)
+
+
+@jax.jit
+def combine(
+    transport: DynamicTransport, arriving: tuple[Arriving, ...], view: tuple[ReflectedView, ...]
+) -> Float[Array, "v c"]:
+    """Radiance of reflected light alone.
+
+    Args:
+        transport: The transport of both.
+        arriving: From `arriving`.
+        view: From `view_side`.
+    """
+    rows = []
+    for light, seen in zip(arriving, view, strict=True):
+        glossy = reduce(jnp.add, (a * b for a, b in zip(light.local, seen.coefficient, strict=True)))
+        rows.append(glossy * seen.specular + light.irradiance * seen.diffuse)
+    colors = max(len(each) for each in rows)
+    whole = jnp.concatenate([jnp.broadcast_to(each, (colors, each.shape[1])) for each in rows], 1)
+    return whole[:, transport.place].T
+
+
+@partial(jax.jit, static_argnames=("edge",))
+def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
+    """Mean radiance of the texels of coarser faces.
+
+    Raises:
+        ValueError: The coarse faces' edge does not divide the light's.
+    """
+    size = radiance.shape[1]
+    if edge < 1 or size % edge:
+        raise ValueError(f"the edge of coarse faces must divide the light's {size}, got {edge}")
+    fold = size // edge
+    area = cubemap.solid_angle(size=size)[..., None]
+    value, whole = (x.reshape(6, edge, fold, edge, fold, -1).sum((2, 4)) for x in (radiance * area, area))
+    return (value / whole).reshape(6 * edge * edge, -1)
+
+
+@jax.jit
+def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
+    light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
+    clusters, modes, *shape = tensor.core.shape
+    met = jnp.einsum("gle,lc->gce", tensor.mode, light)
+
+    def one(argument):
+        light, core = argument
+        return light @ core.reshape(modes, -1).astype(light.dtype)
+
+    first = jnp.moveaxis(jax.lax.map(one, (met, tensor.core)).reshape(clusters, -1, *shape), 1, -1)
+    if tensor.second is None:
+        return LitTransfer(first, None)
+    again = coarse(radiance, edge=math.isqrt(tensor.second.core.shape[2] // 6))
+    return LitTransfer(first, jnp.einsum("golqp,lc->goqpc", tensor.second.core.astype(light.dtype), again))
+
+
+@jax.jit
+def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arriving:
+    local = rotation.rotate_each(whole[..., vertex], frame)
+    cosine = harmonics.cosine(degree=_DEGREE) / np.pi
+    # Of a function that is the same around the normal only m = 0 counts: l (l + 1) is its row.
+    parts = (local[l * (l + 1)] * (cosine[l] * np.sqrt((2 * l + 1) / (4 * np.pi))) for l in range(_DEGREE))
+    return Arriving(local, reduce(jnp.add, parts))
+
+
+@jax.jit
+def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, Array]:
+    """Coefficients of the lobes of each row, and albedo of their diffuse part."""
+    if lobe is None:
+        return jnp.zeros(((_DEGREE + 1) ** 2, 1, len(position)), position.dtype), jnp.zeros_like(position[:, :1].T)
+    each = lobe.lookup(_view(position, frame, eye))
+    band = mixture.bands(each.concentration, degree=_DEGREE)
+    basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=_DEGREE), -1, 0)
+    degree = np.floor(np.sqrt(np.arange(len(basis)))).astype(int)
+    wide = [y * band[l] for y, l in zip(basis, degree.tolist(), strict=True)]
+    return jnp.stack([jnp.sum(each.weight * y, 1) for y in wide]), each.diffuse
+
+
+@jax.jit
+def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
+    """Coefficients of a factored BRDF at each row."""
+    view = brdf.view(_view(position, frame, eye))
+    return jnp.einsum("sk,qke->seq", paths.project(brdf, degree=_DEGREE), view)
+
+
+def _view(position: Array, frame: Array, eye: Array) -> Array:
+    return directions.normalize(jnp.einsum("qij,qj->qi", frame, eye - position))
+
+
+def _mean(value: Array, inside: Array) -> Array:
+    """Mean of a texture over a region's vertices."""
+    if value.ndim == 1:
+        return value
+    share = inside.astype(value.dtype)
+    return share @ value / jnp.maximum(jnp.sum(share), 1)

@@ -1,0 +1,204 @@
+"""Radiance of light that has been reflected: what BRDFs make of what arrives, and all of it in a white world."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import CookTorrance, Lambert, dynamic, separable
+from jaxprt.relight import dynamic as direct
+from jaxprt.relight import transfer as relight
+from jaxprt.relight.dynamic import Material
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.sphere import directions, harmonics, hemisphere
+from jaxprt.transport import dynamic as transports
+from jaxprt.transport import harmonic, interreflection, transfer
+
+SIZE = 16
+EYE = jnp.array([1.0, 2.5, 3.0])
+MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.3, 0.5)]
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    ball = builtin.sphere(rings=8, sectors=10)
+    return join([ball, ground_plane(ball, vertices=64)])
+
+
+@pytest.fixture(scope="module")
+def brdfs():
+    """A set with lobes, and one BRDF for good."""
+    glossy = dynamic.factor(MEMBERS, dynamic.separate(MEMBERS, lobes=2))
+    return [glossy, separable.factor(Lambert([0.6, 0.4, 0.2]), terms=1, resolution=8)]
+
+
+@pytest.fixture(scope="module")
+def transport(mesh, brdfs):
+    return transports.precompute(mesh, brdfs, size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def tensor(mesh, brdfs):
+    along = dynamic.factor(MEMBERS, None, ranks=(2, 8, 8), resolution=12)
+    options = {"components": 10**6, "modes": 10**6, "edge": 4, "size": 8, "progress": False}
+    return transfer.precompute(mesh, [along, brdfs[1]], **options)
+
+
+def material(diffuse=0.4, specular=0.6):
+    return Material(*(jnp.asarray(each, jnp.float32) for each in ([0.3, 0.7], diffuse, specular)))
+
+
+def light(seed=0):
+    value = np.random.default_rng(seed).uniform(size=(6, SIZE, SIZE, 3))
+    return Environment(jnp.asarray(value, jnp.float32))
+
+
+def relative(value, exact):
+    return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
+
+
+def test_what_lobes_send_of_harmonics_is_their_integral(transport, brdfs, tensor):
+    """Free lobes of a mixed material over their whole sphere, the diffuse part over the hemisphere."""
+    view = direct.view_side(transport, brdfs, [material(0.4, [0.6, 0.5, 0.3]), None], eye=EYE)
+    seen = relight.view_side(transport, view)[0]
+    own = transport.region[0]
+    random = np.random.default_rng(1).normal(size=(16, 3)).astype(np.float32)
+    arriving = relight.Arriving(
+        jnp.broadcast_to(jnp.asarray(random)[..., None], (16, 3, len(own.vertex))),
+        jnp.full((3, len(own.vertex)), 0.7),
+    )
+    found = np.sum(arriving.local * seen.coefficient, 0) * seen.specular + arriving.irradiance * seen.diffuse
+    table = view.region[0].brdf.lobe
+    wo = directions.normalize(jnp.einsum("qij,qj->qi", own.seen.frame, EYE - own.seen.position))
+    facing = np.flatnonzero(np.asarray(wo[:, 2]) > 0.2)[::9]
+    nodes, area = hemisphere.arcs(jnp.array([0.0, 0.0, 1.0]), rings=96, sectors=192)
+    both = jnp.concatenate([nodes, nodes * jnp.array([1.0, 1.0, -1.0])])
+    radiance = harmonics.evaluate(both, degree=3) @ random
+    for row in facing:
+        lobes = table.lookup(wo[row][None])
+        means = lobes.mean[..., 0].T
+        density = [
+            mass * k / (2 * np.pi * -np.expm1(-2 * k)) * np.exp(k * (both @ mean - 1))
+            for mass, k, mean in zip(lobes.weight[0, :, 0], lobes.concentration[:, 0], means, strict=True)
+        ]
+        glossy = (np.sum(density, 0) * np.tile(area, 2)) @ radiance
+        exact = (glossy + 0.7 * lobes.diffuse[0, 0]) * np.array([0.6, 0.5, 0.3]) + 0.4 * 0.7
+        np.testing.assert_allclose(found[:, row], exact, rtol=2e-4, atol=2e-5)
+
+
+def test_what_a_factored_brdf_sends_of_harmonics_is_its_integral(mesh):
+    glossy = separable.factor(CookTorrance(diffuse=0.3, specular=0.5, roughness=0.5, f0=0.3), terms=6, resolution=16)
+    transport = transports.precompute(mesh, [glossy, glossy], size=8, progress=False)
+    view = direct.view_side(transport, [glossy, glossy], [None, None], eye=EYE)
+    seen = relight.view_side(transport, view)[0]
+    own = transport.region[0]
+    wo = directions.normalize(jnp.einsum("qij,qj->qi", own.seen.frame, EYE - own.seen.position))
+    nodes, area = hemisphere.arcs(jnp.array([0.0, 0.0, 1.0]), rings=96, sectors=192)
+    basis = harmonics.evaluate(nodes, degree=3) * (nodes[:, 2] * area)[:, None]
+    for row in np.flatnonzero(np.asarray(wo[:, 2]) > 0.1)[::9]:
+        exact = basis.T @ glossy(nodes, jnp.broadcast_to(wo[row], nodes.shape))
+        assert relative(seen.coefficient[:, :, row], exact) < 3e-3  # The quadrature of bilinear maps.
+
+
+def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible(mesh):
+    """White surfaces under constant light: what two bounces leave of radiance one is little."""
+    white = separable.factor(Lambert(1.0), terms=1, resolution=8)
+    transport = transports.precompute(mesh, [white, white], size=SIZE, progress=False)
+    tensor = transfer.precompute(mesh, [white, white], edge=4, components=136, modes=96, progress=False)
+    ones = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+    eye = jnp.array([0.0, 50.0, 0.0])
+    facing = np.asarray(mesh.normal)[:, 1] > 0.1
+    arguments = ([white, white], [None, None], ones)
+    first = direct.radiance(transport, *arguments, eye=eye, texels=0)[facing, 0]
+    both = relight.radiance(transport, tensor, *arguments, eye=eye, texels=0)[facing, 0]
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
+    albedo = np.ones((2, 1), np.float32)
+    exact = interreflection.interreflect_diffuse(mesh, plain, albedo, bounces=2, size=SIZE, progress=False)
+    exact = np.asarray(exact.vector)[0, 0, facing] * np.sqrt(4 * np.pi)
+    without, left = 1 - np.asarray(first), 1 - np.asarray(both)
+    assert without.max() > 0.4
+    assert relative(both, exact) < 0.02
+    assert left.min() > -0.03  # Harmonics of the first bounce ring.
+    assert np.mean(left) < 0.4 * np.mean(without)
+
+
+def test_stages_make_the_radiance(transport, tensor, brdfs):
+    now, lamp = [material(), None], light()
+    view = direct.view_side(transport, brdfs, now, eye=EYE)
+    lit = relight.light_side(tensor, lamp)
+    arrived = relight.arriving(transport, tensor, lit, now)
+    color = direct.combine(transport, direct.light_side(transport, lamp), view)
+    color = color + relight.combine(transport, arrived, relight.view_side(transport, view))
+    whole = relight.radiance(transport, tensor, brdfs, now, lamp, eye=EYE)
+    np.testing.assert_allclose(color, whole, rtol=1e-6, atol=1e-7)
+
+
+def test_reflected_light_has_the_color_of_what_it_met(transport, tensor, brdfs):
+    """A red ball reddens the ground beside it, and does not redden what is direct."""
+    gray = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+    red, blue = (material(each, 0.0) for each in ([0.9, 0.1, 0.1], [0.1, 0.1, 0.9]))
+    near = np.argmin(np.linalg.norm(np.asarray(transport.region[1].seen.position) - [0, -1, 1.1], axis=1))
+    vertex = int(transport.region[1].vertex[near])
+    color = [
+        np.asarray(relight.radiance(transport, tensor, brdfs, [each, None], gray, eye=EYE)[vertex]) / [0.6, 0.4, 0.2]
+        for each in (red, blue)
+    ]
+    plain = direct.radiance(transport, brdfs, [red, None], gray, eye=EYE)[vertex] / jnp.array([0.6, 0.4, 0.2])
+    np.testing.assert_allclose(plain, plain[0], rtol=1e-3)
+    assert color[0][0] > 1.1 * color[0][2]
+    assert color[1][2] > 1.1 * color[1][0]
+    np.testing.assert_allclose(color[0][1], color[1][1], rtol=0.05)  # They differ by the other colors' rounding alone.
+
+
+def test_a_texture_sends_its_mean_to_others(transport, tensor, brdfs, mesh):
+    region = np.asarray(mesh.region) == 0
+    texture = np.where(np.arange(len(region)) % 2, 0.8, 0.2)[:, None].astype(np.float32)
+    mean = texture[region].mean(0)
+    lit = relight.light_side(tensor, light())
+    found, plain = (
+        relight.arriving(transport, tensor, lit, [material(each), None])[1].local for each in (texture, mean)
+    )
+    np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-6)
+
+
+def test_radiance_by_light_and_material_is_finite_differences(transport, tensor, brdfs):
+    lamp, direction = light(), light(1).radiance - 0.5
+
+    def mean(step, color, share):
+        lights = Environment(lamp.radiance + step * direction)
+        return jnp.mean(
+            relight.radiance(
+                transport, tensor, brdfs, [Material(share, color, 0.6), None], lights, eye=EYE, texels=0
+            )
+        )  # fmt: skip
+
+    at = (jnp.array(0.0), jnp.array([0.4, 0.3, 0.2]), jnp.array([0.3, 0.7]))
+    slope = jax.grad(mean, (0, 1, 2))(*at)
+    for number, step in ((0, jnp.array(0.05)), (1, jnp.array([0.02, 0.0, 0.01]))):
+        moved = [tuple(x + sign * step if i == number else x for i, x in enumerate(at)) for sign in (1, -1)]
+        change = (mean(*moved[0]) - mean(*moved[1])) / 2
+        np.testing.assert_allclose(jnp.vdot(slope[number], step), change, rtol=5e-3)
+    assert np.isfinite(slope[2]).all()
+
+
+def test_what_does_not_fit_is_refused(transport, tensor, brdfs, unchecked):
+    now, lamp = [material(), None], light()
+    with pytest.raises(ValueError, match="a material for each of 2 regions, got 1"):
+        relight.weights(tensor, now[:1])
+    with pytest.raises(ValueError, match="region 0 needs a material"):
+        relight.weights(tensor, [None, None])
+    with pytest.raises(ValueError, match="region 1 has one BRDF for good"):
+        relight.weights(tensor, [material(), material()])
+    with pytest.raises(ValueError, match=r"one for each of the tensor's 2 BRDFs, got \[3\]"):
+        relight.weights(tensor, [Material(jnp.array([0.2, 0.3, 0.5]), 0.4, 0.6), None])
+    with pytest.raises(TypeError, match="must be an Environment, got int"):
+        relight.light_side(tensor, 3)
+    with pytest.raises(ValueError, match="must be one environment"):
+        relight.light_side(tensor, Environment(lamp.radiance[None]))
+    with pytest.raises(ValueError, match="must divide the light's 18, got 4"):
+        relight.light_side(tensor, Environment(jnp.ones((6, 18, 18, 3))))
+    other = eqx.tree_at(lambda x: x.place, tensor, tensor.place[:-1])
+    with pytest.raises(ValueError, match="of the transport's 136 vertices, got 135"):
+        relight.arriving(transport, other, relight.light_side(tensor, lamp), now)
