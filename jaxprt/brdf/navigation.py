@@ -158,15 +158,15 @@ def blinn_phong(*, exponents: Sequence[float] = range(1, 201)) -> Family:
     return _family(brdf, line, tuple(f"exponent {n:g}" for n in knot), _NO_MATERIAL)
 
 
-def cook_torrance(*, path: str | pathlib.Path | None = None) -> Family:
+def cook_torrance(*, path: str | pathlib.Path | None = None, point: Float[ArrayLike, "m 2"] | None = None) -> Family:
     """Cook-Torrance lobes over the plane of Fresnel reflectance F0 and roughness m.
 
     Triangles are straight in F0 and log m; published ones are so in m. Of the measured materials, each interpolated
     from the others, the relative rms error by cos_i cos_o is then 0.09 in the mean and 0.03 in the median, instead of
     0.4 and 0.07. A roughness below 0.001 counts as that.
 
-    Without a file, the set is a grid of 49: 16 values of m, geometric from 0.02, where lobes are few texels of
-    6 x 64 x 64 wide, to 1, for F0 of 0 and 1, and those between them for F0 of 0.3. Its error is 0.017 in the mean.
+    Without a file or points, the set is a grid of 49: 16 values of m, geometric from 0.02, where lobes are few texels
+    of 6 x 64 x 64 wide, to 1, for F0 of 0 and 1, and those between them for F0 of 0.3. Its error is 0.017 in the mean.
     The model is linear in F0, but the sides of triangles trade F0 against m: the error is 0.024 without the middle
     column, and as much if that has the same m as the others, so that triangles are halves of rectangles.
 
@@ -174,26 +174,32 @@ def cook_torrance(*, path: str | pathlib.Path | None = None) -> Family:
         path: A CSV file whose first row names the columns material, kd_r, kd_g, kd_b, ks_r, ks_g, ks_b, m and F0, as
             fitted by Ngan et al. to data without MERL's scale of colors, (1, 1.15, 1.66), by which kd and ks are
             multiplied here. Only m and F0 place a material in the plane.
+        point: Instead, F0 and m of each BRDF.
 
     Returns:
         The family, whose coordinate is (F0, m).
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is empty or no text, lacks columns, has cells that are no numbers or out of range, or
-            names a material twice; or there are fewer than three, two coincide, or all lie on one line.
+        ValueError: There are both a file and points; points are out of range; the file is empty or no text, lacks
+            columns, has cells that are no numbers or out of range, or names a material twice; or there are fewer than
+            three, two coincide, or all lie on one line.
 
     Reference: Ngan, Durand, Matusik 2005, "Experimental analysis of BRDF models", for the fits.
     """
+    if path is not None and point is not None:
+        raise ValueError("give either path or point, got both")
     if path is None:
-        place = _grid()
+        place = _grid() if point is None else np.asarray(point, float).reshape(-1, 2)
+        if not (np.isfinite(place).all() and np.all((place >= 0) & (place[:, :1] <= 1))):
+            raise ValueError(f"points must be F0 from 0 to 1 and m from 0, got {place.tolist()}")
         name, weight = tuple(f"F0 {f0:g}, m {m:.3g}" for f0, m in place), _NO_MATERIAL
     else:
         name, weight, place = _read(pathlib.Path(path))
     try:
         plane = triangulate(place, chart=_log_roughness, name=name)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise error if path is None else ValueError(f"{path}: {error}") from error
     brdf = tuple(models.CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=f0) for f0, m in place)
     return _family(brdf, plane, name, weight)
 
