@@ -35,12 +35,12 @@ class LitTransfer(eqx.Module):
     """What bounces make of a light, for all materials.
 
     Attributes:
-        first: Of each cluster: components, harmonics and functions.
+        first: Of each cluster and color: components, harmonics and functions.
         second: Components, and functions of both bounces; None without a second bounce.
     """
 
-    first: Float[Array, "g n s q c"]
-    second: Float[Array, "g o q q c"] | None
+    first: Float[Array, "g c n s q"]
+    second: Float[Array, "g c o q q"] | None
 
 
 class Arriving(eqx.Module):
@@ -173,12 +173,13 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
         light: From `light_side`.
         weight: From `weights`.
     """
-    colors = max(light.first.shape[-1], weight.shape[1])
+    colors = max(light.first.shape[1], weight.shape[1])
     weight = jnp.broadcast_to(weight, (len(weight), colors))
-    met = jnp.einsum("gnsqc,qc->gscn", light.first, weight)
+    light = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), colors, *x.shape[2:])), light)
+    met = jnp.einsum("gcnsq,qc->gscn", light.first, weight)
     rows = jnp.einsum("gscn,gmn->scgm", met, tensor.weight)
     if light.second is not None and tensor.second is not None:
-        twice = jnp.einsum("goqpc,qc,pc->gco", light.second, weight, weight)
+        twice = jnp.einsum("gcoqp,qc,pc->gco", light.second, weight, weight)
         more = jnp.einsum("gco,gmo->cgm", twice, tensor.second.weight)
         rows = rows.at[0].add(more * np.sqrt(4 * np.pi))  # of a function that is one everywhere
     return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
@@ -247,18 +248,22 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
 @jax.jit
 def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
     light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
-    clusters, modes, *shape = tensor.core.shape
-    met = jnp.einsum("gle,lc->gce", tensor.mode, light)
+    first = _met(jnp.einsum("gle,lc->gce", tensor.mode, light), tensor.core)
+    if tensor.second is None:
+        return LitTransfer(first, None)
+    again = coarse(radiance, edge=math.isqrt(tensor.second.core.shape[1] // 6)).T
+    return LitTransfer(first, _met(jnp.broadcast_to(again, (len(first), *again.shape)), tensor.second.core))
+
+
+def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Array, "g c *f"]:
+    """Cluster by cluster: all at once half precision would be converted in memory, at five times the cost."""
+    clusters, kinds, *shape = core.shape
 
     def one(argument):
         light, core = argument
-        return light @ core.reshape(modes, -1).astype(light.dtype)
+        return light @ core.reshape(kinds, math.prod(shape)).astype(light.dtype)
 
-    first = jnp.moveaxis(jax.lax.map(one, (met, tensor.core)).reshape(clusters, -1, *shape), 1, -1)
-    if tensor.second is None:
-        return LitTransfer(first, None)
-    again = coarse(radiance, edge=math.isqrt(tensor.second.core.shape[2] // 6))
-    return LitTransfer(first, jnp.einsum("golqp,lc->goqpc", tensor.second.core.astype(light.dtype), again))
+    return jax.lax.map(one, (light, core)).reshape(clusters, light.shape[1], *shape)
 
 
 @jax.jit
@@ -278,9 +283,11 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
     each = lobe.lookup(_view(position, frame, eye))
     band = mixture.bands(each.concentration, degree=_DEGREE)
     basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=_DEGREE), -1, 0)
-    degree = np.floor(np.sqrt(np.arange(len(basis)))).astype(int)
-    wide = [y * band[l] for y, l in zip(basis, degree.tolist(), strict=True)]
-    return jnp.stack([jnp.sum(each.weight * y, 1) for y in wide]), each.diffuse
+    # Written out lobe by lobe: a reduction over the middle axis costs XLA's CPU code ten times as much.
+    lobes = range(lobe.lobes)
+    strong = [[each.weight[:, i] * band[l, i] for i in lobes] for l in range(_DEGREE + 1)]
+    rows = [reduce(jnp.add, (strong[math.isqrt(s)][i] * basis[s, i] for i in lobes)) for s in range(len(basis))]
+    return jnp.stack(rows), each.diffuse
 
 
 @jax.jit

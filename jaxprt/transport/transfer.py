@@ -38,12 +38,12 @@ class SecondBounce(eqx.Module):
 
     Attributes:
         weight: Of the components of its cluster, for each row.
-        core: Of each cluster: components, texels of the light, functions of the first and of the second bounce.
+        core: Of each cluster: texels of the light, components, functions of the first and of the second bounce.
         error: Relative L2 error of each cluster's tensor that the components make.
     """
 
     weight: Float[Array, "g m o"]
-    core: Float16[Array, "g o l q q"]
+    core: Float16[Array, "g l o q q"]
     error: Float[Array, " g"]
 
 
@@ -96,7 +96,7 @@ class TransferTensor(eqx.Module):
         whole = whole / jnp.maximum(1 - self.error**2, jnp.finfo(size.dtype).eps)
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
         second = self.second and SecondBounce(
-            self.second.weight[..., :components], self.second.core[:, :components], jnp.full_like(error, jnp.nan)
+            self.second.weight[..., :components], self.second.core[:, :, :components], jnp.full_like(error, jnp.nan)
         )
         same = (self.place, self.region, self.function, self.factor, second)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)

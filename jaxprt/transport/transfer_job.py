@@ -191,7 +191,7 @@ class AgainJob(_PathJob):
         light = self.response[0].shape[1] // functions
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
-            "core": Layout((1, self.components, light, functions, functions), 0, "float16"),
+            "core": Layout((1, light, self.components, functions, functions), 0, "float16"),
             "error": Layout((1,), 0, "float32"),
             "white": Layout((self.step,), 0, "float32"),
         }
@@ -257,12 +257,12 @@ def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Ar
     core = tucker.multiply(tensor, vertex, mode=0)
     left = jnp.maximum(whole - jnp.vdot(core, core), 0)
     weight, core = _scaled(vertex, core)
-    return weight, core, jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
+    return weight, core.swapaxes(0, 1), jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
 
 
 def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
     """Weights with the sizes of the core, and the core in half precision with largest entries of 1."""
-    size = jnp.max(jnp.abs(core), tuple(range(1, core.ndim)))
+    size = jnp.max(jnp.abs(core), tuple(range(1, core.ndim)), initial=0)  # There may be no functions.
     size = jnp.where(size > 0, size, 1)
     return vertex * size, (core / size.reshape(-1, *[1] * (core.ndim - 1))).astype(jnp.float16)
 
