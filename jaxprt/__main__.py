@@ -16,10 +16,11 @@ import jax
 import numpy as np
 
 import jaxprt as prt
-from jaxprt import report
+from jaxprt import animation, report
 from jaxprt.report import Part, Scene
 from jaxprt.scene import Environment
 
+SYSTEMS = ("separable", "harmonic", "lobe", "dynamic")
 # Turns that bring an axis of the file to +y.
 _UPRIGHT = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -31,6 +32,8 @@ _RANGES = (
     (("size", "terms", "keep", "table"), "at least 1", lambda x: x >= 1),
     (("order",), "from 1 to 15", lambda x: 1 <= x <= 15),
     (("lobes",), "from 1 to 64", lambda x: 1 <= x <= 64),
+    (("animate",), "at least 2", lambda x: x >= 2),
+    (("roughness", "f0"), "from 0 to 1", lambda x: 0 <= x <= 1),
     (("nu", "nv"), "positive and finite", lambda x: 0 < x < np.inf),
     (("diffuse", "specular"), "not negative and finite", lambda x: 0 <= x < np.inf),
     (("elevation",), "from -90 to 90 degrees", lambda x: abs(x) <= 90),
@@ -58,12 +61,31 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--mesh", type=Path, help="PLY, OBJ, STL, OFF, GLB or glTF; an embedded scene if not given")
     parser.add_argument("--up", choices=list(_UPRIGHT), default="y", help="axis of the file that points up (default y)")
     parser.add_argument("--environment", type=Path, nargs="+", metavar="FILE", help="EXR or HDR; embedded if not given")
-    parser.add_argument("--brdf", choices=["ashikhmin-shirley", "lambert"], default="ashikhmin-shirley")
+    parser.add_argument(
+        "--brdf", choices=["ashikhmin-shirley", "cook-torrance", "lambert"], help="default ashikhmin-shirley"
+    )
     parser.add_argument("--diffuse", type=float, nargs="+", default=[0.5], help="gray or three colors (default 0.5)")
     parser.add_argument("--specular", type=float, nargs="+", default=[0.75], help="gray or three colors (default 0.75)")
     parser.add_argument("--nu", type=float, default=10.0, help="exponent along the tangent (default 10)")
     parser.add_argument("--nv", type=float, default=100.0, help="exponent across it (default 100)")
-    parser.add_argument("--system", choices=["separable", "harmonic", "lobe"], nargs="+", help="one, or several")
+    parser.add_argument("--roughness", type=float, default=0.2, help="of Cook-Torrance's model (default 0.2)")
+    parser.add_argument("--f0", type=float, default=0.1, help="its reflectance at normal incidence (default 0.1)")
+    parser.add_argument(
+        "--material",
+        type=float,
+        nargs=5,
+        action="append",
+        default=[],
+        metavar=("REGION", "DIFFUSE", "SPECULAR", "ROUGHNESS", "F0"),
+        help="of one of the scene's regions, numbered from 0, Cook-Torrance's model; can change in the dynamic system",
+    )
+    parser.add_argument("--system", choices=SYSTEMS, nargs="+", help="one, or several")
+    parser.add_argument(
+        "--bounces", type=int, choices=[0, 1, 2], default=2, help="of light, in the dynamic system (default 2)"
+    )
+    parser.add_argument(
+        "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"
+    )
     parser.add_argument("--terms", type=int, default=4, help="terms of the factored BRDF (default 4)")
     parser.add_argument("--keep", type=int, default=96, help="wavelet coefficients per vertex and term (default 96)")
     parser.add_argument(
@@ -95,6 +117,14 @@ def _check(options: argparse.Namespace) -> None:
             wrong = [x for x in numbers if x is not None and not holds(x)]
             if wrong:
                 raise ValueError(f"--{name} must be {required}, got {wrong[0]:g}")
+    for region, *numbers in options.material:
+        if not (all(0 <= x <= 1 for x in numbers) and region >= 0 and region == int(region)):
+            raise ValueError(
+                "--material must be the number of a region and four numbers from 0 to 1, got "
+                f"{' '.join(f'{x:g}' for x in (region, *numbers))}"
+            )
+    if options.animate and "dynamic" not in (options.system or ()):
+        raise ValueError("--animate needs --system dynamic")
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -105,14 +135,18 @@ def _run(options: argparse.Namespace) -> None:
     print(f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in scene.parts)} vertices")
     _warn_of_backs(scene)
     systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["separable"])
-    ready = {}
+    ready, changing = {}, None
     for system in systems:
         if system == "separable":
             ready[system] = report.relight_separable(scene, options.output, keep=options.keep)
         elif system == "harmonic":
             ready[system] = report.relight_harmonic(scene, options.output, order=options.order, window=options.window)
-        else:
+        elif system == "lobe":
             ready[system] = report.relight_lobe(scene, options.output, lobes=options.lobes)
+        else:
+            changing = animation.prepare(scene, options.output, bounces=options.bounces)
+            # The exact pictures have direct light alone, and so has what is compared with them.
+            ready[system] = animation.relit(changing._replace(tensor=None), scene)
     told["precompute"] = {system: each.told for system, each in ready.items()}
     start, seen = time.perf_counter(), report.seen(scene)
     exact = report.exact(scene, seen)
@@ -121,12 +155,19 @@ def _run(options: argparse.Namespace) -> None:
         name: report.compare(scene, name, ready, [each[number] for each in exact], seen, options.output)
         for number, name in enumerate(scene.lights)
     }
+    if changing is not None:
+        ready["dynamic"] = animation.relit(changing, scene)
+        for name, light in told["lights"].items() if changing.tensor is not None else ():
+            stops = light["exposure_stops"]
+            light["dynamic"]["reflected_share"] = animation.reflect(changing, scene, name, stops, options.output)
+        if options.animate:
+            animation.animate(changing, scene, options.output, frames=options.animate)
     told["times"] = {system: report.times(scene, each) for system, each in ready.items()}
     if options.table:
         vertex = report.sample(scene, options.table)
         truth = report.exact(scene, [vertex])[0]
         tables = {"separable": report.table_separable, "harmonic": report.table_harmonic, "lobe": report.table_lobe}
-        told["table"] = [row for system in systems for row in tables[system](scene, vertex, truth)]
+        told["table"] = [row for system in systems if system in tables for row in tables[system](scene, vertex, truth)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     told["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
     path = options.output / "report.json"
@@ -146,8 +187,16 @@ def _scene(options: argparse.Namespace) -> Scene:
     else:
         mesh = prt.scene.mesh.turn(prt.scene.load_mesh(options.mesh), np.array(_UPRIGHT[options.up]))
         parts = [Part("object", mesh, _brdf(options), terms)]
+        if options.material and len(np.unique(np.asarray(mesh.region))) > 1:
+            regions = enumerate(prt.scene.mesh.split(mesh))
+            parts = [Part(f"region {number}", each, _brdf(options), terms) for number, each in regions]
         if options.ground:
             parts.append(Part("ground", prt.scene.mesh.ground_plane(mesh), prt.brdf.Lambert(0.5), 1))
+    for region, diffuse, specular, roughness, f0 in options.material:
+        if region >= len(parts):
+            raise ValueError(f"--material must name one of regions 0 to {len(parts) - 1}, got {region:g}")
+        brdf = prt.brdf.CookTorrance(diffuse=diffuse, specular=specular, roughness=roughness, f0=f0)
+        parts[int(region)] = parts[int(region)]._replace(brdf=brdf, terms=options.terms)
     if options.environment:
         lights = _load_lights(options.environment)
     else:
@@ -172,6 +221,9 @@ def _load_lights(paths: Sequence[Path]) -> dict[str, Environment]:
 def _brdf(options: argparse.Namespace) -> Callable:
     if options.brdf == "lambert":
         return prt.brdf.Lambert(options.diffuse)
+    if options.brdf == "cook-torrance":
+        more = {"roughness": options.roughness, "f0": options.f0}
+        return prt.brdf.CookTorrance(diffuse=options.diffuse, specular=options.specular, **more)
     return prt.brdf.AshikhminShirley(diffuse=options.diffuse, specular=options.specular, nu=options.nu, nv=options.nv)
 
 
@@ -217,6 +269,9 @@ def _tell(told: dict[str, Any], path: Path) -> None:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
             error = light[system]["image_error"]
             print(f"{name}, {system}: relative L2 error of the picture {error:.1%}; of vertex radiance: {parts}")
+            if "reflected_share" in light[system]:
+                share = light[system]["reflected_share"]
+                print(f"{name}, {system}: {share:.1%} of the picture's light comes from other surfaces")
     for system, times in told["times"].items():
         milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
         print(f"{system}: {milliseconds.replace('_', ' ')}")

@@ -59,8 +59,8 @@ class Relit(NamedTuple):
     """A scene that one system has made ready.
 
     Attributes:
-        light: The light side of every part: what is done again when the light changes.
-        view: The view side of every part: what is done again when the camera moves.
+        light: The light side of every part, or of all as one: what is done again when the light changes.
+        view: The view side: what is done again when the camera moves.
         combine: Radiance from the two.
         told: What it took, for the report.
     """
@@ -70,9 +70,9 @@ class Relit(NamedTuple):
     combine: Callable[[Any, Any], Array]
     told: dict[str, Any]
 
-    def color(self, light: Environment) -> list[Array]:
-        """Radiance of every part's vertices."""
-        return [self.combine(*sides) for sides in zip(self.light(light), self.view(), strict=True)]
+    def color(self, light: Environment) -> Array:
+        """Radiance of all vertices, one part after another."""
+        return jnp.concatenate([self.combine(*sides) for sides in zip(self.light(light), self.view(), strict=True)])
 
 
 def relight_separable(whole: Scene, output: Path, *, keep: int) -> Relit:
@@ -260,27 +260,28 @@ def compare(
     everything = whole.mesh
 
     def draw(color):
-        return image.render(everything, jnp.concatenate(color), whole.camera, background=sky)
+        return image.render(everything, color, whole.camera, background=sky)
 
     full = [
         jnp.zeros((len(part.mesh.position), values.shape[-1])).at[vertex].set(values)
         for part, values, vertex in zip(whole.parts, truth, vertices, strict=True)
     ]
     surface = image.render(everything, jnp.ones((len(everything.position), 1)), whole.camera, background=None)
-    reference = draw(full)
+    reference = draw(jnp.concatenate(full))
     stops = image.automatic_exposure(reference * surface)
     told: dict[str, Any] = {"exposure_stops": float(stops)}
     pictures = {}
     for system, each in ready.items():
         color = each.color(light)
         pictures[system] = draw(color)
+        parts = jnp.split(color, np.cumsum([len(part.mesh.position) for part in whole.parts])[:-1])
         told[system] = {
             "image_error": float(image.relative_l2(pictures[system] * surface, reference * surface)),
             "vertex_error": {
                 part.name: float(image.relative_l2(mine[vertex], values))
-                for part, mine, values, vertex in zip(whole.parts, color, truth, vertices, strict=True)
+                for part, mine, values, vertex in zip(whole.parts, parts, truth, vertices, strict=True)
             },
-            "negative_vertices": int(sum(jnp.sum(jnp.any(mine < 0, -1)) for mine in color)),
+            "negative_vertices": int(jnp.sum(jnp.any(color < 0, -1))),
         }
         _write(output, f"{name}_{system}_difference", jnp.abs(pictures[system] - reference), stops, _AMPLIFY)
     for kind, picture in (pictures | {"reference": reference}).items():
@@ -299,7 +300,7 @@ def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -
 def times(whole: Scene, ready: Relit) -> dict[str, float]:
     """Median seconds of what a frame needs."""
     light = next(iter(whole.lights.values()))
-    lit, seen, color, mesh = ready.light(light), ready.view(), jnp.concatenate(ready.color(light)), whole.mesh
+    lit, seen, color, mesh = ready.light(light), ready.view(), ready.color(light), whole.mesh
 
     def combined(lights, views):
         return [ready.combine(*each) for each in zip(lights, views, strict=True)]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
+from jaxprt import animation
 from jaxprt.__main__ import main
 
 OBJ = """
@@ -43,8 +44,12 @@ def small():
             (prt.transport.lobe, "precompute", {"size": 8}),
             (prt.brdf.lobe, "tabulate", {"resolution": 8}),
             (prt.scene.mesh, "ground_plane", {"vertices": 49}),
+            (prt.transport.dynamic, "precompute", {"size": 8}),
+            (prt.transport.transfer, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
+        for name, value in (("LOBES", 1), ("RANKS", (2, 4, 4)), ("ROUGHNESS", (0.3, 0.5, 0.5))):
+            patch.setattr(animation, name, value)
         yield
 
 
@@ -310,3 +315,34 @@ def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "jaxprt", "--help"], check=True, capture_output=True, text=True)
     assert "usage: python -m jaxprt" in done.stdout
     assert not done.stderr
+
+
+def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys):
+    output = place / "moving"
+    glossy = ["--brdf", "cook-torrance", "--roughness", "0.4", "--specular", "0.6", "0.5", "0.3"]
+    assert run(place, "--ground", "--system", "dynamic", "--animate", "2", *glossy, output=output) == 0
+    told = report(output)
+    assert 0 < told["lights"]["sky"]["dynamic"]["reflected_share"] < 0.5
+    assert told["lights"]["sky"]["dynamic"]["image_error"] < 0.3
+    assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
+    frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
+    assert np.abs(frames[0] - frames[1]).max() > 0.05
+    whole, direct = (prt.files.read_image(output / f"sky_{name}.exr")[0] for name in ("dynamic_bounces", "dynamic"))
+    assert whole.mean() > direct.mean()
+    assert "comes from other surfaces" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--animate", "4"], "--animate needs --system dynamic"),
+        (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
+        (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
+        (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of regions 0 to 0, got 7"),
+        (["--material", "0", "0.1", "0.1", "2", "0.1"], "four numbers from 0 to 1, got 0 0.1 0.1 2 0.1"),
+        (["--roughness", "-1"], "--roughness must be from 0 to 1, got -1"),
+    ],
+)
+def test_materials_that_cannot_be_are_refused(place, capsys, options, message):
+    assert run(place, *options, output=place / "refused") == 2
+    assert message in capsys.readouterr().err

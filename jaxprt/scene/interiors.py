@@ -105,25 +105,33 @@ def corner(mesh: Mesh, *, cells: int = 64) -> Mesh:
     return join([whole, *(assemble([side]) for side in sides)])
 
 
-def ring() -> Mesh:
+def ring(*, spacing: float = 1.0) -> Mesh:
     """A metal ring that lies on a round table, on whose top its inside gathers light to a caustic.
 
     The ring's radius is 1 and its height 0.5, the table's radius 2.4. The top's vertices stand on
     circles, none of them beneath the ring; inside it their spacing is 0.038.
 
+    Args:
+        spacing: Of the vertices, as a multiple of that.
+
     Returns:
         10,969 vertices in two regions: 0 the ring, closed, and 1 the table, its top and its side.
+
+    Raises:
+        ValueError: The spacing is not from 0.25 to 4.
     """
+    if not 0.25 <= spacing <= 4:
+        raise ValueError(f"spacing must be from 0.25 to 4, got {spacing}")
     inner, outer, height = _RING
     profile = [(inner, _GAP), (outer, _GAP), (outer, _GAP + height), (inner, _GAP + height)]
-    inside, around = _SHELLS
+    inside, around = (round(each / spacing) for each in _SHELLS)
     edge, thickness = _TABLE
     growth = np.linspace(0, 1, around) ** 1.3  # Finest beside the ring.
     clear = outer + _CLEAR
     radius = [np.linspace(0, inner - _CLEAR, inside + 1), clear + (edge - clear) * growth]
     side, slope = curve([(edge, -thickness), (edge, 0)], step=thickness, turn=1.0)
     table = [_disk(np.concatenate(radius)), sweep(side, slope, sectors=8 * (inside + around))]
-    return join([assemble(_band(profile, _RING_SECTORS, _RING_STEP)), assemble(table)])
+    return join([assemble(_band(profile, round(_RING_SECTORS / spacing), _RING_STEP * spacing)), assemble(table)])
 
 
 def _reveal() -> list[Part]:

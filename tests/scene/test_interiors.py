@@ -284,3 +284,13 @@ def test_the_sun_that_the_inside_of_the_ring_mirrors_gathers_on_the_table():
     power = cosine[inside] * radius * 2 * np.pi / turns * 0.5 / heights
     gathered, _, _ = np.histogram2d(x[inside], z[inside], bins=np.arange(-1, 1.01, 0.05), weights=power)
     assert gathered.max() / (0.05**2 * SUN[1]) > 10
+
+
+def test_a_coarser_ring_has_fewer_vertices_in_the_same_place():
+    fine, coarse = interiors.ring(), interiors.ring(spacing=2.0)
+    assert 2000 < len(coarse.position) < len(fine.position) / 3
+    for each in (0, 1):
+        low, high = (np.asarray(m.position)[np.asarray(m.region) == each].min(0) for m in (fine, coarse))
+        np.testing.assert_allclose(low, high, atol=0.05)  # Of polygons, whose corners lie elsewhere.
+    with pytest.raises(ValueError, match=r"spacing must be from 0.25 to 4, got 9.0"):
+        interiors.ring(spacing=9.0)

@@ -1,0 +1,275 @@
+"""What does reflected light cost per frame while everything changes, and how wrong is it? Sun et al. 2007's Table 1.
+
+    python -m benchmarks.interreflection [--quick] [--store FOLDER] [--pictures FOLDER] [--output FILE]
+
+Objects on grounds, both of Cook-Torrance's model over the Fresnel-roughness plane and both adjustable, with two
+bounces. `V` are frames of a new view, `V&B` of new materials too, `V&B&L` of a new light too. `peer` are frames of the
+paper, on two Xeons of 3.2 GHz and a GeForce 7800 in 2007; for `precompute` it is the time there.
+
+`error` is that of pictures of 256 x 256 pixels against Mitsuba 3's path tracer with the same BRDFs, the median over ten
+random triples of light, BRDF and view: relative L2 of the whole picture. `indirect_error` is that of its indirect part,
+by one bounce and two. What of it is due to whom: `first_error` and `second_error` are those of each bounce, and
+`light_error` what the 6 x 8 x 8 texels change in one bounce as Mitsuba has it, all relative to the indirect part. Two
+pictures of unlike seeds stand for the exact one, so that their noise falls out of each squared error. Without LLVM of
+version 17 or newer, which Mitsuba needs, there are no errors but those of decompositions.
+
+Lines `Figure 9` are of fewer components and modes: `error` is that of tensors under light of natural spectrum,
+`picture_error` what the reflected light changes against the longest, in the median triple.
+
+Lines `basis` are of the functions that stand for BRDFs along light paths: `error` of the light that they reflect.
+"""
+
+import itertools
+import pathlib
+import time
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness, path_tracing, relight_dynamic
+from benchmarks.relight_dynamic import Triple
+from jaxprt import files, image
+from jaxprt.brdf import CookTorrance, dynamic, navigation
+from jaxprt.relight import dynamic as direct
+from jaxprt.relight import transfer as relight
+from jaxprt.scene import Camera, Environment, Mesh, builtin, load_mesh
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.transport import dynamic as transports
+from jaxprt.transport import transfer
+
+FUNCTIONS, TERMS = 4, 24  # of a set along light paths
+LOBES = 4
+TEXELS = 16
+EDGE, SAMPLES = 256, 144
+LONGEST = (64, 96)
+DEFAULT = (32, 64)
+CUTS = [(8, 64), (16, 64), (32, 16), (32, 32), (32, 64), (32, 96), (64, 64)]
+
+
+class Published(NamedTuple):
+    """A row of the paper's Table 1, and the scene here."""
+
+    name: str
+    hours: float
+    megabytes: float
+    fps: tuple[float, float, float]
+    mesh: str
+    ground: int
+
+
+PUBLISHED = [
+    Published("Tweety", 2.6 + 4.0, 148, (121.58, 28.73, 5.82), "rocker_arm", 3000),
+    Published("Venus", 5.0 + 7.3, 389, (57.09, 10.94, 2.62), "stanford_bunny", 4000),
+]
+
+
+class Scene(NamedTuple):
+    """What is relit."""
+
+    mesh: Mesh
+    transport: transports.DynamicTransport
+    tensor: transfer.TransferTensor
+    brdfs: list
+    triples: list[Triple]
+    materials: list[list]
+
+
+def main() -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
+    parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write pictures beside the exact ones")
+    arguments = parser.parse_args()
+    for line in measure(arguments.quick, arguments.store, arguments.pictures):
+        harness.report(line, arguments.output)
+
+
+def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None):
+    """Lines of all scenes."""
+    point = np.array(list(itertools.product((0.0, 1.0), (0.2, 0.4)))) if quick else None
+    family = navigation.cook_torrance(point=point)
+    members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
+    start = time.perf_counter()
+    ranks = (2, 6, 6) if quick else (FUNCTIONS, TERMS, TERMS)
+    along = dynamic.factor(family.brdf, None, ranks=ranks, resolution=12 if quick else 32)
+    yield {
+        **{"benchmark": "interreflection", "case": f"basis of Cook-Torrance's model, {ranks[0]} functions"},
+        **{"seconds": time.perf_counter() - start, "compile_seconds": 0.0, "bytes": along.nbytes},
+        **{"error": float(along.error), "squared_error": float(along.error) ** 2},
+    }
+    for published in PUBLISHED[:1] if quick else PUBLISHED:
+        yield from measure_scene(published, members, along, family.navigation, quick, store, pictures)
+
+
+def measure_scene(published: Published, members, along, plane, quick: bool, store, pictures):
+    """Lines of one scene."""
+    data = harness.data() / "meshes"
+    real = data.is_dir() and not quick
+    glossy = load_mesh(data / f"{published.mesh}.ply") if real else builtin.sphere(rings=8, sectors=10)
+    mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 64)])
+    size = 64 if real else 16
+    path = store and store / published.mesh
+    transport = transports.precompute(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)
+    start = time.perf_counter()
+    longest = (8, 8) if quick else LONGEST
+    options: dict = {"components": longest[0], "modes": longest[1], "edge": 8 if real else 4, "size": 16 if real else 8}
+    options |= {"path": path and path / "bounces", "progress": False}
+    full = transfer.precompute(mesh, [along] * 2, **options)
+    seconds = time.perf_counter() - start
+    tensor = full.keep(4, modes=4) if quick else full.keep(DEFAULT[0], modes=DEFAULT[1])
+    triples = relight_dynamic.draw(glossy, size, quick)[: 2 if quick else 10]
+    materials = [relight_dynamic.materials(plane, each, 2) for each in triples]
+    scene = Scene(mesh, transport, tensor, [members] * 2, triples, materials)
+    common = {
+        **{"benchmark": "interreflection", "vertices": len(mesh.position), "bytes": tensor.nbytes},
+        **{"worth": [round(float(each), 4) for each in tensor.worth]},
+    }
+    found = errors(scene, pictures and pictures / published.mesh) if path_tracing.available() and not quick else {}
+    if not found:
+        found = {"error": rms(tensor.error)}
+    peer = f"Sun et al. 2007, {published.name}"
+    second = full.second
+    assert second is not None
+    yield {
+        **{**common, "case": f"precompute, {len(mesh.position)} vertices", "seconds": seconds, "compile_seconds": 0.0},
+        **{
+            "error": rms(tensor.error),
+            "second_error": rms(second.error),
+            "peer": peer,
+            "peer_error": None,
+        },
+        **{"peer_seconds": 3600 * published.hours, "peer_bytes": 1e6 * published.megabytes},
+    }
+    for name, frame, fps in frames(scene, published):
+        timing = harness.measure(frame, repeats=3 if quick else 15)
+        case = f"{name}, {len(mesh.position)} vertices"
+        line = {"peer": peer, "peer_seconds": 1 / fps, "peer_error": None, **found}
+        yield {**common, "case": case, **timing.line(), **line}
+    yield from figure_9(scene, full, common, quick)
+
+
+def frames(scene: Scene, published: Published):
+    """Name, function and the paper's rate of each kind of frame."""
+    transport, tensor, brdfs = scene.transport, scene.tensor, scene.brdfs
+    lit = direct.light_side(transport, scene.triples[0].light, texels=TEXELS)
+    bounced = relight.light_side(tensor, scene.triples[0].light)
+    arrived = relight.arriving(transport, tensor, bounced, scene.materials[0])
+    turn = itertools.count()
+
+    def frame(matter: bool, light: bool):
+        number = next(turn) % len(scene.triples)
+        triple, now = scene.triples[number], scene.materials[number if matter else 0]
+        view = direct.view_side(transport, brdfs, now, eye=jnp.asarray(triple.eye))
+        sun, bounce, comes = lit, bounced, arrived
+        if light:
+            sun = direct.light_side(transport, triple.light, texels=TEXELS)
+            bounce = relight.light_side(tensor, triple.light)
+        if matter:
+            comes = relight.arriving(transport, tensor, bounce, now)
+        reflected = relight.combine(transport, comes, relight.view_side(transport, view))
+        return direct.combine(transport, sun, view) + reflected
+
+    yield "V", lambda: frame(False, False), published.fps[0]
+    yield "V&B", lambda: frame(True, False), published.fps[1]
+    yield "V&B&L", lambda: frame(True, True), published.fps[2]
+
+
+def reflected(scene: Scene, tensor: transfer.TransferTensor, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance of one bounce and of two bounces, in one triple."""
+    triple, now = scene.triples[number], scene.materials[number]
+    view = direct.view_side(scene.transport, scene.brdfs, now, eye=jnp.asarray(triple.eye))
+    seen, lit = relight.view_side(scene.transport, view), relight.light_side(tensor, triple.light)
+    both, once = (
+        relight.combine(scene.transport, relight.arriving(scene.transport, tensor, each, now), seen)
+        for each in (lit, relight.LitTransfer(lit.first, None))
+    )
+    return np.asarray(once), np.asarray(both - once)
+
+
+def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
+    """Medians over all triples of what is off, relative to the picture or to its indirect part."""
+    rows = []
+    center = np.mean(np.asarray(scene.mesh.position)[np.asarray(scene.mesh.region) == 0], 0)
+    for number, triple in enumerate(scene.triples):
+        camera = Camera(triple.eye, center, [0.0, 1.0, 0.0], 0.6, EDGE, EDGE)
+        eye = camera.eye
+        color = direct.radiance(
+            scene.transport, scene.brdfs, scene.materials[number], triple.light, eye=eye, texels=TEXELS
+        )
+        mine = [np.asarray(image.render(scene.mesh, jnp.asarray(each), camera, background=None))
+                for each in (color, *reflected(scene, scene.tensor, number))]  # fmt: skip
+        f0, roughness = triple.coordinate.tolist()
+        model = [
+            CookTorrance(diffuse, specular, roughness, f0)
+            for diffuse, specular in (
+                (triple.diffuse, triple.specular),
+                (0.8 * triple.specular, triple.diffuse),
+            )
+        ]
+        rough = relight.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
+        rough = Environment(jnp.broadcast_to(rough, (6, 8, 8, 8, 8, 3)).reshape(6, 64, 64, 3))
+        exact, blurred = [], []
+        for seed in (0, 1):
+            options = {"samples": SAMPLES, "seed": seed}
+            two, three, four = (
+                path_tracing.picture(scene.mesh, model, triple.light, camera, depth=depth, **options)
+                for depth in (2, 3, 4)
+            )
+            exact.append((two, three - two, four - three))
+            low, high = (
+                path_tracing.picture(scene.mesh, model, rough, camera, depth=depth, **options) for depth in (2, 3)
+            )
+            blurred.append(high - low)
+        whole = [np.sum(each, 0) for each in exact]
+        bounced = [each[1] + each[2] for each in exact]
+        indirect = norm(0, *bounced)
+        rows.append(
+            {
+                "error": norm(np.sum(mine, 0), *whole) / norm(0, *whole),
+                "direct_error": norm(mine[0], *(each[0] for each in exact)) / norm(0, *whole),
+                "indirect_error": norm(mine[1] + mine[2], *bounced) / indirect,
+                "first_error": norm(mine[1], *(each[1] for each in exact)) / indirect,
+                "second_error": norm(mine[2], *(each[2] for each in exact)) / indirect,
+                "light_error": norm(0, *(a - b[1] for a, b in zip(blurred, exact, strict=True))) / indirect,
+                "indirect_share": indirect / norm(0, *whole),
+            }
+        )
+        print({key: round(value, 4) for key, value in rows[-1].items()}, roughness, flush=True)
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            mean = np.mean(whole, 0)
+            row = np.concatenate([mine[0], np.sum(mine, 0), mean, 4 * (mine[1] + mine[2]), 4 * np.mean(bounced, 0)], 1)
+            shown = image.expose(jnp.asarray(row), stops=image.automatic_exposure(jnp.asarray(mean)))
+            files.write_png(pictures / f"triple_{number}.png", np.asarray(image.display(shown)))
+    return {key: float(np.median([row[key] for row in rows])) for key in rows[0]}
+
+
+def norm(value, one: np.ndarray, other: np.ndarray) -> float:
+    """Of the difference from what two noisy pictures are means of: their noise has no part in the product."""
+    return float(np.sqrt(max(np.sum((value - one) * (value - other), dtype=np.float64), 0)))
+
+
+def figure_9(scene: Scene, full: transfer.TransferTensor, common: dict, quick: bool):
+    """Lines of shorter decompositions."""
+    numbers = range(len(scene.triples))
+    exact = [reflected(scene, full, number)[0] for number in numbers]
+    for components, modes in [(2, 4)] if quick else CUTS:
+        start = time.perf_counter()
+        short = full.keep(components, modes=modes)
+        seconds = time.perf_counter() - start
+        found = [reflected(scene, short, number)[0] for number in numbers]
+        change = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, exact, strict=True)]
+        yield {
+            **{**common, "case": f"Figure 9: {components} components, {modes} modes", "bytes": short.nbytes},
+            **{"seconds": seconds, "compile_seconds": 0.0, "error": rms(short.error)},
+            "picture_error": float(np.median(change)),
+        }
+
+
+def rms(value) -> float:
+    """Root mean square."""
+    return float(jnp.sqrt(jnp.mean(jnp.asarray(value) ** 2)))
+
+
+if __name__ == "__main__":
+    main()
