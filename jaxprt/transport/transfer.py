@@ -11,6 +11,7 @@ cluster are decomposed, along vertices and light. `jaxprt.relight.transfer` make
 A third bounce would follow in the same way, and cost as many times the second as there are functions.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -87,19 +88,41 @@ class TransferTensor(eqx.Module):
         if not (1 <= components <= most[0] and 1 <= modes <= most[1]):
             raise ValueError(f"components and modes must be at least 1 and at most {most}, got {components}, {modes}")
         weight, core = self.weight[..., :components], self.core[:, :modes, :components]
-        size = jnp.linalg.norm(self.weight, axis=1)
-
-        def energy(core, size):
-            return jnp.sum((core.astype(size.dtype) * size[:, None, : core.shape[2], None, None]) ** 2, (1, 2, 3, 4))
-
-        whole, kept = energy(self.core, size), energy(core, size)
-        whole = whole / jnp.maximum(1 - self.error**2, jnp.finfo(size.dtype).eps)
+        energy, whole = _energy(self)
+        kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
         second = self.second and SecondBounce(
             self.second.weight[..., :components], self.second.core[:, :, :components], jnp.full_like(error, jnp.nan)
         )
         same = (self.place, self.region, self.function, self.factor, second)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)
+
+    def shorten(self, *, error: float | None = None, nbytes: int | None = None) -> "TransferTensor":
+        """The smallest tensor whose root mean square error is no larger, or that of least error that is no larger.
+
+        Raises:
+            ValueError: Neither or both of error and bytes, or one that no components and modes reach.
+        """
+        if (error is None) == (nbytes is None):
+            raise ValueError(f"give either error or nbytes, got error={error} and nbytes={nbytes}")
+        energy, whole = (np.asarray(each, np.float64) for each in _energy(self))
+        share = energy / np.where(whole > 0, whole, 1)[:, None, None]
+        left = np.where(whole[:, None, None] > 0, 1 - share.cumsum(1).cumsum(2), 0)
+        wrong = np.sqrt(np.maximum(left, 0).mean(0))  # [e, n]
+        modes, components = (np.arange(1, n + 1) for n in wrong.shape)
+        clusters, _, _, *shape = self.core.shape
+        size = 2 * clusters * math.prod(shape) * modes[:, None] * components
+        size = size + 4 * self.weight[..., 0].size * components + 4 * self.mode[..., 0].size * modes[:, None]
+        if self.second is not None:
+            each = self.second.core[:, :, 0].nbytes + self.second.weight[..., 0].nbytes
+            size = size + each * components + self.second.error.nbytes
+        fits = wrong <= error if error is not None else size <= nbytes
+        if not fits.any():
+            reached = f"error must be at least {wrong.min():.3g}" if nbytes is None else f"nbytes at least {size.min()}"
+            raise ValueError(f"{reached}, got {error if nbytes is None else nbytes}")
+        cost = np.where(fits, size if nbytes is None else wrong, np.inf)
+        mode, component = np.unravel_index(np.argmin(cost), cost.shape)
+        return self.keep(int(component) + 1, modes=int(mode) + 1)
 
 
 def precompute(
@@ -204,6 +227,14 @@ def precompute(
     arrays = (weight, core, found["mode"], clustered.places(member), job.region.astype(np.int32), function)
     arrays = [jnp.asarray(each) for each in arrays]
     return TransferTensor(*arrays, factor, second, jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype))
+
+
+@jax.jit
+def _energy(tensor: TransferTensor) -> tuple[Float[Array, "g e n"], Float[Array, " g"]]:
+    """What each mode and component holds of a cluster's tensor under light of natural spectrum, and all of it."""
+    size = jnp.sum(tensor.weight**2, 1)
+    energy = jnp.sum(tensor.core.astype(size.dtype) ** 2, (3, 4)) * size[:, None]
+    return energy, jnp.sum(energy, (1, 2)) / jnp.maximum(1 - tensor.error**2, jnp.finfo(size.dtype).eps)
 
 
 def _white(factor: Array) -> np.ndarray:

@@ -216,6 +216,23 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
         whole.keep(0, modes=3)
 
 
+def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
+    few = whole.shorten(error=0.1)
+    assert 0.05 < float(few.error[0]) <= 0.1
+    components, modes = few.core.shape[2], few.core.shape[1]
+    assert float(whole.keep(components - 1, modes=modes).error[0]) > 0.1
+    assert float(whole.keep(components, modes=modes - 1).error[0]) > 0.1
+    small = whole.shorten(nbytes=few.nbytes)
+    assert small.nbytes <= few.nbytes
+    assert float(small.error[0]) <= float(few.error[0])
+    with pytest.raises(ValueError, match="give either error or nbytes, got error=None and nbytes=None"):
+        whole.shorten()
+    with pytest.raises(ValueError, match=r"nbytes at least \d+, got 10"):
+        whole.shorten(nbytes=10)
+    with pytest.raises(ValueError, match="error must be at least"):
+        few.shorten(error=0.01)
+
+
 def test_what_brings_little_is_left_out_and_told(mesh, capsys):
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
     changing = dynamic.factor(members, None, ranks=(2, 6, 6), resolution=12)
