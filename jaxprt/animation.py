@@ -88,7 +88,7 @@ def prepare(whole: Scene, output: Path, *, bounces: int) -> Ready:
     return Ready(direct, tensor, brdfs, family, told)
 
 
-def materials(ready: Ready, whole: Scene, turn: float = 0.0) -> list[Material | None]:
+def materials(ready: Ready, whole: Scene, *, turn: float = 0.0) -> list[Material | None]:
     """Materials of a scene; as the turn goes from 0 to 1 they go through roughnesses and colors, and back."""
     result: list[Material | None] = []
     for number, part in enumerate(whole.parts):
@@ -155,7 +155,7 @@ def animate(ready: Ready, whole: Scene, output: Path, *, frames: int, progress: 
         around = _about(2 * np.pi * turn)
         view = _swung(whole.camera, _ORBIT * np.sin(2 * np.pi * turn))
         lamp = scene.environment.rotate(light, around)
-        color = ready.radiance(materials(ready, whole, turn), lamp, eye=view.eye)
+        color = ready.radiance(materials(ready, whole, turn=turn), lamp, eye=view.eye)
         sky = scene.environment.background(lamp, image.ray_direction(view))
         picture = image.render(mesh, color, view, background=sky)
         stops = image.automatic_exposure(picture) if stops is None else stops
