@@ -57,8 +57,8 @@ def test_touching_and_interpenetrating_meshes_gain_no_energy(white, height):
     mesh = join([ball(height=height), floor()])
     first, more, tensor = bounced(mesh, [white, white])
     assert more.max() > 0.05
-    assert (first + more).max() < 1.1  # Of 49 coarse vertices, whose harmonics ring.
-    assert more.min() > -0.06
+    assert (first + more).max() < 1.03  # Of 49 coarse vertices, whose harmonics ring.
+    assert more.min() > -1e-6
     assert float(tensor.worth[0]) > float(tensor.worth[1]) > 0
 
 
@@ -100,7 +100,7 @@ def test_hits_on_degenerate_triangles_are_finite(white):
     broken = make_mesh(position, face, normal=normal)
     _, more, _ = bounced(join([ball(height=1.2), broken]), [white, white])
     _, exact, _ = bounced(join([ball(height=1.2), plain]), [white, white])
-    np.testing.assert_allclose(more[: len(exact)], exact, atol=0.02)
+    np.testing.assert_allclose(more[: len(exact)], exact, atol=1e-4)
 
 
 def test_a_sun_in_one_texel_reaches_no_vertex_twice_over(white):
@@ -111,7 +111,7 @@ def test_a_sun_in_one_texel_reaches_no_vertex_twice_over(white):
     first, more, _ = bounced(mesh, [white, white], Environment(sun))
     size = float(relight.coarse(sun, edge=2).max())
     _, soft, _ = bounced(mesh, [white, white], Environment(jnp.repeat(jnp.repeat(spread, 4, 1), 4, 2) * size))
-    np.testing.assert_allclose(more, soft, rtol=1e-3, atol=1e-3 * np.abs(soft).max())
+    np.testing.assert_allclose(more, soft, rtol=1e-5, atol=1e-5 * np.abs(soft).max())
     assert np.abs(more).max() < first.max()
 
 

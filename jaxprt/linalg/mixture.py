@@ -80,10 +80,12 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 @partial(jax.jit, static_argnames=("degree",))
 def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l *b"]:
-    """What a von Mises-Fisher lobe leaves of each band of the harmonics that it is averaged over: 1, coth k - 1/k, ...
+    """What a von Mises-Fisher lobe leaves of each band of the harmonics that it is averaged over.
 
-    Ratios of modified spherical Bessel functions: by their recurrence for sharp lobes, where it is stable, and for wide
-    ones by their continued fraction.
+        A_l = i_l(k) / i_0(k),    A_0 = 1,    A_1 = coth k - 1 / k,    A_(l+1) = A_(l-1) - (2 l + 1) / k A_l
+
+    with modified spherical Bessel functions i_l: by their recurrence for sharp lobes, where it is stable, and for wide
+    ones by the continued fraction of their ratios.
     """
     sharp = concentration > _SHARP
     safe = jnp.where(sharp, concentration, _SHARP)

@@ -27,8 +27,7 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.transport.dynamic import DynamicTransport
 from jaxprt.transport.transfer import TransferTensor
-
-_DEGREE = 3  # of the harmonics that arrive
+from jaxprt.transport.transfer_job import DEGREE
 
 
 class LitTransfer(eqx.Module):
@@ -84,20 +83,18 @@ def radiance(
     Args:
         transport: Precomputed transport of direct light.
         tensor: Precomputed bounces, of the same mesh.
-        brdfs: Of each region, those that the transport was made for.
-        materials: Of each region, what it is made of at present; None where that does not change. Light that a textured
-            region sends to others has the texture's mean.
-        light: The environment.
+        brdfs: This and more as `jaxprt.relight.dynamic.radiance` has it.
+        materials: Light that a textured region sends to others has the texture's mean.
+        light: Directly by its texels, reflected by coarser ones.
         eye: Position of the viewer in world units.
-        texels: How many of the brightest texels light the vertices directly one by one, exactly.
+        texels: How many light the vertices one by one.
 
     Returns:
-        Linear radiance per vertex in the light's units; slightly negative values occur at shadow boundaries.
-        Differentiable in the light, the eye and the materials.
+        Linear radiance per vertex in the light's units. Differentiable in the light, the eye and the materials.
 
     Raises:
-        TypeError: The light is no Environment, or a material no Material.
-        ValueError: As of `jaxprt.relight.dynamic.radiance`; or the tensor is not of the transport's mesh or of sets as
+        TypeError: As of `jaxprt.relight.dynamic.radiance`.
+        ValueError: Likewise; or the tensor is not of the transport's mesh or of sets as
             large as these.
 
     Reference: Sun et al. 2007, equations 3 and 4.
@@ -269,9 +266,9 @@ def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Ar
 @jax.jit
 def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arriving:
     local = rotation.rotate_each(whole[..., vertex], frame)
-    cosine = harmonics.cosine(degree=_DEGREE) / np.pi
+    cosine = harmonics.cosine(degree=DEGREE) / np.pi
     # Of a function that is the same around the normal only m = 0 counts: l (l + 1) is its row.
-    parts = (local[l * (l + 1)] * (cosine[l] * np.sqrt((2 * l + 1) / (4 * np.pi))) for l in range(_DEGREE))
+    parts = (local[l * (l + 1)] * (cosine[l] * np.sqrt((2 * l + 1) / (4 * np.pi))) for l in range(DEGREE))
     return Arriving(local, reduce(jnp.add, parts))
 
 
@@ -279,13 +276,13 @@ def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arrivi
 def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, Array]:
     """Coefficients of the lobes of each row, and albedo of their diffuse part."""
     if lobe is None:
-        return jnp.zeros(((_DEGREE + 1) ** 2, 1, len(position)), position.dtype), jnp.zeros_like(position[:, :1].T)
+        return jnp.zeros(((DEGREE + 1) ** 2, 1, len(position)), position.dtype), jnp.zeros_like(position[:, :1].T)
     each = lobe.lookup(_view(position, frame, eye))
-    band = mixture.bands(each.concentration, degree=_DEGREE)
-    basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=_DEGREE), -1, 0)
+    band = mixture.bands(each.concentration, degree=DEGREE)
+    basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=DEGREE), -1, 0)
     # Written out lobe by lobe: a reduction over the middle axis costs XLA's CPU code ten times as much.
     lobes = range(lobe.lobes)
-    strong = [[each.weight[:, i] * band[l, i] for i in lobes] for l in range(_DEGREE + 1)]
+    strong = [[each.weight[:, i] * band[l, i] for i in lobes] for l in range(DEGREE + 1)]
     rows = [reduce(jnp.add, (strong[math.isqrt(s)][i] * basis[s, i] for i in lobes)) for s in range(len(basis))]
     return jnp.stack(rows), each.diffuse
 
@@ -294,7 +291,7 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
 def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
     """Coefficients of a factored BRDF at each row."""
     view = brdf.view(_view(position, frame, eye))
-    return jnp.einsum("sk,qke->seq", paths.project(brdf, degree=_DEGREE), view)
+    return jnp.einsum("sk,qke->seq", paths.project(brdf, degree=DEGREE), view)
 
 
 def _view(position: Array, frame: Array, eye: Array) -> Array:

@@ -47,6 +47,14 @@ class SecondBounce(eqx.Module):
     core: Float16[Array, "g l o q q"]
     error: Float[Array, " g"]
 
+    def keep(self, components: int) -> "SecondBounce":
+        """The first components."""
+        energy = jnp.sum(self.core.astype(self.weight.dtype) ** 2, (1, 3, 4)) * jnp.sum(self.weight**2, 1)
+        whole = jnp.sum(energy, 1) / jnp.maximum(1 - self.error**2, jnp.finfo(energy.dtype).eps)
+        kept = jnp.sum(energy[:, :components], 1)
+        error = jnp.where(whole > 0, jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0)), 0)
+        return SecondBounce(self.weight[..., :components], self.core[:, :, :components], error)
+
 
 class TransferTensor(eqx.Module):
     """One bounce and two, by clusters of vertices; `weight` holds the sizes, so that half precision holds the rest.
@@ -83,7 +91,11 @@ class TransferTensor(eqx.Module):
         return sum(each.nbytes for each in jax.tree.leaves((self.weight, self.core, self.mode, self.second)))
 
     def keep(self, components: int, *, modes: int) -> "TransferTensor":
-        """The first components and modes of one bounce, and components of two; their error is then larger."""
+        """The first components and modes of one bounce, and components of two; their error is then larger.
+
+        Raises:
+            ValueError: Numbers below 1, or above those of the tensor.
+        """
         most = self.core.shape[2], self.core.shape[1]
         if not (1 <= components <= most[0] and 1 <= modes <= most[1]):
             raise ValueError(f"components and modes must be at least 1 and at most {most}, got {components}, {modes}")
@@ -91,9 +103,7 @@ class TransferTensor(eqx.Module):
         energy, whole = _energy(self)
         kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
-        second = self.second and SecondBounce(
-            self.second.weight[..., :components], self.second.core[:, :, :components], jnp.full_like(error, jnp.nan)
-        )
+        second = self.second and self.second.keep(components)
         same = (self.place, self.region, self.function, self.factor, second)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)
 

@@ -75,7 +75,7 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
         key = " ".join(_key(basis) for basis in self.bases)
-        made = blocks.fingerprint(self.region, self.member)
+        made = blocks.fingerprint(self.region, self.member, self.white)
         kinds = self.response[0].shape[1]
         same = {"system": "transfer", "mesh": self.mesh_key, "size": self.size, "kinds": kinds, "brdfs": key}
         return {**same, "made": made, "components": self.components}

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial.transform
+import scipy.special
 import scipy.stats
 from numpy.typing import ArrayLike
 
@@ -354,3 +355,11 @@ def test_weighing_nothing_gives_zeros(nothing):
     found, likelihood = mixture.weigh(each, mass * (nothing != "mass"), weight * (nothing != "weight"), steps=3)
     np.testing.assert_array_equal(found, 0)
     np.testing.assert_array_equal(likelihood, 0)
+
+
+def test_bands_are_ratios_of_bessel_functions():
+    concentration = np.logspace(-3, 5, 33)
+    order = np.arange(6)[:, None] + 0.5
+    exact = scipy.special.ive(order, concentration) / scipy.special.ive(0.5, concentration)
+    found = mixture.bands(jnp.asarray(concentration, jnp.float32), degree=5)
+    np.testing.assert_allclose(found, exact, rtol=2e-5)

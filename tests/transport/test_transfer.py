@@ -74,7 +74,7 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system(mesh):
     bright = albedo.max(1, keepdims=True)
     one, two = (interreflection.interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
     brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
-    np.testing.assert_allclose(tensor.worth, np.sqrt(np.mean(np.square(brought), (1, 2))), rtol=0.02)
+    np.testing.assert_allclose(tensor.worth, np.sqrt(np.mean(np.square(brought), (1, 2))), rtol=0.01)
 
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(brdfs):
@@ -131,7 +131,7 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(brdfs):
 
 
 # What 16 harmonics leave of the first bounce, in the second.
-TWICE = 0.03
+TWICE = 0.025
 
 
 def test_linear_in_the_light(whole):
@@ -189,7 +189,7 @@ def test_diffuse_surfaces_exchange_light_reciprocally():
         mean = np.average(arrived[own, 0, 0, 0], weights=np.outer(line, line).ravel()) * weight
         received.append((2 * edge) ** 2 * mean)
     assert received[0] > 0.1
-    np.testing.assert_allclose(received[0], received[1], rtol=0.02)
+    np.testing.assert_allclose(received[0], received[1], rtol=1e-5)
 
 
 def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
@@ -209,9 +209,9 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
     assert float(cut.error[0]) > 0.01
     np.testing.assert_allclose(np.sqrt(wrong / total), float(cut.error[0]), rtol=1e-3)
     shorter = whole.keep(20, modes=24)
-    np.testing.assert_allclose(shorter.error, cut.error, rtol=0.02)
+    np.testing.assert_allclose(shorter.error, cut.error, rtol=5e-3)
     exact, short, found = (arriving(each, light(3))[0] for each in (whole, shorter, cut))
-    np.testing.assert_allclose(relative(short, exact), relative(found, exact), rtol=0.05)
+    np.testing.assert_allclose(relative(short, exact), relative(found, exact), rtol=1e-3)
     with pytest.raises(ValueError, match=r"at most \(136, 96\), got 0, 3"):
         whole.keep(0, modes=3)
 
