@@ -14,11 +14,13 @@ pictures of unlike seeds stand for the exact one, so that their noise falls out 
 version 17 or newer, which Mitsuba needs, there are no errors but those of decompositions.
 
 Lines `Figure 9` are of fewer components and modes: `error` is that of tensors under light of natural spectrum,
-`picture_error` what the reflected light changes against the longest, in the median triple.
+`picture_error` what the reflected light changes against the longest, in the median triple. With pictures comes Figure
+10 too: the reflected light of one triple, 8 / 64, 16 / 64, 32 / 16, 32 / 32; below 32 / 64, 32 / 96, 64 / 64, longest.
 
-Lines `basis` are of the functions that stand for BRDFs along light paths: `error` of the light that they reflect, if
-they are factored over the directions; `PCA alone` in the norm of the disk, of the 86 materials of Ngan et al. 2005 and
-of 200 exponents, where the paper has squared errors of 6.23e-4 and 1.61e-7 with five functions, one of them diffuse.
+Lines `basis` are of the functions that stand for BRDFs along light paths: `error` of the light that they reflect, in
+the norm in which they are factored over the directions; `PCA alone` in the norm of the disk, of the 86 materials of
+Ngan et al. 2005 and of 200 exponents, where the paper has squared errors of 6.23e-4 and 1.61e-7 with five functions,
+one of them diffuse.
 """
 
 import itertools
@@ -32,7 +34,7 @@ import numpy as np
 from benchmarks import harness, path_tracing, relight_dynamic
 from benchmarks.relight_dynamic import Triple
 from jaxprt import files, image
-from jaxprt.brdf import CookTorrance, dynamic, navigation
+from jaxprt.brdf import CookTorrance, dynamic, navigation, paths
 from jaxprt.relight import dynamic as direct
 from jaxprt.relight import transfer as relight
 from jaxprt.scene import Camera, Environment, Mesh, builtin, load_mesh
@@ -45,6 +47,7 @@ LOBES = 4
 TEXELS = 16
 EDGE, SAMPLES = 256, 144
 LONGEST = (64, 96)
+PICTURED = 2  # triple
 DEFAULT = (32, 64)
 CUTS = [(8, 64), (16, 64), (32, 16), (32, 32), (32, 64), (32, 96), (64, 64)]
 
@@ -92,10 +95,10 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     family = navigation.cook_torrance(point=point)
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
     start = time.perf_counter()
-    ranks = (2, 6, 6) if quick else (FUNCTIONS, TERMS, TERMS)
-    along = dynamic.factor(family.brdf, None, ranks=ranks, resolution=12 if quick else 32)
+    functions, terms = (2, 6) if quick else (FUNCTIONS, TERMS)
+    along = paths.factor(family.brdf, functions=functions, terms=terms, resolution=12 if quick else 32)
     yield {
-        **{"benchmark": "interreflection", "case": f"basis: Cook-Torrance, {ranks[0]} functions of {ranks[1]} terms"},
+        **{"benchmark": "interreflection", "case": f"basis: Cook-Torrance, {functions} functions of {terms} terms"},
         **{"seconds": time.perf_counter() - start, "compile_seconds": 0.0, "bytes": along.nbytes},
         **{"error": float(along.error), "squared_error": float(along.error) ** 2},
     }
@@ -103,8 +106,8 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     fitted = navigation.cook_torrance(path=data).brdf if data.is_file() and not quick else family.brdf
     shiny = navigation.blinn_phong(exponents=(1, 8, 64) if quick else range(1, 201)).brdf
     for name, brdfs in {"Cook-Torrance": fitted, "Blinn-Phong": shiny}.items():
-        found = relight_dynamic.principal(brdfs, functions=ranks[0])
-        yield {"benchmark": "interreflection", "case": f"basis: {name}, {ranks[0]} functions, PCA alone", **found}
+        found = relight_dynamic.principal(brdfs, functions=functions)
+        yield {"benchmark": "interreflection", "case": f"basis: {name}, {functions} functions, PCA alone", **found}
     for published in PUBLISHED[:1] if quick else PUBLISHED:
         yield from measure_scene(published, members, along, family.navigation, quick, store, pictures)
 
@@ -155,6 +158,8 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
         line = {"peer": peer, "peer_seconds": 1 / fps, "peer_error": None, **found}
         yield {**common, "case": case, **timing.line(), **line}
     yield from figure_9(scene, full, common, quick)
+    if pictures is not None and not quick:
+        figure_10(scene, full, pictures / published.mesh)
 
 
 def frames(scene: Scene, published: Published):
@@ -198,9 +203,8 @@ def reflected(scene: Scene, tensor: transfer.TransferTensor, number: int) -> tup
 def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
     """Medians over all triples of what is off, relative to the picture or to its indirect part."""
     rows = []
-    center = np.mean(np.asarray(scene.mesh.position)[np.asarray(scene.mesh.region) == 0], 0)
     for number, triple in enumerate(scene.triples):
-        camera = Camera(triple.eye, center, [0.0, 1.0, 0.0], 0.6, EDGE, EDGE)
+        camera = camera_of(scene, triple)
         eye = camera.eye
         color = direct.radiance(
             scene.transport, scene.brdfs, scene.materials[number], triple.light, eye=eye, texels=TEXELS
@@ -245,12 +249,23 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
         )
         print({key: round(value, 4) for key, value in rows[-1].items()}, roughness, flush=True)
         if pictures is not None:
-            pictures.mkdir(parents=True, exist_ok=True)
             mean = np.mean(whole, 0)
             row = np.concatenate([mine[0], np.sum(mine, 0), mean, 4 * (mine[1] + mine[2]), 4 * np.mean(bounced, 0)], 1)
-            shown = image.expose(jnp.asarray(row), stops=image.automatic_exposure(jnp.asarray(mean)))
-            files.write_png(pictures / f"triple_{number}.png", np.asarray(image.display(shown)))
+            write(pictures / f"triple_{number}.png", row, mean)
     return {key: float(np.median([row[key] for row in rows])) for key in rows[0]}
+
+
+def camera_of(scene: Scene, triple: Triple) -> Camera:
+    """From the eye of a triple to the middle of what stands on the ground."""
+    center = np.mean(np.asarray(scene.mesh.position)[np.asarray(scene.mesh.region) == 0], 0)
+    return Camera(triple.eye, center, [0.0, 1.0, 0.0], 0.6, EDGE, EDGE)
+
+
+def write(path: pathlib.Path, picture: np.ndarray, exposed: np.ndarray) -> None:
+    """Writes a picture with the exposure that another one asks for."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shown = image.expose(jnp.asarray(picture), stops=image.automatic_exposure(jnp.asarray(exposed)))
+    files.write_png(path, np.asarray(image.display(shown)))
 
 
 def norm(value, one: np.ndarray, other: np.ndarray) -> float:
@@ -273,6 +288,17 @@ def figure_9(scene: Scene, full: transfer.TransferTensor, common: dict, quick: b
             **{"seconds": seconds, "compile_seconds": 0.0, "error": rms(short.error)},
             "picture_error": float(np.median(change)),
         }
+
+
+def figure_10(scene: Scene, full: transfer.TransferTensor, pictures: pathlib.Path) -> None:
+    """Reflected light by shorter decompositions, and by the longest one last."""
+    camera = camera_of(scene, scene.triples[PICTURED])
+    tiles = []
+    for tensor in (*(full.keep(components, modes=modes) for components, modes in CUTS), full):
+        color = jnp.asarray(sum(reflected(scene, tensor, PICTURED)))
+        tiles.append(np.asarray(image.render(scene.mesh, color, camera, background=None)))
+    rows = [np.concatenate(tiles[at : at + 4], 1) for at in (0, 4)]
+    write(pictures / "figure_10.png", np.concatenate(rows), tiles[-1])
 
 
 def rms(value) -> float:

@@ -21,7 +21,7 @@ from jaxprt.report import Relit, Scene
 from jaxprt.scene import Camera, Environment
 
 LOBES = 4
-RANKS = (4, 24, 24)  # of the sets that light meets on its way
+FUNCTIONS, TERMS = 4, 24  # of the sets that light meets on its way
 ROUGHNESS = (0.05, 0.12, 0.25, 0.5)  # of the set, beside those of the scene
 _ORBIT = np.radians(40)  # what the camera goes around in an animation
 _TEXELS = 16
@@ -80,7 +80,8 @@ def prepare(whole: Scene, output: Path, *, bounces: int) -> Ready:
     tensor = None
     if bounces:
         start = timeit.default_timer()
-        bases = brdf.dynamic.factor(family.brdf, None, ranks=(min(RANKS[0], len(family.brdf)), *RANKS[1:]))
+        functions = min(FUNCTIONS, len(family.brdf))
+        bases = brdf.paths.factor(family.brdf, functions=functions, terms=TERMS)
         paths = [fixed.get(number, bases) for number in count]
         tensor = transport.transfer.precompute(mesh, paths, bounces=bounces, path=store / f"bounces_{bounces}")
         told |= {"bounces_seconds": timeit.default_timer() - start, "bounces_bytes": tensor.nbytes}

@@ -48,7 +48,7 @@ def small():
             (prt.transport.transfer, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
-        for name, value in (("LOBES", 1), ("RANKS", (2, 4, 4)), ("ROUGHNESS", (0.3, 0.5, 0.5))):
+        for name, value in (("LOBES", 1), ("FUNCTIONS", 2), ("TERMS", 4), ("ROUGHNESS", (0.3, 0.5, 0.5))):
             patch.setattr(animation, name, value)
         yield
 

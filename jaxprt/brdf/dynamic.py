@@ -10,6 +10,7 @@ transport has a term for them. The set is gray where its BRDFs are; of colored o
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -171,8 +172,6 @@ def factor(
 
     Reference: Sun et al. 2007, section 3.2, equation 2, with the prior in place of their Frobenius norm.
     """
-    if resolution < 4:
-        raise ValueError(f"resolution must be at least 4, got {resolution}")
     colors = check(brdfs, lobe)
     together = stacked(brdfs)
     if ranks is None:
@@ -181,9 +180,38 @@ def factor(
         shapes = ((0, 0, 0), (len(brdfs), len(lobe.weight), 0), (0, 4, 4))
         core, along, maps = (jnp.zeros(each, lobe.scale.dtype) for each in shapes)
         return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
+    inside = int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0))
+    check_ranks(ranks, (len(brdfs) * colors, inside, (_DEGREE + 1) ** 2))
+    found = reflect(brdfs, lobe, resolution=resolution)
+    weight, rest = jnp.sqrt(found.area), (lobe, together)
+    return decompose(found.tensor, found.to_map, weight, found.whole, ranks, rest, hemisphere.parabolic_coordinates)
+
+
+class Reflected(NamedTuple):
+    """What each of some BRDFs reflects to views in the texels of a parabolic map, of light of natural spectrum.
+
+    Attributes:
+        tensor: Of each BRDF and color, for each view and harmonic.
+        to_map: Light maps of what reflects one harmonic each.
+        direction: Of each view.
+        area: Solid angle of each view, zero outside the map's disk.
+        whole: Squared norm of what they reflect before lobes are taken out.
+    """
+
+    tensor: Float[Array, "m c d b"]
+    to_map: Float[Array, "b e"]
+    direction: Float[Array, "d 3"]
+    area: Float[Array, " d"]
+    whole: Float[Array, ""]
+
+
+def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> Reflected:
+    """What BRDFs reflect without their lobes; arguments as of `factor`, which checks their number and colors."""
+    if resolution < 4:
+        raise ValueError(f"resolution must be at least 4, got {resolution}")
     direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
     area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
-    check_ranks(ranks, (len(brdfs) * colors, int(jnp.sum(area > 0)), (_DEGREE + 1) ** 2))
+    together = stacked(brdfs)
     # All at once where they are of one kind, and else one by one.
     parts = (
         [(jax.tree.map(lambda x: x[None], grid.as_argument(each)), jnp.array([n])) for n, each in enumerate(brdfs)]
@@ -199,9 +227,7 @@ def factor(
     if turned:
         tensor = _turn(tensor, direction)
     whole = jnp.sum(jnp.concatenate([square for _, square, _ in found])[:, :, back] * area)
-    return decompose(
-        tensor, _to_map(direction), jnp.sqrt(area), whole, ranks, (lobe, together), hemisphere.parabolic_coordinates
-    )
+    return Reflected(tensor, _to_map(direction), direction, area, whole)
 
 
 def decompose(

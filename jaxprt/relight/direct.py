@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxprt.scene.environment import Environment
@@ -100,10 +101,9 @@ def radiance(
 
     def group(argument):
         texel, excess, visible = argument
-        direction, area = (table(size=size).reshape(-1, 3)[texel] for table in (cubemap.direction, cubemap.vector_area))
+        direction = cubemap.direction(size=size).reshape(-1, 3)[texel]
         wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
-        flux = jnp.maximum(_along(frame[2], area[:, None]), 0) * visible
-        sent = value(wi, wo) * flux * facing
+        sent = value(wi, wo) * _flux(frame[2], texel, visible, size=size) * facing
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
     count = max(1, min(_GROUP, len(texel)))
@@ -113,6 +113,22 @@ def radiance(
         lambda x: x.reshape(len(x) // count, count, *x.shape[1:]), (texel, excess, transport.visible(texel))
     )
     return jnp.sum(jax.lax.map(group, groups), 0).T
+
+
+@jax.jit
+def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "v c"]:
+    """Irradiance over pi of light from some texels: the radiance of white diffuse vertices, from any side.
+
+    Arguments as of `radiance`.
+    """
+    flux = _flux(transport.frame[:, 2].T, texel, transport.visible(texel), size=transport.size)
+    return (excess.T @ flux).T / np.pi
+
+
+def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:
+    """Visible solid angle of some texels times the cosine."""
+    area = cubemap.vector_area(size=size).reshape(-1, 3)[texel]
+    return jnp.maximum(_along(normal, area[:, None]), 0) * visible
 
 
 def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:

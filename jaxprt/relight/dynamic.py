@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxprt.brdf.dynamic import DynamicBrdf, Mixed
-from jaxprt.brdf.models import Lambert
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.relight import direct, lobe, separable
 from jaxprt.relight.lobe import LobeLight, LobeView
@@ -49,12 +48,14 @@ class DynamicLight(eqx.Module):
         blurred: The same light for lobes; None where no region has any.
         texel: Its brightest texels, which are lit by one by one.
         excess: Their radiance.
+        matte: What white diffuse rows make of them.
     """
 
     met: tuple[Float[Array, "_ _ c"], ...]
     blurred: LobeLight | None
     texel: Int[Array, " t"]
     excess: Float[Array, "t c"]
+    matte: tuple[Float[Array, "_ c"], ...]
 
 
 class RegionView(eqx.Module):
@@ -138,7 +139,8 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
     if any(_has_pyramid(each) for each in transport.region):
         blurred = lobe.prefilter(rest)
         blurred = LobeLight(blurred.level, blurred.coefficient[:0], blurred.size)
-    return DynamicLight(met, blurred, texel, excess)
+    matte = tuple(direct.irradiance(each.seen, texel, excess) for each in transport.region)
+    return DynamicLight(met, blurred, texel, excess, matte)
 
 
 def view_side(
@@ -185,14 +187,13 @@ def combine(transport: DynamicTransport, light: DynamicLight, view: DynamicView)
         view: From `view_side`.
     """
     result = []
-    for own, met, each in zip(transport.region, light.met, view.region, strict=True):
+    for own, met, matte, each in zip(transport.region, light.met, light.matte, view.region, strict=True):
         if isinstance(each.brdf, SeparableBrdf):
             single = direct.radiance(own.seen, each.brdf, light.texel, light.excess, eye=view.eye)
             result.append(separable.combine(met, each.factor) + single)
             continue
         model = each.brdf if each.brdf.brdf is None else each.brdf.brdf
         single = direct.radiance(own.seen, model, light.texel, light.excess, eye=view.eye)
-        matte = direct.radiance(own.seen, Lambert(1.0), light.texel, light.excess, eye=view.eye)
         glossy = None
         if each.looked is not None:
             glossy = lobe.combine(light.blurred, _glossy(each.looked)), each.looked.diffuse.T

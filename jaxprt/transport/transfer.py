@@ -153,9 +153,8 @@ def precompute(
 
     Args:
         mesh: The whole scene, which lights itself.
-        brdfs: Of each region, in the order of their numbers, what light meets on its way: a set with terms and without
-            lobes, as `jaxprt.brdf.dynamic.factor` makes it with `ranks=(4, 24, 24)`, or the one BRDF that it has for
-            good, factored.
+        brdfs: Of each region, in the order of their numbers, what light meets on its way: a set from
+            `jaxprt.brdf.paths.factor`, or the one BRDF that it has for good, factored.
         bounces: 1 or 2.
         least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
             less than this share of what arrives.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import CookTorrance, Lambert, dynamic, separable
+from jaxprt.brdf import CookTorrance, Lambert, dynamic, paths, separable
 from jaxprt.relight import dynamic as direct
 from jaxprt.relight import transfer as relight
 from jaxprt.relight.dynamic import Material
@@ -41,7 +41,7 @@ def transport(mesh, brdfs):
 
 @pytest.fixture(scope="module")
 def tensor(mesh, brdfs):
-    along = dynamic.factor(MEMBERS, None, ranks=(2, 8, 8), resolution=12)
+    along = paths.factor(MEMBERS, functions=2, terms=8, resolution=12)
     options = {"components": 10**6, "modes": 10**6, "edge": 4, "size": 8, "progress": False}
     return transfer.precompute(mesh, [along, brdfs[1]], **options)
 

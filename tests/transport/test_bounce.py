@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, Lambert, dynamic, paths, separable
-from jaxprt.brdf.models import CookTorrance
+from jaxprt.brdf import AshikhminShirley, Lambert, paths, separable
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, harmonics
@@ -134,43 +133,6 @@ def test_in_a_closed_furnace_light_falls_as_the_geometric_series():
         irradiance = weight * arrived(response, axes, basis, rays, flux(hollow))[:, 0, 0, 0]
         np.testing.assert_allclose(irradiance, 0.7**number, rtol=3e-3)
         arriving = weight * arrived(response, axes, basis, rays, shining(3)).transpose(1, 2, 3, 0)[:, 0]
-
-
-def test_functions_of_a_set_make_its_brdfs():
-    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
-    table = dynamic.factor(members, None, ranks=(2, 8, 8), resolution=12)
-    share, diffuse, specular = jnp.array([0.3, 0.7]), jnp.array([0.1, 0.2, 0.3]), jnp.array([0.5, 0.4, 0.3])
-    random = np.random.default_rng(0).normal(size=(2, 50, 3))
-    random[..., 2] = np.abs(random[..., 2]) + 0.2
-    wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.float32)
-    value = paths.basis(table)(wi, wo) @ paths.weights(table.factor, share, diffuse, specular)
-    np.testing.assert_allclose(value, table.at(share)(wi, wo) * specular + diffuse / np.pi, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("brdf", "functions"), [(Lambert(0.3), 1), (Lambert([0.9, 0.3, 0.1]), 1), (Lambert([0.0, 0.0, 0.0]), 0)]
-)
-def test_one_brdf_has_as_few_functions_as_its_colors_need(brdf, functions):
-    factored = separable.factor(brdf, terms=1, resolution=8)
-    weight = paths.fixed_weights(factored)
-    assert weight.shape == (functions, factored.view_map.shape[-1])
-    assert paths.basis(factored).view_map.shape[-1] == functions
-
-
-def test_colors_of_their_own_are_functions_of_their_own():
-    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3), terms=4, resolution=12)
-    weight = paths.fixed_weights(glossy)
-    assert weight.shape == (2, 3)  # Diffuse color and white gloss.
-    wi = wo = jnp.array([[0.6, 0.0, 0.8], [0.0, 0.3, np.sqrt(0.91)]], jnp.float32)
-    np.testing.assert_allclose(paths.basis(glossy)(wi, wo) @ weight, glossy(wi, wo), rtol=1e-5)
-
-
-@pytest.mark.parametrize(("ranks", "found"), [(None, "none"), ((1, 1, 1), "those of what its lobes leave")])
-def test_a_set_without_terms_of_whole_brdfs_makes_no_functions(ranks, found):
-    members = [Lambert(0.5)]
-    table = dynamic.factor(members, dynamic.separate(members, lobes=1), ranks=ranks, resolution=8)
-    with pytest.raises(ValueError, match=f"without lobes, got {found}"):
-        paths.basis(table)
 
 
 def test_triangles_between_regions_send_what_each_corner_does(mesh, seen, frame, met):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, Lambert, dynamic, paths, separable
+from jaxprt.brdf import AshikhminShirley, Lambert, paths, separable
 from jaxprt.brdf.models import CookTorrance
 from jaxprt.relight import transfer as relight
 from jaxprt.relight.transfer import LitTransfer
@@ -235,7 +235,7 @@ def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
 
 def test_what_brings_little_is_left_out_and_told(mesh, capsys):
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
-    changing = dynamic.factor(members, None, ranks=(2, 6, 6), resolution=12)
+    changing = paths.factor(members, functions=2, terms=6, resolution=12)
     dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
     options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
     every = transfer.precompute(mesh, [changing, dark], progress=False, **options)
