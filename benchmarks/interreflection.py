@@ -42,7 +42,7 @@ from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.transport import dynamic as transports
 from jaxprt.transport import transfer
 
-FUNCTIONS, TERMS = 4, 24  # of a set along light paths
+FUNCTIONS, TERMS = 4, 32  # of a set along light paths
 LOBES = 4
 TEXELS = 16
 EDGE, SAMPLES = 256, 144

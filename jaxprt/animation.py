@@ -21,7 +21,7 @@ from jaxprt.report import Relit, Scene
 from jaxprt.scene import Camera, Environment
 
 LOBES = 4
-FUNCTIONS, TERMS = 4, 24  # of the sets that light meets on its way
+FUNCTIONS, TERMS = 4, 32  # of the sets that light meets on its way
 ROUGHNESS = (0.05, 0.12, 0.25, 0.5)  # of the set, beside those of the scene
 _ORBIT = np.radians(40)  # what the camera goes around in an animation
 _TEXELS = 16

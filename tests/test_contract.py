@@ -264,7 +264,7 @@ class Draw:
     def transfer(self, vertices):
         """Bounces of ``changing``, with what is stored in half precision in the one under test."""
         row, both = jnp.arange(vertices), transport.transfer.SecondBounce
-        second = both(self.normal(1, vertices, 2), jnp.zeros((1, 6, 2, 3, 3), jnp.float16), self.uniform(1))
+        second = both(self.normal(1, vertices, 2), jnp.zeros((1, 6, 2, 16, 3, 3), jnp.float16), self.uniform(1))
         tensor = transport.TransferTensor(
             self.normal(1, vertices, 2),
             jnp.zeros((1, 3, 2, 16, 3), jnp.float16),
@@ -277,7 +277,7 @@ class Draw:
             self.uniform(1),
             self.uniform(2),
         )
-        cores = self.normal(1, 3, 2, 16, 3), self.normal(1, 6, 2, 3, 3)
+        cores = self.normal(1, 3, 2, 16, 3), self.normal(1, 6, 2, 16, 3, 3)
         return eqx.tree_at(lambda each: (each.core, each.second.core), tensor, cores)
 
     def mixture(self, lobes=2):

@@ -1,6 +1,6 @@
 """Relighting with light that has been reflected once and twice, while light, view and materials are free.
 
-    B(x, wo) = sum_s E_x(s, wo) sum_l L(l) sum_q H(q) T1_x(l, q, s) + E_x(0, wo) sqrt(4 pi) I2_x
+    B(x, wo) = sum_s E_x(s, wo) [sum_l L(l) sum_q H(q) T1_x(l, q, s) + sum_l L(l) sum_qp H(q) H(p) T2_x(l, q, p, s)]
 
 A change of light redoes `light_side`, one of materials `arriving` and what follows, one of the view only `view_side`;
 `combine` makes radiance. What lobes of a BRDF and its other terms make of harmonics is exact: von Mises-Fisher lobes
@@ -35,11 +35,11 @@ class LitTransfer(eqx.Module):
 
     Attributes:
         first: Of each cluster and color: components, harmonics and functions.
-        second: Components, and functions of both bounces; None without a second bounce.
+        second: Components, harmonics, and functions of both bounces; None without a second bounce.
     """
 
     first: Float[Array, "g c n s q"]
-    second: Float[Array, "g c o q q"] | None
+    second: Float[Array, "g c o s q q"] | None
 
 
 class Arriving(eqx.Module):
@@ -176,9 +176,8 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
     met = jnp.einsum("gcnsq,qc->gscn", light.first, weight)
     rows = jnp.einsum("gscn,gmn->scgm", met, tensor.weight)
     if light.second is not None and tensor.second is not None:
-        twice = jnp.einsum("gcoqp,qc,pc->gco", light.second, weight, weight)
-        more = jnp.einsum("gco,gmo->cgm", twice, tensor.second.weight)
-        rows = rows.at[0].add(more * np.sqrt(4 * np.pi))  # of a function that is one everywhere
+        twice = jnp.einsum("gcosqp,qc,pc->gsco", light.second, weight, weight)
+        rows = rows + jnp.einsum("gsco,gmo->scgm", twice, tensor.second.weight)
     return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
 
 

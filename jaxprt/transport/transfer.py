@@ -1,12 +1,13 @@
 """Precomputed transfer tensors: what arrives at every vertex after one bounce and two, for any light and any BRDFs.
 
     I1_x(s) = sum_l L(l) sum_q H(q) T1_x(l, q, s)
-    I2_x = sum_l L(l) sum_qp H(q) H(p) T2_x(l, q, p)
+    I2_x(s) = sum_l L(l) sum_qp H(q) H(p) T2_x(l, q, p, s)
 
 One bounce has light of 6 x 8 x 8 texels l, and arrives as 16 harmonics s in world directions; q counts the functions of
 all regions, which `jaxprt.brdf.paths` makes, and H are their weights at present. Two bounces, off functions q and then
-p, have light of 6 x 2 x 2 texels, and arrive alike from everywhere. Vertices are clustered, and the tensors of each
-cluster are decomposed, along vertices and light. `jaxprt.relight.transfer` makes radiance of them.
+p, have light of 6 x 2 x 2 texels, which changes 7 % of them; that they arrived alike from everywhere, as they do in the
+paper, would change 50 %. Vertices are clustered, and the tensors of each cluster are decomposed, along vertices and
+light. `jaxprt.relight.transfer` makes radiance of them.
 
 A third bounce would follow in the same way, and cost as many times the second as there are functions.
 """
@@ -31,6 +32,7 @@ from jaxprt.transport import blocks, clustered, transfer_job
 
 _MEMBERS = 230  # vertices of a cluster
 _SEEN = 4  # visibility has faces so many times as large as the light's
+_FEWER = 4  # as many times fewer components have two bounces
 _SAMPLE = 8  # clusters that tell what a bounce is worth
 
 
@@ -39,17 +41,17 @@ class SecondBounce(eqx.Module):
 
     Attributes:
         weight: Of the components of its cluster, for each row.
-        core: Of each cluster: texels of the light, components, functions of the first and of the second bounce.
+        core: Of each cluster: texels of the light, components, harmonics, functions of the first and the second bounce.
         error: Relative L2 error of each cluster's tensor that the components make.
     """
 
     weight: Float[Array, "g m o"]
-    core: Float16[Array, "g l o q q"]
+    core: Float16[Array, "g l o s q q"]
     error: Float[Array, " g"]
 
     def keep(self, components: int) -> "SecondBounce":
         """The first components."""
-        energy = jnp.sum(self.core.astype(self.weight.dtype) ** 2, (1, 3, 4)) * jnp.sum(self.weight**2, 1)
+        energy = jnp.sum(self.core.astype(self.weight.dtype) ** 2, (1, 3, 4, 5)) * jnp.sum(self.weight**2, 1)
         whole = jnp.sum(energy, 1) / jnp.maximum(1 - self.error**2, jnp.finfo(energy.dtype).eps)
         kept = jnp.sum(energy[:, :components], 1)
         error = jnp.where(whole > 0, jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0)), 0)
@@ -91,7 +93,9 @@ class TransferTensor(eqx.Module):
         return sum(each.nbytes for each in jax.tree.leaves((self.weight, self.core, self.mode, self.second)))
 
     def keep(self, components: int, *, modes: int) -> "TransferTensor":
-        """The first components and modes of one bounce, and components of two; their error is then larger.
+        """The first components and modes of one bounce, and a quarter of these components of two.
+
+        Their errors are then larger.
 
         Raises:
             ValueError: Numbers below 1, or above those of the tensor.
@@ -103,7 +107,7 @@ class TransferTensor(eqx.Module):
         energy, whole = _energy(self)
         kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
-        second = self.second and self.second.keep(components)
+        second = self.second and self.second.keep(_twice(components))
         same = (self.place, self.region, self.function, self.factor, second)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)
 
@@ -125,7 +129,8 @@ class TransferTensor(eqx.Module):
         size = size + 4 * self.weight[..., 0].size * components + 4 * self.mode[..., 0].size * modes[:, None]
         if self.second is not None:
             each = self.second.core[:, :, 0].nbytes + self.second.weight[..., 0].nbytes
-            size = size + each * components + self.second.error.nbytes
+            held = np.minimum([_twice(int(each)) for each in components], self.second.core.shape[2])
+            size = size + each * held + self.second.error.nbytes
         fits = wrong <= error if error is not None else size <= nbytes
         if not fits.any():
             reached = f"error must be at least {wrong.min():.3g}" if nbytes is None else f"nbytes at least {size.min()}"
@@ -158,7 +163,7 @@ def precompute(
         bounces: 1 or 2.
         least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
             less than this share of what arrives.
-        components: Along the vertices of a cluster, or as many as it has.
+        components: Along the vertices of a cluster, or as many as it has; a quarter of them for two bounces.
         modes: Along the light, or as many as it has texels.
         edge: Edge of the light's faces in texels, a power of two.
         size: Edge of the faces through whose texels rays are sent.
@@ -222,9 +227,12 @@ def precompute(
     core = found["core"][..., function]
     second = None
     if bounces == 2 and function.size:
-        again = job.again(weight, core, found["mode"], function)
+        count = min(_twice(components), member.shape[1])
+        again = job.again(weight, core, found["mode"], function, components=count)
         sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
-        worth.append(_rms(np.concatenate([again.brought(again.tensor(member[each])) for each in sample])))
+        white = job.white[function]
+        brought = [again.brought(again.tensor(member[each]), member[each], white) for each in sample]
+        worth.append(_rms(np.concatenate(brought)))
         if worth[1] >= least:
             store = None if path is None else os.path.join(path, "clusters_2")
             twice = blocks.compute(again, path=store, label="bounce 2", **options)
@@ -244,6 +252,11 @@ def _energy(tensor: TransferTensor) -> tuple[Float[Array, "g e n"], Float[Array,
     size = jnp.sum(tensor.weight**2, 1)
     energy = jnp.sum(tensor.core.astype(size.dtype) ** 2, (3, 4)) * size[:, None]
     return energy, jnp.sum(energy, (1, 2)) / jnp.maximum(1 - tensor.error**2, jnp.finfo(size.dtype).eps)
+
+
+def _twice(components: int) -> int:
+    """Components of two bounces beside those of one."""
+    return max(1, components // _FEWER)
 
 
 def _white(factor: Array) -> np.ndarray:

@@ -80,10 +80,12 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
         same = {"system": "transfer", "mesh": self.mesh_key, "size": self.size, "kinds": kinds, "brdfs": key}
         return {**same, "made": made, "components": self.components}
 
-    def arrived(self, part: np.ndarray, measure: np.ndarray) -> Float[np.ndarray, "b s q l"]:
-        """What arrives at some vertices by measures of each texel, [d s] or [b d s], before it is decomposed."""
+    def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
+        """Harmonics of what arrives at some vertices, before it is decomposed."""
         found = bounce.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
+        area = np.asarray(cubemap.solid_angle(size=self.size), np.float32).reshape(-1, 1)
+        measure = np.asarray(harmonics.evaluate(jnp.asarray(way), degree=DEGREE)) * area
         result = []
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             if number not in found:
@@ -96,11 +98,21 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
             # Padded to a power of two groups, so that few shapes are compiled; what is added weighs nothing.
             spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
             owner, corner, weight, texel = (np.pad(x, ((0, spare), *[(0, 0)] * (x.ndim - 1))) for x in rays)
-            each = measure[texel] if measure.ndim == 2 else measure[owner[:, None], texel]
-            fixed = (owner, local[corner], weight, way[texel], each)
+            fixed = (owner, local[corner], weight, way[texel], measure[texel])
             arrived = bounce.arrive(response, self.frame[own], basis, *map(jnp.asarray, fixed), points=len(part))
             result.append(np.asarray(arrived))
         return np.concatenate(result, 2)
+
+    def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
+        """Irradiance over pi at each vertex of a part, by weights of functions, under constant light."""
+        cosine = harmonics.convolve(
+            harmonics.evaluate(jnp.asarray(self.frame[part, 2]), degree=DEGREE).T,
+            harmonics.cosine(degree=DEGREE) / np.pi,
+        )
+        met = np.sum(tensor, 1)
+        for _ in range(met.ndim - 2):
+            met = met @ white
+        return np.einsum("bs,sb->b", met, cosine)
 
 
 @dataclass(frozen=True)
@@ -134,23 +146,18 @@ class TransferJob(_PathJob):
         flat = jnp.asarray(tensor.reshape(count, light, -1))
         weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
         core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions)
-        cosine = harmonics.convolve(
-            harmonics.evaluate(jnp.asarray(self.frame[self.member[block], 2]), degree=DEGREE).T,
-            harmonics.cosine(degree=DEGREE) / np.pi,
-        )
-        white = np.einsum("blsq,sb,q->b", tensor, cosine, self.white, optimize=True)
+        white = self.brought(tensor, self.member[block], self.white)
         energy = np.sum(tensor**2, (0, 1, 2))[None]
         rows = {"weight": weight, "core": core, "mode": mode[None], "error": error[None], "energy": energy}
         return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
         """What arrives at some vertices, before it is decomposed."""
-        area = np.asarray(cubemap.solid_angle(size=self.size), np.float32).reshape(-1, 1)
-        way = cubemap.direction(size=self.size).reshape(-1, 3)
-        shining = np.asarray(harmonics.evaluate(way, degree=DEGREE)) * area
-        return np.moveaxis(self.arrived(part, shining), 3, 1)
+        return np.moveaxis(self.arrived(part), 3, 1)
 
-    def again(self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray) -> "AgainJob":
+    def again(
+        self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int
+    ) -> "AgainJob":
         """The job of a second bounce, off surfaces that the first one lights."""
         fine = math.isqrt(self.response[0].shape[1] // 6)
         edge = min(_AGAIN, fine)
@@ -170,7 +177,7 @@ class TransferJob(_PathJob):
                     made = bounce.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[own]]] = np.asarray(made)[own]
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
-        return AgainJob(**{**same, "response": tuple(response)}, function=function)
+        return AgainJob(**{**same, "response": tuple(response), "components": components}, function=function)
 
 
 @dataclass(frozen=True)
@@ -189,9 +196,10 @@ class AgainJob(_PathJob):
         """Shapes of one block."""
         functions = len(self.function)
         light = self.response[0].shape[1] // functions
+        shape = (1, light, self.components, (DEGREE + 1) ** 2, functions, functions)
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
-            "core": Layout((1, light, self.components, functions, functions), 0, "float16"),
+            "core": Layout(shape, 0, "float16"),
             "error": Layout((1,), 0, "float32"),
             "white": Layout((self.step,), 0, "float32"),
         }
@@ -201,19 +209,14 @@ class AgainJob(_PathJob):
         tensor = self.tensor(self.member[block])
         weight, core, error = _along_vertices(jnp.asarray(tensor), components=self.components)
         rows = {"weight": weight, "core": core[None], "error": error[None]}
-        return {name: np.asarray(each) for name, each in (rows | {"white": self.brought(tensor)}).items()}, 0
+        white = self.brought(tensor, self.member[block], self.white[self.function])
+        return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
 
-    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l q q"]:
-        """Irradiance over pi at some vertices, before it is decomposed."""
-        area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
-        flux = np.maximum(self.frame[part, 2] @ area.T, 0)[..., None] / np.float32(np.pi)
-        found = self.arrived(part, flux)[:, 0][:, self.function]
-        return np.moveaxis(found.reshape(*found.shape[:2], -1, len(self.function)), 1, 3)
-
-    def brought(self, tensor: np.ndarray) -> np.ndarray:
-        """What two bounces bring to each vertex of a part."""
-        white = self.white[self.function]
-        return np.einsum("blqp,q,p->b", tensor, white, white, optimize=True)
+    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
+        """What arrives at some vertices, before it is decomposed."""
+        found = self.arrived(part)[:, :, self.function]
+        found = found.reshape(*found.shape[:3], -1, len(self.function))
+        return found.transpose(0, 3, 1, 4, 2)
 
 
 @functools.partial(jax.jit, static_argnames=("components", "modes"))
