@@ -227,7 +227,10 @@ def combine(
 
 @partial(jax.jit, static_argnames=("edge",))
 def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
-    """Mean radiance of the texels of coarser faces.
+    """Radiance of the texels of coarser faces: light is shared by the four texels around it, by its distances.
+
+    So a small sun is where it is, to second order; kept in one texel alone it would be in its middle. Constant light
+    stays as it is; flux is kept within 2.5 % for faces of 8 x 8, 5 % for those of 4 x 4.
 
     Raises:
         ValueError: The coarse faces' edge does not divide the light's.
@@ -235,10 +238,11 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     size = radiance.shape[1]
     if edge < 1 or size % edge:
         raise ValueError(f"the edge of coarse faces must divide the light's {size}, got {edge}")
-    fold = size // edge
-    area = cubemap.solid_angle(size=size)[..., None]
-    value, whole = (x.reshape(6, edge, fold, edge, fold, -1).sum((2, 4)) for x in (radiance * area, area))
-    return (value / whole).reshape(6 * edge * edge, -1)
+    area, way = cubemap.solid_angle(size=size)[..., None], cubemap.direction(size=size)
+    each = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
+    shape = jax.ShapeDtypeStruct((6, edge, edge, each.shape[-1]), each.dtype)
+    (total,) = jax.linear_transpose(lambda faces: cubemap.lookup(faces, way), shape)(each)
+    return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
 
 
 @jax.jit

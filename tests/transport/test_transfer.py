@@ -122,10 +122,12 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(brdfs):
         result[point, through] = np.einsum("hk,hkc->hc", share, leaving(radiance, corner, wo))
         return result
 
-    once = gather(np.where(mask[:, None], np.asarray(seen)[..., None] / 16 * np.ones(3), 0))
+    lamp = Environment(jnp.asarray(np.where(mask, 1.0, 0).reshape(6, SIZE, SIZE, 1), jnp.float32))
+    held = np.asarray(relight.coarse(lamp.radiance, edge=2)).reshape(6, 2, 1, 2, 1)
+    shone = np.broadcast_to(held, (6, 2, 8, 2, 8)).reshape(-1)  # The lamp and some of what is around it.
+    once = gather(shone[:, None] * np.asarray(seen)[..., None] / 16 * np.ones(3))
     shining = np.asarray(harmonics.evaluate(way, degree=3)) * np.asarray(cubemap.solid_angle(size=SIZE)).reshape(-1, 1)
     twice = np.einsum("vdc,ds->vsc", gather(once), shining)
-    lamp = Environment(jnp.asarray(np.where(mask, 1.0, 0).reshape(6, SIZE, SIZE, 1), jnp.float32))
     _, found = arriving(whole, lamp)
     assert np.abs(twice).max() > 1e-3
     assert relative(found, twice) < TWICE
@@ -253,13 +255,34 @@ def test_what_brings_little_is_left_out_and_told(mesh, capsys):
     assert few.worth[1] < 0.05
 
 
-def test_a_coarse_light_has_the_flux_of_the_light():
+def test_a_coarse_light_is_where_the_light_is():
+    np.testing.assert_allclose(relight.coarse(jnp.full((6, 16, 16, 1), 0.3), edge=4), 0.3, rtol=1e-5)
     fine = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
-    small = relight.coarse(fine, edge=4)
     wide, narrow = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (4, 16))
-    np.testing.assert_allclose(np.sum(small * wide, 0), np.sum(fine.reshape(-1, 3) * narrow, 0), rtol=1e-5)
+    flux = np.sum(relight.coarse(fine, edge=4) * wide, 0)
+    np.testing.assert_allclose(flux, (narrow * fine.reshape(-1, 3)).sum(0), rtol=0.002)
+    np.testing.assert_allclose(relight.coarse(fine, edge=16), fine.reshape(-1, 3), rtol=1e-5)
     with pytest.raises(ValueError, match="must divide the light's 16, got 5"):
         relight.coarse(fine, edge=5)
+
+
+@pytest.mark.parametrize("size", [4, 8])
+def test_the_middle_of_a_sun_stays_in_place(size):
+    """Within .04 of a coarse texel; in the middle of one alone it would be off by up to .7."""
+    area = np.asarray(cubemap.solid_angle(size=size)).ravel()
+    place, fine = (np.asarray(cubemap.point(size=n)).reshape(-1, 3) for n in (size, 64))
+    off = []
+    for texel in np.random.default_rng(2).integers(0, 64**2, 60):
+        sun = jnp.zeros((6 * 64**2, 1)).at[texel].set(1.0).reshape(6, 64, 64, 1)
+        flux = np.asarray(relight.coarse(sun, edge=size))[:, 0] * area
+        at = fine[texel]
+        if np.sort(np.abs(at))[1] > 1 - 1 / size:
+            continue  # Shared with other faces.
+        off.append(np.linalg.norm(flux @ place / flux.sum() - at) / (2 / size))
+        total = float(cubemap.solid_angle(size=64).ravel()[texel])
+        np.testing.assert_allclose(flux.sum(), total, rtol={4: 0.05, 8: 0.025}[size])
+    assert len(off) > 20
+    assert max(off) < 0.04
 
 
 def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
