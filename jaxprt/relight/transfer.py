@@ -173,11 +173,12 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
     colors = max(light.first.shape[1], weight.shape[1])
     weight = jnp.broadcast_to(weight, (len(weight), colors))
     light = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), colors, *x.shape[2:])), light)
-    met = jnp.einsum("gcnsq,qc->gscn", light.first, weight)
-    rows = jnp.einsum("gscn,gmn->scgm", met, tensor.weight)
+    met, row = jnp.einsum("gcnsq,qc->gscn", light.first, weight), tensor.weight
     if light.second is not None and tensor.second is not None:
-        twice = jnp.einsum("gcosqp,qc,pc->gsco", light.second, weight, weight)
-        rows = rows + jnp.einsum("gsco,gmo->scgm", twice, tensor.second.weight)
+        both = jnp.einsum("qc,pc->cqp", weight, weight).reshape(colors, -1)
+        twice = jnp.einsum("gcosk,ck->gsco", light.second.reshape(*light.second.shape[:4], -1), both)
+        met, row = jnp.concatenate([met, twice], -1), jnp.concatenate([row, tensor.second.weight], -1)
+    rows = jnp.einsum("gscn,gmn->scgm", met, row)
     return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
 
 
