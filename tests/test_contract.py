@@ -566,6 +566,9 @@ EXAMPLES = {
         )
     ),
     "relight.direct.split": example(lambda draw: call(draw.light()), count=5),
+    "relight.direct.irradiance": example(
+        lambda draw: call(draw.direct(), draw.integer(96, 5), draw.uniform(5, 3)), gradient=("excess",)
+    ),
     "relight.direct.radiance": example(
         lambda draw: call(
             each := draw.direct(),
