@@ -592,6 +592,7 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
+    "transport.transfer.scales": example(lambda draw: call((draw.normal(3, 1, 2), draw.normal(2, 3)))),
     "relight.transfer.radiance": example(
         lambda draw: call(
             each := draw.regions(),

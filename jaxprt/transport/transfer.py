@@ -32,7 +32,8 @@ from jaxprt.transport import blocks, clustered, transfer_job
 
 _MEMBERS = 230  # vertices of a cluster
 _SEEN = 4  # visibility has faces so many times as large as the light's
-_FEWER = 4  # as many times fewer components have two bounces
+_FEWER = 2  # as many times fewer components have two bounces
+_LEAST = 0.01  # of the largest weight
 _SAMPLE = 8  # clusters that tell what a bounce is worth
 
 
@@ -42,16 +43,17 @@ class SecondBounce(eqx.Module):
     Attributes:
         weight: Of the components of its cluster, for each row.
         core: Of each cluster: texels of the light, components, harmonics, functions of the first and the second bounce.
-        error: Relative L2 error of each cluster's tensor that the components make.
+        error: Relative L2 error of each cluster's tensor that the components make, as that of one bounce.
     """
 
     weight: Float[Array, "g m o"]
     core: Float16[Array, "g l o s q q"]
     error: Float[Array, " g"]
 
-    def keep(self, components: int) -> "SecondBounce":
-        """The first components."""
-        energy = jnp.sum(self.core.astype(self.weight.dtype) ** 2, (1, 3, 4, 5)) * jnp.sum(self.weight**2, 1)
+    def keep(self, components: int, *, scale: Float[Array, " q"]) -> "SecondBounce":
+        """The first components; functions count by some scale."""
+        core = self.core * (scale[:, None] * scale)
+        energy = jnp.sum(core**2, (1, 3, 4, 5)) * jnp.sum(self.weight**2, 1)
         whole = jnp.sum(energy, 1) / jnp.maximum(1 - self.error**2, jnp.finfo(energy.dtype).eps)
         kept = jnp.sum(energy[:, :components], 1)
         error = jnp.where(whole > 0, jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0)), 0)
@@ -70,8 +72,8 @@ class TransferTensor(eqx.Module):
         function: Numbers of the functions that are kept among those of all regions.
         factor: What makes the weights of each region's functions: those of the BRDFs of a set, or of one BRDF.
         second: Two bounces, if asked for and not left out.
-        error: Relative L2 error of each cluster's tensor that the decomposition makes, a difference of squares: less
-            than 5e-4 is rounding.
+        error: Relative L2 error of each cluster's tensor that the decomposition makes, of functions at the largest
+            weights they can have; a difference of squares: less than 5e-4 is rounding.
         worth: What each bounce brings to white surfaces under constant light, root mean square of irradiance over that
             of an open surface. Regions with one BRDF count as they are.
     """
@@ -93,7 +95,7 @@ class TransferTensor(eqx.Module):
         return sum(each.nbytes for each in jax.tree.leaves((self.weight, self.core, self.mode, self.second)))
 
     def keep(self, components: int, *, modes: int) -> "TransferTensor":
-        """The first components and modes of one bounce, and a quarter of these components of two.
+        """The first components and modes of one bounce, and half as many components of two.
 
         Their errors are then larger.
 
@@ -107,7 +109,7 @@ class TransferTensor(eqx.Module):
         energy, whole = _energy(self)
         kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
-        second = self.second and self.second.keep(_twice(components))
+        second = self.second and self.second.keep(_twice(components), scale=scales(self.factor)[self.function])
         same = (self.place, self.region, self.function, self.factor, second)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)
 
@@ -163,7 +165,7 @@ def precompute(
         bounces: 1 or 2.
         least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
             less than this share of what arrives.
-        components: Along the vertices of a cluster, or as many as it has; a quarter of them for two bounces.
+        components: Along the vertices of a cluster, or as many as it has; half of them for two bounces.
         modes: Along the light, or as many as it has texels.
         edge: Edge of the light's faces in texels, a power of two.
         size: Edge of the faces through whose texels rays are sent.
@@ -212,6 +214,7 @@ def precompute(
         bases=bases,
         response=tuple(response),
         white=np.concatenate([_white(each) for each in factor]),
+        scale=np.asarray(scales(factor)),
         region=np.searchsorted(numbers, region),
         member=member,
         components=min(components, member.shape[1]),
@@ -220,7 +223,7 @@ def precompute(
     del response
     store = None if path is None else os.path.join(path, "clusters")
     found = blocks.compute(job, path=store, label="bounce", **options)
-    share = _shares(found["energy"], factor)
+    share = _shares(found["energy"], job.scale)
     function = np.flatnonzero(share >= least)
     worth = [_rms(found["white"])]
     weight = found["weight"].reshape(*member.shape, -1)
@@ -250,7 +253,7 @@ def precompute(
 def _energy(tensor: TransferTensor) -> tuple[Float[Array, "g e n"], Float[Array, " g"]]:
     """What each mode and component holds of a cluster's tensor under light of natural spectrum, and all of it."""
     size = jnp.sum(tensor.weight**2, 1)
-    energy = jnp.sum(tensor.core.astype(size.dtype) ** 2, (3, 4)) * size[:, None]
+    energy = jnp.sum((tensor.core * scales(tensor.factor)[tensor.function]) ** 2, (3, 4)) * size[:, None]
     return energy, jnp.sum(energy, (1, 2)) / jnp.maximum(1 - tensor.error**2, jnp.finfo(size.dtype).eps)
 
 
@@ -267,13 +270,19 @@ def _white(factor: Array) -> np.ndarray:
     return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
 
 
-def _shares(energy: np.ndarray, factor: tuple) -> np.ndarray:
-    """What each function brings at its largest weight, as a share of what all bring."""
+def scales(factor: Sequence[Array]) -> Float[Array, " q"]:
+    """Largest weights of all functions, at least a hundredth of the largest of all: half precision must hold both."""
     largest = []
     for each in factor:
-        size = np.abs(np.asarray(each))
-        largest.append(np.append(size.max((0, 1)), 1) if each.ndim == 3 else size.max(1))
-    size = np.sqrt(energy.sum(0)) * np.concatenate(largest)
+        size = jnp.abs(each)
+        largest += [jnp.max(size, (0, 1)), jnp.ones(1)] if each.ndim == 3 else [jnp.max(size, 1)]
+    whole = jnp.concatenate(largest)
+    return jnp.maximum(whole, _LEAST * jnp.max(whole, initial=0))
+
+
+def _shares(energy: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """What each function brings at its largest weight, as a share of what all bring."""
+    size = np.sqrt(energy.sum(0)) * scale
     return size / max(np.linalg.norm(size), np.finfo(np.float32).tiny)
 
 

@@ -61,12 +61,14 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
         bases: Functions of each region.
         response: Of their light factors, at the vertices of each region.
         white: Weights of all functions by which a bounce is judged.
+        scale: Of all functions, by which errors of decompositions count them.
         region: Number of each vertex's region.
     """
 
     bases: tuple[SeparableBrdf, ...]
     response: tuple[np.ndarray, ...]
     white: np.ndarray
+    scale: np.ndarray
     region: np.ndarray
     member: np.ndarray
     components: int
@@ -75,7 +77,7 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
         key = " ".join(_key(basis) for basis in self.bases)
-        made = blocks.fingerprint(self.region, self.member, self.white)
+        made = blocks.fingerprint(self.region, self.member, self.white, self.scale)
         kinds = self.response[0].shape[1]
         same = {"system": "transfer", "mesh": self.mesh_key, "size": self.size, "kinds": kinds, "brdfs": key}
         return {**same, "made": made, "components": self.components}
@@ -143,9 +145,9 @@ class TransferJob(_PathJob):
         """One block."""
         tensor = self.tensor(self.member[block])
         count, light, harmonic, functions = tensor.shape
-        flat = jnp.asarray(tensor.reshape(count, light, -1))
+        flat = jnp.asarray((tensor * self.scale).reshape(count, light, -1))
         weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
-        core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions)
+        core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions) / self.scale
         white = self.brought(tensor, self.member[block], self.white)
         energy = np.sum(tensor**2, (0, 1, 2))[None]
         rows = {"weight": weight, "core": core, "mode": mode[None], "error": error[None], "energy": energy}
@@ -207,8 +209,10 @@ class AgainJob(_PathJob):
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block."""
         tensor = self.tensor(self.member[block])
-        weight, core, error = _along_vertices(jnp.asarray(tensor), components=self.components)
-        rows = {"weight": weight, "core": core[None], "error": error[None]}
+        scale = self.scale[self.function]
+        both = scale[:, None] * scale
+        weight, core, error = _along_vertices(jnp.asarray(tensor * both), components=self.components)
+        rows = {"weight": weight, "core": (np.asarray(core) / both)[None], "error": error[None]}
         white = self.brought(tensor, self.member[block], self.white[self.function])
         return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
 

@@ -206,7 +206,7 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
         faces = jnp.zeros((6 * EDGE**2, 1)).at[wavelet].set(spectrum[wavelet]).reshape(6, EDGE, EDGE, 1)
         lamp = Environment(haar.inverse(faces))
         for function in range(3):
-            weight = jnp.zeros((3, 1)).at[function].set(1.0)
+            weight = jnp.zeros((3, 1)).at[function].set(transfer.scales(whole.factor)[function])
             exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
             wrong, total = wrong + np.sum((found - exact) ** 2), total + np.sum(exact**2)
     assert float(cut.error[0]) > 0.01
