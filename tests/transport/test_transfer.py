@@ -303,3 +303,9 @@ def test_what_makes_no_tensor_is_refused(mesh, brdfs):
         transfer.precompute(mesh, brdfs, edge=6, progress=False)
     with pytest.raises(ValueError, match="bounces must be 1 or 2, got 3"):
         transfer.precompute(mesh, brdfs, bounces=3, progress=False)
+
+
+def test_the_default_number_of_components_keeps_the_light_of_two_bounces(whole):
+    short = whole.keep(32, modes=64)
+    found, exact = (np.sum(arriving(each, light(4))[1][:, 0]) for each in (short, whole))
+    assert found > 0.98 * exact
