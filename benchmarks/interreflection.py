@@ -42,7 +42,6 @@ from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.transport import dynamic as transports
 from jaxprt.transport import transfer
 
-FUNCTIONS, TERMS = 4, 32  # of a set along light paths
 LOBES = 4
 TEXELS = 16
 EDGE, SAMPLES = 256, 144
@@ -95,8 +94,9 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     family = navigation.cook_torrance(point=point)
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
     start = time.perf_counter()
-    functions, terms = (2, 6) if quick else (FUNCTIONS, TERMS)
-    along = paths.factor(family.brdf, functions=functions, terms=terms, resolution=12 if quick else 32)
+    sizes: dict = {"functions": 2, "terms": 6, "resolution": 12} if quick else {}
+    along = paths.factor(family.brdf, **sizes)
+    functions, terms = along.factor.shape[-1], len(along.light_map)
     yield {
         **{"benchmark": "interreflection", "case": f"basis: Cook-Torrance, {functions} functions of {terms} terms"},
         **{"seconds": time.perf_counter() - start, "compile_seconds": 0.0, "bytes": along.nbytes},

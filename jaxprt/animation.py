@@ -21,7 +21,6 @@ from jaxprt.report import Relit, Scene
 from jaxprt.scene import Camera, Environment
 
 LOBES = 4
-FUNCTIONS, TERMS = 4, 32  # of the sets that light meets on its way
 ROUGHNESS = (0.05, 0.12, 0.25, 0.5)  # of the set, beside those of the scene
 _ORBIT = np.radians(40)  # what the camera goes around in an animation
 _TEXELS = 16
@@ -80,8 +79,7 @@ def prepare(whole: Scene, output: Path, *, bounces: int) -> Ready:
     tensor = None
     if bounces:
         start = timeit.default_timer()
-        functions = min(FUNCTIONS, len(family.brdf))
-        bases = brdf.paths.factor(family.brdf, functions=functions, terms=TERMS)
+        bases = brdf.paths.factor(family.brdf)
         paths = [fixed.get(number, bases) for number in count]
         tensor = transport.transfer.precompute(mesh, paths, bounces=bounces, path=store / f"bounces_{bounces}")
         told |= {"bounces_seconds": timeit.default_timer() - start, "bounces_bytes": tensor.nbytes}

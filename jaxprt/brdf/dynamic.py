@@ -172,7 +172,7 @@ def factor(
 
     Reference: Sun et al. 2007, section 3.2, equation 2, with the prior in place of their Frobenius norm.
     """
-    colors = check(brdfs, lobe)
+    colors = check(brdfs, lobe, resolution=resolution)
     together = stacked(brdfs)
     if ranks is None:
         if lobe is None:
@@ -206,9 +206,7 @@ class Reflected(NamedTuple):
 
 
 def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> Reflected:
-    """What BRDFs reflect without their lobes; arguments as of `factor`, which checks their number and colors."""
-    if resolution < 4:
-        raise ValueError(f"resolution must be at least 4, got {resolution}")
+    """What BRDFs reflect without their lobes; arguments as of `factor`, which checks them."""
     direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
     area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
     together = stacked(brdfs)
@@ -283,8 +281,10 @@ def decompose(
     )
 
 
-def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None) -> int:
-    """Refuses a set without BRDFs, and lobes that are not those of the set; returns the number of colors."""
+def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> int:
+    """Refuses a set without BRDFs, lobes of another set, and maps too small; returns the number of colors."""
+    if resolution < 4:
+        raise ValueError(f"resolution must be at least 4, got {resolution}")
     _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
         raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")

@@ -49,7 +49,7 @@ def factor(brdfs: Sequence[Callable], *, functions: int = 4, terms: int = 32, re
 
     Reference: Sun et al. 2007, section 3.1, in the norm of natural light in place of Frobenius'.
     """
-    colors = dynamic.check(brdfs, None)
+    colors = dynamic.check(brdfs, None, resolution=resolution)
     found = dynamic.reflect(brdfs, None, resolution=resolution)
     count, _, views, harmonic = found.tensor.shape
     kinds = (_SMOOTH + 1) ** 2

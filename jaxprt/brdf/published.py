@@ -207,7 +207,7 @@ def factor_tensor(
 
     Reference: Sun et al. 2007, section 3.2, equation 2.
     """
-    dynamic.check(brdfs, None)
+    dynamic.check(brdfs, None, resolution=resolution)
     direction, area = _texels(resolution, hemisphere.disk_coordinates)
     # Texels outside the disk, which bilinear lookup needs at the rim, count next to nothing.
     flux = jnp.sqrt(jnp.maximum(area, 1e-6 * jnp.max(area)))

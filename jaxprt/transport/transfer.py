@@ -131,7 +131,7 @@ class TransferTensor(eqx.Module):
         size = size + 4 * self.weight[..., 0].size * components + 4 * self.mode[..., 0].size * modes[:, None]
         if self.second is not None:
             each = self.second.core[:, :, 0].nbytes + self.second.weight[..., 0].nbytes
-            held = np.minimum([_twice(int(each)) for each in components], self.second.core.shape[2])
+            held = np.minimum([_twice(int(count)) for count in components], self.second.core.shape[2])
             size = size + each * held + self.second.error.nbytes
         fits = wrong <= error if error is not None else size <= nbytes
         if not fits.any():

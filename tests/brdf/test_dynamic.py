@@ -204,6 +204,8 @@ def test_derivatives_by_shares(lobes, pairs):
         (lambda _: dynamic.factor(SET, None, ranks=(4, 1, 1), resolution=8), r"from 1 to the tensor's size \(3, "),
         (lambda _: dynamic.factor(SET, None, ranks=(0, 1, 1), resolution=8), "from 1"),
         (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=2), "resolution must be at least 4"),
+        (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=0), "resolution must be at least 4"),
+        (lambda _: published.factor_tensor(SET, ranks=(1, 1, 1), resolution=0), "resolution must be at least 4"),
         (lambda _: dynamic.factor([SET[0], Lambert([1.0, 0, 0])], None, ranks=(1, 1, 1)), r"\[b 1\], or all to"),
         (
             lambda _: dynamic.factor([SET[0], lambda wi, wo: -wi[:, 2:]], None, ranks=(1, 1, 1), resolution=8),
