@@ -37,6 +37,7 @@ BATCH = 3
 JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
+    "staging": "takes functions",
     "report": "measures, and writes files",
     "animation": "the same",
     "files": "reads and writes files",

@@ -1,7 +1,9 @@
 """BRDFs as sums of products of a light map and a view map: f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
 
 import importlib
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,9 +13,11 @@ from jaxtyping import Array, Float
 
 from jaxprt.linalg import eigen
 from jaxprt.sphere import harmonics, hemisphere
+from jaxprt.staging import apart
 
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
 _MOST_TERMS = 256
+_BLOCK = 2048  # directions that are looked up at once, and again for gradients, so that what was read is not kept
 _NULL = 4  # rounding errors of the largest value: less is none
 
 
@@ -65,8 +69,19 @@ class SeparableBrdf(eqx.Module):
 
     def _read(self, texel: Array, direction: Array) -> Array:
         polar = self.coordinates is hemisphere.polar_coordinates
-        lookup = hemisphere.polar_lookup if polar else hemisphere.lookup
-        return lookup(jnp.moveaxis(texel, 0, 2), self.coordinates(direction))
+        return _looked_up(jnp.moveaxis(texel, 0, 2), self.coordinates(direction), polar=polar)
+
+
+@partial(apart, static=("polar",))
+def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
+    lookup = hemisphere.polar_lookup if polar else hemisphere.lookup
+    if texel.shape[-1] == 1:  # Gradients by the place would take ten times as long with a trailing axis of 1.
+        return _looked_up(texel[..., 0], coordinates, polar=polar)[..., None]
+    *batch, axes = coordinates.shape
+    if math.prod(batch) <= _BLOCK:
+        return lookup(texel, coordinates)
+    each = jax.checkpoint(lambda place: lookup(texel, place))
+    return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
 
 
 def _unpickle(light_map, view_map, error, module: str, name: str) -> SeparableBrdf:

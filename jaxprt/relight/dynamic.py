@@ -18,6 +18,7 @@ from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.relight import direct, lobe, separable
 from jaxprt.relight.lobe import LobeLight, LobeView
 from jaxprt.scene.environment import Environment
+from jaxprt.staging import apart
 from jaxprt.transport.dynamic import DynamicTransport, RegionTransport
 from jaxprt.transport.lobe import LobeTransport
 
@@ -201,7 +202,7 @@ def combine(transport: DynamicTransport, light: DynamicLight, view: DynamicView)
     return _gathered(tuple(result), transport.place)
 
 
-@jax.jit
+@apart
 def _mixed(brdf: DynamicBrdf, share: Array) -> Mixed:
     return brdf.at(share)
 
@@ -211,7 +212,7 @@ def _glossy(view: LobeView) -> LobeView:
     return LobeView(view.place, view.share, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
 
 
-@jax.jit
+@apart
 def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
     irradiance, result = met[:, -1], single
     if factor is not None:

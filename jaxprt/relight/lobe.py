@@ -22,6 +22,7 @@ from jaxprt.brdf.lobe import LobeBrdf, Lobes
 from jaxprt.linalg import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, harmonics
+from jaxprt.staging import apart
 from jaxprt.transport.lobe import DEGREE, LobeTransport, Scales, between, corners
 
 _FIRST = 0.8  # width of the finest blur in texels of the environment
@@ -111,8 +112,6 @@ def prefilter(light: Environment) -> LobeLight:
 def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) -> LobeView:
     """Where each vertex reads the light for a view, and what it sees there.
 
-    Its steps are compiled one by one, since XLA's CPU code would repeat each for every use in the next.
-
     Arguments as of `radiance`.
     """
     lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye)
@@ -122,7 +121,7 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) ->
     return LobeView(place, share, lobe.weight, lobe.diffuse, transport.vector, transport.size)
 
 
-@jax.jit
+@apart
 def _places(position: Array, frame: Array, brdf: LobeBrdf, eye: Array) -> tuple[Lobes, tuple[Array, ...]]:
     """Lobes of each vertex, and face, place on it and spread of each."""
     offset = [eye[i] - position[:, i] for i in range(3)]
@@ -132,7 +131,7 @@ def _places(position: Array, frame: Array, brdf: LobeBrdf, eye: Array) -> tuple[
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(apart, static=("size",))
 def _taps(face, s, t, spread, concentration, share, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Texels of the blurred light, and what each counts."""
     seen, by_s, by_t = share
@@ -152,7 +151,7 @@ def _taps(face, s, t, spread, concentration, share, *, size: int) -> tuple[tuple
     return tuple(place), tuple(result)
 
 
-@jax.jit
+@apart
 def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     """Radiance of a view under a light.
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
+from jaxprt.staging import apart, linear
 
 _STEPS = (1 << 15) - 1  # signed 16 bits
 
@@ -143,6 +144,37 @@ def _choose(coefficient: Array, weight: Array, count: int) -> Array:
     return jnp.zeros_like(coefficient).at[index].set(coefficient[index])
 
 
+@jax.custom_jvp
+def _product(light: Array, view: Array) -> Array:
+    return _sum(light, view)
+
+
+@_product.defjvp
+def _(primal, tangent):
+    light, view = primal
+    parts = [
+        linear(_sum, _spread_gray if x.shape[2] < fixed.shape[2] else _spread, fixed, x)
+        for fixed, x in ((view, tangent[0]), (light, tangent[1]))
+    ]
+    return _sum(light, view), parts[0] + parts[1]
+
+
+def _sum(fixed: Array, x: Array) -> Array:
+    # Written out term by term: a reduction over the middle axis costs XLA's CPU code ten times as much.
+    return reduce(jnp.add, (fixed[:, term] * x[:, term] for term in range(fixed.shape[1])))
+
+
+def _spread(fixed: Array, cotangent: Array) -> Array:
+    """The transpose; JAX's own pads every term."""
+    return fixed * cotangent[:, None]
+
+
+def _spread_gray(fixed: Array, cotangent: Array) -> Array:
+    """The same for what is gray beside colors, written out for the same reason."""
+    colors = range(cotangent.shape[1])
+    return reduce(jnp.add, (fixed[..., c] * cotangent[:, None, c] for c in colors))[..., None]
+
+
 def light_tuple(transport: Transport, light: Environment, *, light_keep: int | None = None) -> Float[Array, "v r c"]:
     """The light side: what changes when the light turns.
 
@@ -217,7 +249,7 @@ def modulate(
     return view * weight[:, np.repeat(np.arange(len(terms)), terms)]
 
 
-@jax.jit
+@apart
 def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
     """Dot product of the two tuples: outgoing radiance per vertex and color.
 
@@ -228,8 +260,7 @@ def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[
     Returns:
         Linear radiance in e colors, the larger of c and d: a gray side serves all colors of the other.
     """
-    # Written out term by term: a reduction over the middle axis costs XLA's CPU code ten times as much.
-    return reduce(jnp.add, (light[:, term] * view[:, term] for term in range(light.shape[1])))
+    return _product(light, view)
 
 
 def radiance(

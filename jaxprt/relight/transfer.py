@@ -25,6 +25,7 @@ from jaxprt.relight import dynamic
 from jaxprt.relight.dynamic import DynamicView, Material
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
+from jaxprt.staging import apart
 from jaxprt.transport.dynamic import DynamicTransport
 from jaxprt.transport.transfer import TransferTensor
 from jaxprt.transport.transfer_job import DEGREE
@@ -161,7 +162,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
 
 
-@jax.jit
+@apart
 def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"]) -> Float[Array, "s c v"]:
     """SH coefficients, in world directions, of the radiance that arrives at each vertex.
 
@@ -206,7 +207,7 @@ def view_side(transport: DynamicTransport, view: DynamicView) -> tuple[Reflected
     return tuple(result)
 
 
-@jax.jit
+@apart
 def combine(
     transport: DynamicTransport, arriving: tuple[Arriving, ...], view: tuple[ReflectedView, ...]
 ) -> Float[Array, "v c"]:
@@ -246,7 +247,7 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
 
 
-@jax.jit
+@apart
 def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
     light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
     first = _met(jnp.einsum("gle,lc->gce", tensor.mode, light), tensor.core)
@@ -267,7 +268,7 @@ def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Ar
     return jax.lax.map(one, (light, core)).reshape(clusters, light.shape[1], *shape)
 
 
-@jax.jit
+@apart
 def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arriving:
     local = rotation.rotate_each(whole[..., vertex], frame)
     cosine = harmonics.cosine(degree=DEGREE) / np.pi
@@ -276,7 +277,7 @@ def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arrivi
     return Arriving(local, reduce(jnp.add, parts))
 
 
-@jax.jit
+@apart
 def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, Array]:
     """Coefficients of the lobes of each row, and albedo of their diffuse part."""
     if lobe is None:
@@ -291,7 +292,7 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
     return jnp.stack(rows), each.diffuse
 
 
-@jax.jit
+@apart
 def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
     """Coefficients of a factored BRDF at each row."""
     view = brdf.view(_view(position, frame, eye))

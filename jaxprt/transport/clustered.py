@@ -23,6 +23,7 @@ from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.files.arrays import Layout
 from jaxprt.linalg import clustering, eigen
 from jaxprt.sphere import haar
+from jaxprt.staging import linear
 from jaxprt.transport import blocks, separable
 from jaxprt.transport.direct import DirectTransport
 
@@ -97,21 +98,43 @@ class ClusteredTransport(eqx.Module):
         Returns:
             The light-modulated tuple of Wang et al., in the light's units.
         """
-        _, modes, vectors, terms = self.core.shape
-        light = coefficient[self.index.astype(jnp.int32)]
-        dtype = light.dtype
-
-        def one(argument):
-            mode, core, weight, light = argument
-            met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
-            vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
-            return weight.astype(dtype) @ vector.reshape(vectors, -1)
-
-        return jax.lax.map(one, (self.mode, self.core, self.weight, light)).reshape(len(self.position), terms, -1)
+        return linear(_relit, _transposed, self, coefficient)
 
     def ordered(self, value: Float[Array, "q *c"]) -> Float[Array, "v *c"]:
         """What was computed by row, in the order of the vertices."""
         return value[self.place]
+
+
+def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
+    _, modes, vectors, terms = transport.core.shape
+    light = coefficient[transport.index.astype(jnp.int32)]
+    dtype = light.dtype
+
+    def one(argument):
+        mode, core, weight, light = argument
+        met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
+        vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
+        return weight.astype(dtype) @ vector.reshape(vectors, -1)
+
+    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, light))
+    return found.reshape(len(transport.position), terms, -1)
+
+
+def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
+    """Cluster by cluster too: JAX's own would keep modes and cores of all of them in full precision."""
+    clusters, modes, vectors, terms = transport.core.shape
+    dtype = cotangent.dtype
+
+    def one(argument):
+        mode, core, weight, cotangent = argument
+        vector = (weight.astype(dtype).T @ cotangent.reshape(len(weight), -1)).reshape(vectors, terms, -1)
+        met = core.reshape(modes, vectors * terms).astype(dtype) @ vector.reshape(vectors * terms, -1)
+        return mode.astype(dtype) @ met
+
+    rows = cotangent.reshape(clusters, -1, *cotangent.shape[1:])
+    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, rows))
+    start = jnp.zeros((len(transport.rms), found.shape[2]), dtype)
+    return start.at[transport.index.astype(jnp.int32)].add(found)
 
 
 def precompute(

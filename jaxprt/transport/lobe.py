@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar
+from jaxprt.staging import apart
 from jaxprt.transport import blocks, harmonic, visibility
 from jaxprt.transport.direct import DirectTransport
 
@@ -73,13 +74,13 @@ class LobeTransport(eqx.Module):
         Returns:
             Shares from 0 to 1, and their derivatives by s and t.
         """
-        # In steps: XLA's CPU code vectorizes what has no gather in it.
+        # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
         address, bit = _addresses(face, s, t, spread, size=self.size)
         read = _by_tap(_bytes(self.level, _by_vertex(address)))
         return _decoded(read, bit, s, t, spread, size=self.size)
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(apart, static=("size",))
 def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
     """Bytes of the eight texels that a lobe is read from, and for the scales in bits the place in the byte."""
     scale = scales(size)
@@ -98,23 +99,23 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
     return tuple(address), tuple(bit)
 
 
-@jax.jit
+@apart
 def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
     """All that a vertex reads side by side: what lies in memory together is then read together."""
     return jnp.stack(address).reshape(-1, address[0].shape[1]).T
 
 
-@jax.jit
+@apart
 def _bytes(level: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
     return jnp.take_along_axis(level, address, 1, mode="promise_in_bounds")
 
 
-@jax.jit
+@apart
 def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
     return tuple(read.T.reshape(8, -1, len(read)))
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(apart, static=("size",))
 def _decoded(read: tuple, bit: tuple, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, Array]:
     """Value and slopes, from the eight bytes."""
     scale = scales(size)

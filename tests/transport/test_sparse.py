@@ -1,3 +1,7 @@
+from functools import partial
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -104,3 +108,73 @@ def test_rms_is_that_of_the_dense_rows(random, close, colors):
     transport = make(random.normal(size=(6, 24, 3, colors)), 9)
     close(transport.rms, np.sqrt(np.mean(dense(transport) ** 2, (0, 2, 3))))
     assert np.all(np.asarray(make(np.zeros((2, 24, 1, 1)), 3).rms) == 0)
+
+
+@pytest.fixture(params=[(1, 1), (1, 3), (3, 3), (3, 1)], ids=lambda p: f"transport {p[0]}, light {p[1]}")
+def prepared(request, random):
+    """Transport of 40 vertices with and without its transpose, and a light."""
+    colors, light_colors = request.param
+    coefficient = random.normal(size=(40, 24, 3, colors)) * (random.uniform(size=(40, 24, 3, 1)) < 0.4)
+    transport = make(coefficient, 7)
+    return transport, transport.with_transpose(), jnp.asarray(random.normal(size=(24, light_colors)), jnp.float32)
+
+
+def squared(coefficient, transport):
+    return jnp.sum(jnp.sin(transport.apply(coefficient)) ** 2)
+
+
+def test_with_its_transpose_transport_is_the_same(prepared):
+    transport, with_transpose, light = prepared
+    np.testing.assert_array_equal(with_transpose.apply(light), transport.apply(light))
+    assert with_transpose.nbytes > transport.nbytes
+
+
+def test_every_kept_coefficient_is_in_the_transpose_once(prepared):
+    transport, with_transpose, _ = prepared
+    each = with_transpose.transpose
+    found = np.zeros((24, 120, transport.value.shape[3]))
+    np.add.at(found, (np.broadcast_to(each.number, each.row.shape), np.asarray(each.row)), np.asarray(each.value))
+    expected = np.moveaxis(dense(transport), 1, 0).reshape(24, 120, -1)
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    assert np.count_nonzero(np.any(np.asarray(each.value), -1)) == np.count_nonzero(np.any(expected, -1))
+
+
+def hessian_product(function):
+    return lambda light, transport: jax.jvp(jax.grad(partial(function, transport=transport)), (light,), (light + 1,))[1]
+
+
+def batched(function):
+    return lambda light, transport: jax.vmap(jax.grad(function), (0, None))(jnp.stack([light, -2 * light]), transport)
+
+
+def by_values(function):
+    """Of the function, and mixed with the light."""
+
+    def at(value, light, transport):
+        return function(light, eqx.tree_at(lambda t: t.value, transport, value))
+
+    def both(light, transport):
+        slope = jax.grad(at)(transport.value, light, transport)
+        mixed = jax.jvp(lambda value: jax.grad(at, 1)(value, light, transport), (transport.value,), (slope,))[1]
+        return jnp.concatenate([slope.ravel(), mixed.ravel()])
+
+    return both
+
+
+@pytest.mark.parametrize("change", [jax.grad, hessian_product, batched, by_values])
+def test_derivatives_by_the_transpose_are_those_without(prepared, change, close):
+    transport, with_transpose, light = prepared
+    close(change(squared)(light, with_transpose), change(squared)(light, transport))
+
+
+def test_an_empty_transport_has_a_transpose():
+    transport = make(np.zeros((2, 24, 1, 1)), 3).with_transpose()
+    slope = jax.grad(squared)(jnp.ones((24, 1)), transport)
+    np.testing.assert_array_equal(slope, 0)
+
+
+def test_a_shorter_transport_has_no_transpose(prepared):
+    _, with_transpose, light = prepared
+    shorter = with_transpose.keep(3)
+    assert shorter.transpose is None
+    assert np.all(np.isfinite(jax.grad(squared)(light, shorter)))

@@ -1,0 +1,284 @@
+"""What do gradients cost beside what they are of, by light, material and eye, in each system?
+
+    python -m benchmarks.gradients [--quick] [--output FILE]
+
+`seconds` is for a weighted sum of all vertices' radiance and its gradient, together; `peer` is the radiance alone, and
+`cost` the one over the other. Both are as a user calls them: the gradient inside one `jit`, radiance as each system is
+quickest. `hessian` lines have the product of the Hessian of the squared radiance with a direction in its place.
+
+`error` is that of the slope along a random direction against differences of fourth order, in float64 on a few vertices.
+
+Visibility and transport are random numbers on 36,000 random vertices, which is harder on caches than a mesh.
+"""
+
+import itertools
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from benchmarks import harness, relight_separable
+from jaxprt import brdf, relight
+from jaxprt.brdf import AshikhminShirley
+from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.relight.dynamic import Material
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import directions
+from jaxprt.transport import ClusteredTransport, DynamicTransport, LobeTransport, TransferMatrix, TransferTensor
+from jaxprt.transport import lobe as pyramids
+from jaxprt.transport.dynamic import RegionTransport
+from jaxprt.transport.transfer import SecondBounce
+
+VERTICES = 36_000
+MEMBERS = 225
+SIZE = 64
+TEXELS = 16
+STEP = 1e-4  # of differences, relative, times 1e-2 and 2e-2
+
+
+class Case(NamedTuple):
+    """A system and what its radiance depends on.
+
+    Attributes:
+        radiance: Of the arguments, by name: light, material, eye.
+        argument: Those.
+        bytes: Of transport.
+    """
+
+    radiance: Callable[..., jax.Array]
+    argument: dict[str, PyTree]
+    bytes: int
+
+
+def main() -> None:
+    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args()
+    vertices, repeats = (900, 3) if arguments.quick else (VERTICES, 15)
+    for system, make in SYSTEMS.items():
+        case, small = make(vertices), make(2 * MEMBERS)
+        for name in case.argument:
+            for line in measure(system, case, small, name, repeats):
+                harness.report(line, arguments.output)
+
+
+def measure(system: str, case: Case, small: Case, name: str, repeats: int):
+    """Lines of one argument."""
+    shape = jax.eval_shape(lambda: case.radiance(**case.argument)).shape
+    weight = jax.random.normal(jax.random.key(3), shape)
+
+    # All arrays are arguments: as constants they would be folded into the program.
+    @jax.jit
+    def slope(moved, other, weight):
+        return jax.value_and_grad(lambda moved: jnp.vdot(case.radiance(**{name: moved}, **other), weight))(moved)
+
+    @jax.jit
+    def curved(moved, other, along):
+        def squared(moved):
+            return jnp.sum(case.radiance(**{name: moved}, **other) ** 2) / 2
+
+        return jax.jvp(jax.grad(squared), (moved,), (along,))[1]
+
+    moved = case.argument[name]
+    other = {key: value for key, value in case.argument.items() if key != name}
+    along = random_like(moved)
+    common: dict[str, Any] = {"benchmark": "gradients", "bytes": case.bytes, "vertices": shape[0]}
+    common |= {"error": disagreement(small, name), "peer": "radiance", "peer_error": 0.0}
+    for kind, function in {
+        "gradient": lambda: slope(moved, other, weight),
+        "hessian": lambda: curved(moved, other, along),
+    }.items():
+        mine, alone = harness.compare(function, lambda: case.radiance(**case.argument), repeats=repeats)
+        times = {**mine.line(), "peer_seconds": alone.seconds, "cost": mine.seconds / alone.seconds}
+        yield {**common, "case": f"{system}: {kind} by {name}, {shape[0]} vertices", **times}
+
+
+def disagreement(case: Case, name: str) -> float:
+    """Relative difference of a slope from differences, in double precision."""
+    with jax.enable_x64(True):
+        argument = jax.tree.map(wide, case.argument)
+        shape = jax.eval_shape(lambda: case.radiance(**argument)).shape
+        weight = jax.random.normal(jax.random.key(3), shape)
+        along = jax.tree.map(lambda x, d: STEP * jnp.abs(x) * d, argument[name], random_like(argument[name]))
+
+        def value(step):
+            moved = jax.tree.map(lambda x, d: x + step * d, argument[name], along)
+            return jnp.vdot(case.radiance(**{**argument, name: moved}), weight)
+
+        exact = jax.grad(value)(0.0)
+        tangent = jax.jvp(value, (0.0,), (1.0,))[1]
+        near, far = ((value(h) - value(-h)) / (2 * h) for h in (1e-2, 2e-2))
+        expected = (4 * near - far) / 3
+        return float(max(abs(exact - expected), abs(tangent - expected)) / abs(expected))
+
+
+def wide(array: jax.Array) -> jax.Array:
+    """The same in double precision."""
+    return jnp.asarray(np.asarray(array), jnp.float64) if jnp.issubdtype(array.dtype, jnp.floating) else array
+
+
+def random_like(tree: PyTree) -> PyTree:
+    """Normal random numbers."""
+    leaf, structure = jax.tree.flatten(tree)
+    keys = jax.random.split(jax.random.key(4), len(leaf))
+    return structure.unflatten([jax.random.normal(k, x.shape, x.dtype) for k, x in zip(keys, leaf, strict=True)])
+
+
+def separable(vertices: int) -> Case:
+    """Four terms of 96 coefficients."""
+    return _terms(relight_separable.synthetic(vertices).with_transpose(), 4)
+
+
+def clustered(vertices: int) -> Case:
+    """Thirty-two terms, 16 vectors, 64 modes, 768 coefficients."""
+    return _terms(_clustered(vertices, terms=32, vectors=16, modes=64, keep=768), 32)
+
+
+def harmonic(vertices: int) -> Case:
+    """Transfer matrices of 25 coefficients."""
+    position, frame = points(vertices)
+    table = brdf.harmonic.tabulate(AshikhminShirley(nu=12.0, nv=4.0), degree=4)
+    matrix = jax.random.normal(jax.random.key(1), (vertices, 1, 25, 25))
+    transport = TransferMatrix(matrix, position, frame)
+    leaf, structure = jax.tree.flatten(table)
+
+    def radiance(light, material, eye):
+        return relight.harmonic.radiance(transport, structure.unflatten(material), light, eye=eye)
+
+    light = jax.random.normal(jax.random.key(0), (25, 3))
+    return Case(radiance, {"light": light, "material": leaf, "eye": EYE}, matrix.nbytes)
+
+
+def lobe(vertices: int) -> Case:
+    """Eight lobes, tabulated over roughness, and sixteen texels."""
+    transport = _seen(vertices)
+    table = brdf.lobe.tabulate(lambda m: brdf.CookTorrance(roughness=m), lobes=8, knot=[np.array([0.15, 0.2, 0.3])])
+
+    def radiance(light, material, eye):
+        texel, excess, rest = relight.direct.split(Environment(light), count=TEXELS)
+        color = relight.lobe.radiance(transport, table.at(material), rest, eye=eye)
+        model = brdf.CookTorrance(roughness=material)
+        return color + relight.direct.radiance(transport, model, texel, excess, eye=eye)
+
+    return Case(radiance, {"light": sky(), "material": jnp.array(0.22), "eye": EYE}, transport.nbytes)
+
+
+def dynamic(vertices: int) -> Case:
+    """Direct light on a region that changes, with four lobes."""
+    family, members = changing()
+    transport = _region(vertices)
+
+    def radiance(light, material, eye):
+        made = [mixed(family, material)]
+        return relight.dynamic.radiance(transport, [members], made, Environment(light), eye=eye, texels=TEXELS)
+
+    return Case(radiance, arguments(), transport.nbytes)
+
+
+def transfer(vertices: int) -> Case:
+    """The same with one bounce and two."""
+    family, members = changing()
+    transport = _region(vertices)
+    tensor = _bounces(vertices, brdf.paths.factor(family.brdf).factor)
+
+    def radiance(light, material, eye):
+        made = [mixed(family, material)]
+        direct_and_bounces = (transport, tensor, [members], made, Environment(light))
+        return relight.transfer.radiance(*direct_and_bounces, eye=eye, texels=TEXELS)
+
+    return Case(radiance, arguments(), transport.nbytes + tensor.nbytes)
+
+
+@lru_cache(maxsize=1)
+def changing():
+    """Cook-Torrance's model over Fresnel reflectance and roughness, and its lobes."""
+    family = brdf.navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), (0.1, 0.2, 0.4)))))
+    return family, brdf.dynamic.factor(family.brdf, brdf.dynamic.separate(family.brdf, lobes=4))
+
+
+def mixed(family, material) -> Material:
+    """A material of diffuse and specular weights and coordinates."""
+    diffuse, specular, place = material
+    return Material(family.navigation.share(place), diffuse, specular)
+
+
+def arguments() -> dict[str, PyTree]:
+    """What all materials of the dynamic system can be differentiated in."""
+    material = (jnp.array([0.3, 0.2, 0.1]), jnp.array([0.5, 0.6, 0.7]), jnp.array([0.4, 0.15]))
+    return {"light": sky(), "material": material, "eye": EYE}
+
+
+def points(vertices: int) -> tuple[jax.Array, jax.Array]:
+    """Vertices on a sphere, and their frames."""
+    normal = directions.normalize(jax.random.normal(jax.random.key(0), (vertices, 3)))
+    return normal, directions.frame(normal, directions.tangent(normal))
+
+
+def sky() -> jax.Array:
+    """Light with a few bright texels."""
+    return jax.random.lognormal(jax.random.key(5), 2.0, (6, SIZE, SIZE, 3))
+
+
+def _terms(transport, terms: int) -> Case:
+    factored = brdf.separable.factor(AshikhminShirley(), terms=terms)
+
+    def radiance(light, material, eye):
+        own = SeparableBrdf(factored.light_map, material, factored.error, factored.coordinates)
+        return relight.separable.radiance(transport, own, Environment(light), eye=eye)
+
+    return Case(radiance, {"light": sky(), "material": factored.view_map, "eye": EYE}, transport.nbytes)
+
+
+def _clustered(vertices: int, *, terms: int, vectors: int, modes: int, keep: int) -> ClusteredTransport:
+    clusters, random = vertices // MEMBERS, np.random.default_rng(0)
+    position, frame = points(vertices)
+    index = random.integers(0, 6 * SIZE * SIZE, (clusters, keep), dtype=np.uint16)
+    mode, core, weight = (
+        random.standard_normal(shape, dtype=np.float32)
+        for shape in ((clusters, keep, modes), (clusters, modes, vectors, terms), (clusters, MEMBERS, vectors))
+    )
+    half = jnp.asarray(mode, jnp.float16), jnp.asarray(core, jnp.float16)
+    row = jnp.arange(vertices)
+    rms = jnp.ones(6 * SIZE * SIZE)
+    return ClusteredTransport(jnp.asarray(index), *half, jnp.asarray(weight), position, frame, row, row, rms)
+
+
+def _seen(vertices: int) -> LobeTransport:
+    position, frame = points(vertices)
+    count = pyramids.scales(SIZE).total
+    level = np.random.default_rng(1).integers(0, 256, (vertices, count), dtype=np.uint8)
+    vector = jax.random.normal(jax.random.key(2), ((pyramids.DEGREE + 1) ** 2, vertices))
+    return LobeTransport(jnp.asarray(level), vector, position, frame, SIZE)
+
+
+def _region(vertices: int) -> DynamicTransport:
+    terms = _clustered(vertices, terms=1, vectors=24, modes=24, keep=1024)
+    row = jnp.arange(vertices)
+    seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices)))
+    return DynamicTransport((RegionTransport(terms, seen, row),), row)
+
+
+def _bounces(vertices: int, factor: jax.Array) -> TransferTensor:
+    clusters, functions, random = vertices // MEMBERS, factor.shape[2] + 1, np.random.default_rng(2)
+    weight, mode, again = (
+        random.standard_normal(shape, dtype=np.float32)
+        for shape in ((clusters, MEMBERS, 32), (clusters, 384, 64), (clusters, MEMBERS, 16))
+    )
+    first, second = (
+        jnp.asarray(random.standard_normal(shape, dtype=np.float32), jnp.float16)
+        for shape in ((clusters, 64, 32, 16, functions), (clusters, 24, 16, 16, functions, functions))
+    )
+    row, wrong = jnp.arange(vertices), jnp.zeros(clusters)
+    twice = SecondBounce(jnp.asarray(again), second, wrong)
+    known = (row, jnp.zeros_like(row), jnp.arange(functions), (factor,), twice, wrong, jnp.ones(2))
+    return TransferTensor(jnp.asarray(weight), first, jnp.asarray(mode), *known)
+
+
+EYE = jnp.array([2.0, 1.0, 3.0])
+SYSTEMS = {each.__name__: each for each in (separable, clustered, harmonic, lobe, dynamic, transfer)}
+
+if __name__ == "__main__":
+    main()
