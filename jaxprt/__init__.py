@@ -16,7 +16,7 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-from jaxprt import brdf, files, image, linalg, plan, relight, scene, sphere, transport
+from jaxprt import brdf, files, image, inverse, linalg, plan, relight, scene, sphere, transport
 
-__all__ = ["brdf", "files", "image", "linalg", "plan", "relight", "scene", "sphere", "transport"]
+__all__ = ["brdf", "files", "image", "inverse", "linalg", "plan", "relight", "scene", "sphere", "transport"]
 __version__ = "0.1.0"

@@ -34,6 +34,9 @@ SIDEWAYS = {
     ("brdf", "published", "models"),
     ("brdf", "published", "separable"),
     ("brdf", "scattered", "measured"),
+    ("inverse", "fit", "numbers"),
+    ("inverse", "fit", "pictures"),
+    ("inverse", "fit", "solve"),
     ("linalg", "tucker", "eigen"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),
@@ -83,7 +86,7 @@ ONLY_IN = {
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
     "zarr": "jaxprt.files",
-    "jaxopt": "jaxprt.inverse",
+    "jaxopt": "jaxprt.inverse.solve",
     "fast_simplification": "jaxprt.scene.occluder",
 }
 

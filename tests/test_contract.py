@@ -38,6 +38,7 @@ JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
     "staging": "takes functions",
+    "inverse": "takes functions, and fits on the host",
     "report": "measures, and writes files",
     "animation": "the same",
     "files": "reads and writes files",

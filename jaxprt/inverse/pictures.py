@@ -1,0 +1,123 @@
+"""What pictures show of a mesh, and how far a scene is from them."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxprt.image import raster
+from jaxprt.scene.camera import Camera
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap
+
+
+class Picture(eqx.Module):
+    """A picture of the object.
+
+    Attributes:
+        image: Its pixels, linear: radiance times the exposure.
+        camera: From where, with the image's size.
+        mask: Pixels that count; all if None.
+        exposure: What radiance was multiplied by.
+        saturation: Value at which pixels are clipped, in any color; those do not count. None if none are.
+    """
+
+    image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
+    camera: Camera
+    mask: Bool[Array, "h w"] | None = None
+    exposure: float = 1.0
+    saturation: float | None = None
+
+
+class Pixels(eqx.Module):
+    """Pixels of pictures that count, and what of the vertices each shows.
+
+    Attributes:
+        eye: Of each picture.
+        vertex: Three vertices of each pixel, those of picture n from n times the number of vertices on.
+        weight: Their barycentric weights, times the exposure.
+        value: What the pixel has.
+    """
+
+    eye: Float[Array, "n 3"]
+    vertex: Int[Array, "p 3"]
+    weight: Float[Array, "p 3"]
+    value: Float[Array, "p c"]
+
+
+def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
+    """Finds what pictures show of a mesh: pixels that see it, inside their masks, and not saturated.
+
+    Raises:
+        TypeError: What is no `Picture`.
+        ValueError: No pictures; an image or mask of another size than the camera's; images that differ in colors;
+            pixels that count and are negative or not finite; exposures that are not positive; pictures that are black;
+            or no pixel that counts.
+    """
+    if not pictures:
+        raise ValueError("at least one picture is needed, got none")
+    parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]
+    colors = {each.image.shape[2] for each in pictures}
+    if len(colors) > 1:
+        raise ValueError(f"all pictures must have as many colors, got {sorted(colors)}")
+    vertex, weight, value = (np.concatenate(each) for each in zip(*parts, strict=True))
+    if not len(value):
+        raise ValueError("pictures must show the mesh in a pixel that counts, got none")
+    if not np.any(value):
+        raise ValueError("pictures must not be black wherever they count")
+    eye = jnp.stack([each.camera.eye for each in pictures])
+    return Pixels(eye, jnp.asarray(vertex), jnp.asarray(weight), jnp.asarray(value))
+
+
+def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, weights and values of a picture's pixels."""
+    if not isinstance(picture, Picture):
+        raise TypeError(f"picture {number} must be a Picture, got {type(picture).__name__}")
+    image, camera = np.asarray(picture.image), picture.camera
+    size = (camera.height, camera.width)
+    for name, array in {"image": image, "mask": picture.mask}.items():
+        if array is not None and array.shape[:2] != size:
+            raise ValueError(
+                f"the {name} of picture {number} must have its camera's size {size}, got {array.shape[:2]}"
+            )
+    if not (np.isfinite(picture.exposure) and picture.exposure > 0):
+        raise ValueError(f"the exposure of picture {number} must be positive, got {picture.exposure}")
+    fragments = raster.rasterize(mesh, camera)
+    counts = np.asarray(fragments.triangle) >= 0
+    if picture.mask is not None:
+        counts &= np.asarray(picture.mask)
+    if picture.saturation is not None:
+        counts &= ~np.any(image >= picture.saturation, -1)
+    value = image[counts]
+    wrong = ~(np.isfinite(value) & (value >= 0)).all(-1)
+    if wrong.any():
+        raise ValueError(
+            f"pixels that count must be finite and not negative, {wrong.sum()} of {len(value)} of picture {number} are "
+            "not: mask them"
+        )
+    vertex = np.asarray(mesh.face)[np.asarray(fragments.triangle)[counts]] + number * len(mesh.position)
+    return vertex, np.asarray(fragments.barycentric)[counts] * picture.exposure, value
+
+
+def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Array, " m"]:
+    """What a scene's pictures differ by from those observed, in units of the norm of these.
+
+    Args:
+        radiance: Of the parameters and an eye, of every vertex; what does not depend on the eye is computed once.
+        parameters: Of the radiance.
+        pixels: What was observed.
+    """
+    color = jax.vmap(lambda eye: radiance(parameters, eye))(pixels.eye)
+    color = color.reshape(-1, color.shape[-1])
+    made = sum(pixels.weight[:, i, None] * color[pixels.vertex[:, i]] for i in range(3))
+    return ((made - pixels.value) / jnp.linalg.norm(pixels.value)).ravel()
+
+
+def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:
+    """Mean square of differences between neighboring texels, across the edges of faces too: a prior of light."""
+    wide = cubemap.pad(radiance)
+    down, right = wide[:, 1:, 1:-1] - wide[:, :-1, 1:-1], wide[:, 1:-1, 1:] - wide[:, 1:-1, :-1]
+    return jnp.mean(down**2) + jnp.mean(right**2)

@@ -1,0 +1,148 @@
+"""Least squares by jaxopt, which no other module knows."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
+    import jaxopt
+
+DENSE = 512  # numbers whose derivatives are held, all of them
+_KNOWN = 1e-4  # of the largest singular value: what has less cannot be told from rounding
+_SHARE = 0.01  # of a number outside what is known, that makes it unknown
+_SETTLED = 1e-6  # relative decrease of the squared residual
+_PATIENT = 3  # steps without more than that
+_REFUSED = 8  # steps that would only have made it worse; each next is 2, 4, 8, ... times shorter
+_LEAST = 1e-3  # of the largest squared derivative: others count as that
+_PROBES = 16  # random combinations of pixels, for mean squares of derivatives
+_POWER = 20  # steps to the largest curvature
+_SAFETY = 1.1
+
+
+class Fit(NamedTuple):
+    """What explains pictures.
+
+    Attributes:
+        value: The light or material, as the start is made; where pictures do not tell, the start's.
+        residual: Difference from the pictures relative to them, in L2: at the start and after each step.
+        deviation: Standard deviation of each number, were what is left of the residual independent noise; infinite for
+            what the pictures do not tell. Of many numbers (over 512) a lower bound, since others may make up for each.
+        rank: How many combinations of numbers the pictures tell; None of many numbers.
+    """
+
+    value: Any
+    residual: np.ndarray
+    deviation: Any
+    rank: int | None
+
+
+def _jacobian(function: Callable, x: Array) -> Float[Array, "n m"]:
+    """Derivatives by each number, one after another, so that memory is that of one."""
+    return jax.lax.map(lambda each: jax.jvp(function, (x,), (each,))[1], jnp.eye(len(x), dtype=x.dtype))
+
+
+def _told(slope: np.ndarray, left: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions that pictures tell, their singular values, and deviations of the numbers."""
+    rows = np.asarray(slope, np.float64)
+    square, axis = np.linalg.eigh(rows @ rows.T)
+    value = np.sqrt(np.maximum(square, 0))
+    known = value > _KNOWN * max(value[-1], np.finfo(np.float32).tiny)
+    axis, value = axis[:, known], value[known]
+    noise = left**2 / max(1, rows.shape[1] - len(value))
+    deviation = np.sqrt(noise * np.sum((axis / value) ** 2, 1))
+    return axis, value, np.where(1 - np.sum(axis**2, 1) > _SHARE, np.inf, deviation)
+
+
+def at_once(function: Callable, first: Array, unravel: Callable) -> Fit:
+    """A linear problem, by singular values; what is not told stays as it is."""
+    r, slope = jax.jit(lambda x: (function(x), _jacobian(function, x)))(first)
+    before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
+    axis, value, _ = _told(rows, 0.0)
+    move = -axis @ ((axis.T @ (rows @ before)) / value**2)
+    history = np.array([np.linalg.norm(before), np.linalg.norm(before + move @ rows)])
+    _, _, deviation = _told(rows, history[-1])
+    found, deviation = first + jnp.asarray(move, first.dtype), jnp.asarray(deviation, first.dtype)
+    return Fit(unravel(found), history, unravel(deviation), len(value))
+
+
+def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int) -> Fit:
+    """By steps of Levenberg and Marquardt in free numbers, which others follow from."""
+    solver = jaxopt.LevenbergMarquardt(
+        function, materialize_jac=True, solver="cholesky", damping_parameter=1e-3, implicit_diff=False
+    )
+    # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
+    solver._jac_fun = lambda u: _jacobian(function, u).T
+    state, update = jax.jit(solver.init_state)(free), jax.jit(solver.update)
+    history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
+    for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
+        moved, tried = update(free, state)
+        if not (np.isfinite(moved).all() and np.isfinite(tried.residual).all()):
+            break
+        refused = refused + 1 if np.array_equal(moved, free) else 0  # Too long a step: the next is shorter.
+        free, state = moved, tried
+        history.append(float(jnp.linalg.norm(state.residual)))
+        settled = history[-2] ** 2 - history[-1] ** 2 <= _SETTLED * history[-2] ** 2
+        still = still if refused else still + 1 if settled else 0
+        if still == _PATIENT or refused == _REFUSED:
+            break
+    axis, _, deviation = _told(np.asarray(state.jac).T, history[-1])
+    rate = np.abs(np.asarray(jax.jvp(bounded, (free,), (jnp.ones_like(free),))[1]))
+    told = np.isfinite(deviation)
+    deviation = jnp.asarray(np.where(told, np.where(told, deviation, 0) * rate, np.inf), free.dtype)
+    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), axis.shape[1])
+
+
+def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
+    """By first derivatives, each number in units of what it changes."""
+
+    def pull(x, back):
+        return jax.vjp(function, x)[1](back)[0]
+
+    count = len(jax.eval_shape(function, first))
+    probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), first.dtype)
+    square = jax.jit(lambda x: jnp.mean(jax.lax.map(lambda each: pull(x, each) ** 2, probe), 0))(first)
+    whole = float(jnp.max(square))
+    size = 1 / jnp.sqrt(square + _LEAST * (whole if whole > 0 else 1.0))
+
+    def value(y):
+        extra = 0.0 if prior is None else prior(unravel(size * y))
+        return jnp.sum(function(size * y) ** 2) / 2 + extra
+
+    limit = tuple(jnp.asarray(each, first.dtype) / size for each in bound)
+    bounded = any(np.isfinite(each).any() for each in bound)
+    y = first / size
+    if bounded:
+        curved = jax.jit(lambda y, along: jax.jvp(jax.grad(value), (y,), (along,))[1])
+        along = jax.random.normal(jax.random.key(1), y.shape, y.dtype)
+        for _ in range(_POWER):
+            along = along / jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)
+            along = curved(y, along)
+        step = float(1 / (_SAFETY * jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)))
+        box = jaxopt.projection.projection_box
+        solver: Any = jaxopt.ProjectedGradient(value, box, stepsize=step, maxiter=steps, implicit_diff=False)
+        state, update = solver.init_state(y, limit), jax.jit(lambda y, state: solver.update(y, state, limit))
+    else:
+        solver = jaxopt.LBFGS(value, maxiter=steps, implicit_diff=False)
+        state, update = solver.init_state(y), jax.jit(solver.update)
+    far = jax.jit(lambda y: (jnp.linalg.norm(function(size * y)), value(y)))
+    history, last, still = [float(far(y)[0])], float(far(y)[1]), 0
+    for _ in range(steps):
+        moved, state = update(y, state)
+        if not np.isfinite(moved).all():
+            break
+        y = moved
+        norm, now = map(float, far(y))
+        history.append(norm)
+        still = still + 1 if last - now <= _SETTLED * abs(last) else 0
+        last = now
+        if still == _PATIENT:
+            break
+    noise = history[-1] ** 2 / max(1, count)
+    deviation = jnp.where(square > _KNOWN**2 * whole, jnp.sqrt(noise / jnp.where(square > 0, square, 1)), jnp.inf)
+    return Fit(unravel(size * y), np.array(history), unravel(deviation), None)
