@@ -14,8 +14,12 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap
 
 
+def _mask(value) -> Array | None:
+    return None if value is None else jnp.asarray(value, bool)
+
+
 class Picture(eqx.Module):
-    """A picture of the object.
+    """A picture of the object. NumPy arrays become arrays.
 
     Attributes:
         image: Its pixels, linear: radiance times the exposure.
@@ -27,8 +31,8 @@ class Picture(eqx.Module):
 
     image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
     camera: Camera
-    mask: Bool[Array, "h w"] | None = None
-    exposure: float = 1.0
+    mask: Bool[Array, "_ _"] | None = eqx.field(converter=_mask, default=None)
+    exposure: float = eqx.field(converter=float, default=1.0)
     saturation: float | None = None
 
 

@@ -1,0 +1,179 @@
+"""What pictures do not tell, tell wrongly, or tell of nothing at all."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import inverse
+from jaxprt.brdf import AshikhminShirley, Lambert, harmonic
+from jaxprt.image import render
+from jaxprt.inverse import Picture
+from jaxprt.relight import harmonic as relight
+from jaxprt.scene import builtin, camera
+
+EDGE = 32
+BANDS = np.sqrt(np.arange(25)).astype(int)
+ODD = BANDS == 3  # of degrees to 4, what a diffuse ball does not reflect
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return builtin.sphere(rings=16, sectors=32)
+
+
+@pytest.fixture(scope="module")
+def view(mesh):
+    return camera.orbit(mesh, elevation=0.2, width=EDGE, height=EDGE)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return relight.project(builtin.daylight(size=16), degree=4)
+
+
+@pytest.fixture(scope="module")
+def matte(mesh):
+    table = harmonic.tabulate(Lambert(0.5), degree=4, resolution=8)
+    return lambda light, eye: relight.unshadowed_radiance(mesh, table, light, eye=eye)
+
+
+@pytest.fixture(scope="module")
+def image(mesh, matte, sky, view):
+    image = render(mesh, matte(sky, view.eye), view)
+    assert float(image.min()) >= 0
+    return np.asarray(image)
+
+
+def fit(mesh, radiance, *pictures, start=0.0):
+    return inverse.light(radiance, jnp.full((25, 3), start), inverse.observe(mesh, pictures))
+
+
+def test_what_a_diffuse_ball_does_not_reflect_is_reported_and_not_invented(mesh, matte, sky, view, image):
+    found = fit(mesh, matte, Picture(image, view), start=0.3)
+    assert found.rank == 54
+    np.testing.assert_array_equal(np.isinf(found.deviation), np.broadcast_to(ODD[:, None], (25, 3)))
+    np.testing.assert_allclose(found.value[ODD], 0.3, atol=2e-3)
+    np.testing.assert_allclose(found.value[~ODD], sky[~ODD], atol=2e-3 * np.linalg.norm(sky))
+
+
+def test_a_sharp_material_tells_all_of_it(mesh, sky, view):
+    table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=48)
+
+    def shiny(light, eye):
+        return relight.unshadowed_radiance(mesh, table, light, eye=eye)
+
+    image = render(mesh, shiny(sky, view.eye), view)
+    found = fit(mesh, shiny, Picture(image, view, mask=image.min(-1) >= 0))
+    assert found.rank == 75
+    np.testing.assert_allclose(found.value, sky, atol=2e-3 * np.linalg.norm(sky))
+
+
+def test_saturated_pixels_do_not_count(mesh, matte, sky, view, image):
+    clipped = np.minimum(image, np.quantile(image[image > 0], 0.8))
+    naive, right = (fit(mesh, matte, Picture(clipped, view, saturation=each)) for each in (None, float(clipped.max())))
+    wrong, exact = (np.linalg.norm((each.value - sky)[~ODD]) / np.linalg.norm(sky) for each in (naive, right))
+    assert exact < 0.01
+    assert wrong > 5 * exact
+
+
+def test_noise_leaves_a_residual_of_its_size_and_deviations_that_hold(mesh, matte, sky, view, image):
+    noise = 0.02 * np.sqrt(np.mean(image[image > 0] ** 2))
+    noisy = np.maximum(image + noise * np.random.default_rng(0).normal(size=image.shape), 0).astype(np.float32)
+    found = fit(mesh, matte, Picture(noisy, view))
+    assert 0.01 < found.residual[-1] < 0.03
+    away = np.abs(found.value - sky)[~ODD] / np.asarray(found.deviation)[~ODD]
+    assert np.mean(away < 2) > 0.85  # 95 % of normal numbers are.
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_wrong_exposure_scales_the_light_and_nothing_else(mesh, matte, view, image, factor):
+    right, wrong = (fit(mesh, matte, Picture(image, view, exposure=each)) for each in (1.0, factor))
+    np.testing.assert_allclose(factor * wrong.value, right.value, atol=1e-3 * np.linalg.norm(right.value))
+    assert wrong.residual[-1] < 1e-4
+
+
+def test_light_from_behind_is_known_badly(mesh, matte, view, image):
+    """A picture of one side tells more of the light from there."""
+    found = fit(mesh, matte, Picture(image, view, mask=np.broadcast_to(np.arange(EDGE) < EDGE // 3, image.shape[:2])))
+    whole = fit(mesh, matte, Picture(image, view))
+    known = ~ODD
+    few, many = (np.asarray(each.deviation)[known] / each.residual[-1] for each in (found, whole))
+    assert np.median(few / many) > 2
+
+
+def test_a_flat_objective_stays_at_its_start(mesh, view, image):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    start = {"unused": 0.4, "light": jnp.ones(3)}
+
+    def flat(parameters, eye):
+        return jnp.zeros((len(mesh.position), 3)) + 0 * jnp.sum(parameters["unused"])
+
+    for found in (inverse.material(flat, start, pixels, lower=0.0, upper=1.5), inverse.light(flat, start, pixels)):
+        assert found.rank == 0
+        assert found.residual.tolist() == pytest.approx([1.0] * len(found.residual))
+        assert np.isinf(found.deviation["unused"])
+        assert float(found.value["unused"]) == pytest.approx(0.4)
+    many = inverse.light(flat, {"unused": jnp.full(600, 0.4)}, pixels, lower=0.0)
+    assert np.isinf(many.deviation["unused"]).all()
+    np.testing.assert_allclose(many.value["unused"], 0.4)
+
+
+def test_an_unused_number_is_unknown_and_the_others_are_found(mesh, matte, sky, view, image):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    start = {"albedo": jnp.array(0.9), "unused": jnp.array(0.2)}
+    found = inverse.material(lambda m, eye: m["albedo"] / 0.5 * matte(sky, eye), start, pixels, lower=0.0, upper=1.0)
+    assert found.rank == 1
+    assert float(found.value["albedo"]) == pytest.approx(0.5, abs=1e-4)
+    assert float(found.value["unused"]) == pytest.approx(0.2, abs=1e-4)
+    assert np.isfinite(found.deviation["albedo"])
+    assert np.isinf(found.deviation["unused"])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
+def test_broken_pixels_are_refused_where_they_count(mesh, view, image, value):
+    broken = image.copy()
+    middle = EDGE // 2
+    broken[middle, middle, 1] = value
+    with pytest.raises(ValueError, match=r"finite and not negative, 1 of .* of picture 0 are not: mask them"):
+        inverse.observe(mesh, [Picture(broken, view)])
+    mask = np.ones(image.shape[:2], bool)
+    mask[middle, middle] = False
+    assert np.all(np.isfinite(inverse.observe(mesh, [Picture(broken, view, mask=mask)]).value))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("pictures", "error", "message"),
+    [
+        (lambda i, v: [], ValueError, "at least one picture"),
+        (lambda i, v: [i], TypeError, "picture 0 must be a Picture, got ndarray"),
+        (lambda i, v: [Picture(i[1:], v)], ValueError, r"image of picture 0 .* \(32, 32\), got \(31, 32\)"),
+        (lambda i, v: [Picture(i, v, mask=np.ones((4, 4), bool))], ValueError, "mask of picture 0"),
+        (lambda i, v: [Picture(i, v, mask=np.zeros((EDGE, EDGE), bool))], ValueError, "in a pixel that counts"),
+        (lambda i, v: [Picture(i, v, exposure=0.0)], ValueError, "exposure of picture 0 must be positive, got 0"),
+        (lambda i, v: [Picture(i, v), Picture(i[..., :1], v)], ValueError, r"as many colors, got \[1, 3\]"),
+        (lambda i, v: [Picture(0 * i, v)], ValueError, "must not be black"),
+    ],
+)
+def test_pictures_that_cannot_be_used_are_refused(mesh, view, image, pictures, error, message):
+    with pytest.raises(error, match=message):
+        inverse.observe(mesh, pictures(image, view))
+
+
+@pytest.mark.parametrize(
+    ("start", "options", "error", "message"),
+    [
+        ({"a": 0.5}, {"lower": 0.6}, ValueError, "number 0 is 0.5, the bounds are 0.6 and inf"),
+        ({"a": 0.5}, {"lower": 0.5, "upper": 0.5}, ValueError, "between its bounds"),
+        ({"a": 0.5}, {"lower": {"b": 0.1}}, ValueError, "one number, or made like the start"),
+        ({"a": 0.5, "b": "red"}, {}, TypeError, "arrays and numbers, in a pytree, got a str"),
+        ({"a": np.nan}, {}, ValueError, "finite numbers"),
+        ({"a": np.ones(600)}, {}, ValueError, "at most 512 numbers can be fitted so, got 600"),
+        ({"a": 0.5}, {"steps": 0}, ValueError, "steps must be at least 1, got 0"),
+        ({}, {}, ValueError, "at least one, got 0"),
+    ],
+)
+def test_materials_that_cannot_be_fitted_are_refused(mesh, view, image, start, options, error, message):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    with pytest.raises(error, match=message):
+        inverse.material(lambda m, eye: jnp.zeros((len(mesh.position), 3)), start, pixels, **options)
