@@ -21,6 +21,7 @@ import numpy as np
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import raster
 from jaxprt.scene import Camera, Environment, Mesh, environment
+from jaxprt.sphere import cubemap, harmonics
 
 EDGE = 256  # pixels: about as many as there are vertices
 SAMPLES = (4, 16, 64, 256, 1024)
@@ -267,3 +268,65 @@ def _latlong(light: Environment) -> np.ndarray:
     across = np.cos(latitude)
     direction = np.stack([np.sin(longitude) * across, np.sin(latitude), np.cos(longitude) * across], -1)
     return np.array(environment.background(light, jnp.asarray(direction, jnp.float32)), order="C")
+
+
+def fit_light(
+    mesh: Mesh, albedo: float, image: np.ndarray, camera: Camera, *, degree: int, steps: int, samples: int, rate: float
+) -> tuple[np.ndarray, float]:
+    """Harmonics of the light of a picture of a diffuse object, by Mitsuba's own gradients of direct light and Adam.
+
+    Needs LLVM 17 or newer, see `available`.
+
+    Args:
+        mesh: The object.
+        albedo: Of all of it.
+        image: The picture.
+        camera: From where.
+        degree: Of the harmonics.
+        steps: Of Adam.
+        samples: Paths per pixel and step.
+        rate: Of Adam.
+
+    Returns:
+        Coefficients in three colors, and the seconds of all steps but the first, which compiles, times their number.
+    """
+    import drjit
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_rgb")
+    edge = 16
+    constant = Environment(jnp.ones((6, edge, edge, 3)))
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "prb", "max_depth": 2, "rr_depth": 100, "hide_emitters": True},
+            "sensor": _sensor(mitsuba, camera),
+            "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(_latlong(constant))},
+            "object": _shape(mitsuba, mesh, _bsdf(mitsuba, Lambert(albedo))),
+        }
+    )
+    names = mitsuba.traverse(scene)
+    each = [
+        _latlong(Environment(harmonics.evaluate(cubemap.direction(size=edge), degree=degree)[..., [n] * 3]))[..., 0]
+        for n in range((degree + 1) ** 2)
+    ]
+    basis = np.stack(each, -1)
+    basis = np.concatenate([basis, basis[:, :1]], 1)  # Mitsuba has the first column again behind the last.
+    value = np.zeros((basis.shape[-1], 3))
+    value[0] = np.sqrt(4 * np.pi) * image[image.any(-1)].mean(0) / albedo
+    target = mitsuba.TensorXf(image)
+    first, second, seconds = np.zeros_like(value), np.zeros_like(value), []
+    for step in range(1, steps + 1):
+        start = time.perf_counter()
+        data = mitsuba.TensorXf((basis @ value).astype(np.float32))
+        drjit.enable_grad(data)
+        names["light.data"] = data
+        names.update()
+        seeds: Any = {"seed": 2 * step, "seed_grad": 2 * step + 1}
+        made = mitsuba.render(scene, names, spp=samples, **seeds)
+        drjit.backward(drjit.mean(drjit.square(made - target), axis=None))
+        slope = np.einsum("hwl,hwc->lc", basis, np.array(drjit.grad(data)))
+        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+        value -= rate * (first / (1 - 0.9**step)) / (np.sqrt(second / (1 - 0.999**step)) + 1e-12)
+        seconds.append(time.perf_counter() - start)
+    return value, float(np.mean(seconds[1:]) * steps)

@@ -15,7 +15,9 @@ BENCHMARKS = sorted(
 MOST_ERROR = {
     "compression": 1.0,
     "factorization": 1e-4,
+    "gradients": 1e-7,
     "interreflection": 0.65,
+    "inverse": 0.01,
     "lobes": 0.15,
     "precompute_separable": 3e-3,
     "rasterize": 1e-3,

@@ -53,7 +53,7 @@ class Pixels(eqx.Module):
 
 
 def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
-    """Finds what pictures show of a mesh: pixels that see it, inside their masks, and not saturated.
+    """Finds what pictures show of a mesh: pixels that see it, not at its silhouette, inside masks, and not saturated.
 
     Raises:
         TypeError: What is no `Picture`.
@@ -90,7 +90,7 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
     if not (np.isfinite(picture.exposure) and picture.exposure > 0):
         raise ValueError(f"the exposure of picture {number} must be positive, got {picture.exposure}")
     fragments = raster.rasterize(mesh, camera)
-    counts = np.asarray(fragments.triangle) >= 0
+    counts = _inside(np.asarray(fragments.triangle) >= 0)
     if picture.mask is not None:
         counts &= np.asarray(picture.mask)
     if picture.saturation is not None:
@@ -104,6 +104,13 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
         )
     vertex = np.asarray(mesh.face)[np.asarray(fragments.triangle)[counts]] + number * len(mesh.position)
     return vertex, np.asarray(fragments.barycentric)[counts] * picture.exposure, value
+
+
+def _inside(seen: np.ndarray) -> np.ndarray:
+    """Pixels that are seen, all around too: at silhouettes cameras mix the object with what is behind."""
+    wide = np.pad(seen, 1)
+    height, width = seen.shape
+    return np.all([wide[i : i + height, j : j + width] for i in range(3) for j in range(3)], 0)
 
 
 def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Array, " m"]:

@@ -15,7 +15,8 @@ with warnings.catch_warnings():
 
 DENSE = 512  # numbers whose derivatives are held, all of them
 _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told from rounding
-_SHARE = 0.01  # of a number outside what is known, that makes it unknown
+_SHARE = 1e-3  # of a number's square outside what is known, that makes it unknown
+_CLEAR = 3.0  # times less than all that is told must an error like what is left make of a direction
 _SETTLED = 1e-6  # relative decrease of the squared residual
 _PATIENT = 3  # steps without more than that
 _REFUSED = 8  # steps that would only have made it worse; each next is 2, 4, 8, ... times shorter
@@ -33,13 +34,19 @@ class Fit(NamedTuple):
         residual: Difference from the pictures relative to them, in L2: at the start and after each step.
         deviation: Standard deviation of each number, were what is left of the residual independent noise; infinite for
             what the pictures do not tell. Of many numbers (over 512) a lower bound, since others may make up for each.
-        rank: How many combinations of numbers the pictures tell; None of many numbers.
+        told: Orthonormal combinations of the numbers that the pictures tell, in a row as `ravel_pytree` has them; of a
+            material those of its free numbers. None of many numbers.
     """
 
     value: Any
     residual: np.ndarray
     deviation: Any
-    rank: int | None
+    told: Float[np.ndarray, "r n"] | None
+
+    @property
+    def rank(self) -> int | None:
+        """How many combinations of numbers the pictures tell."""
+        return None if self.told is None else len(self.told)
 
 
 def _jacobian(function: Callable, x: Array) -> Float[Array, "n m"]:
@@ -47,28 +54,40 @@ def _jacobian(function: Callable, x: Array) -> Float[Array, "n m"]:
     return jax.lax.map(lambda each: jax.jvp(function, (x,), (each,))[1], jnp.eye(len(x), dtype=x.dtype))
 
 
-def _told(slope: np.ndarray, left: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions that pictures tell, their singular values, and deviations of the numbers."""
-    rows = np.asarray(slope, np.float64)
+def _told(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions that pictures tell, apart from rounding, and their singular values."""
     square, axis = np.linalg.eigh(rows @ rows.T)
     value = np.sqrt(np.maximum(square, 0))
     known = value > _KNOWN * max(value[-1], np.finfo(np.float32).tiny)
-    axis, value = axis[:, known], value[known]
-    noise = left**2 / max(1, rows.shape[1] - len(value))
+    return axis[:, known], value[known]
+
+
+def _deviation(axis: np.ndarray, value: np.ndarray, left: float, pixels: int) -> np.ndarray:
+    """Of each number; infinite outside the directions."""
+    noise = left**2 / max(1, pixels - len(value))
     deviation = np.sqrt(noise * np.sum((axis / value) ** 2, 1))
-    return axis, value, np.where(1 - np.sum(axis**2, 1) > _SHARE, np.inf, deviation)
+    return np.where(1 - np.sum(axis**2, 1) > _SHARE, np.inf, deviation)
 
 
 def at_once(function: Callable, first: Array, unravel: Callable) -> Fit:
-    """A linear problem, by singular values; what is not told stays as it is."""
+    """A linear problem, by singular values; what is not told stays as it is.
+
+    Nor is a direction told in which an error like what is left, all of it in one pattern, would make a third of all
+    that is told: what is left of real pictures is no noise that averages out. Truncation as in Hansen 1998,
+    "Rank-deficient and discrete ill-posed problems".
+    """
     r, slope = jax.jit(lambda x: (function(x), _jacobian(function, x)))(first)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
-    axis, value, _ = _told(rows, 0.0)
-    move = -axis @ ((axis.T @ (rows @ before)) / value**2)
-    history = np.array([np.linalg.norm(before), np.linalg.norm(before + move @ rows)])
-    _, _, deviation = _told(rows, history[-1])
-    found, deviation = first + jnp.asarray(move, first.dtype), jnp.asarray(deviation, first.dtype)
-    return Fit(unravel(found), history, unravel(deviation), len(value))
+    axis, value = _told(rows)
+    part = -(axis.T @ (rows @ before)) / value**2
+    least = np.linalg.norm(before + axis @ part @ rows)
+    while len(value) and not (keep := value * np.linalg.norm(part) > _CLEAR * least).all():
+        axis, value, part = axis[:, keep], value[keep], part[keep]
+    move = axis @ part
+    left = float(np.linalg.norm(before + move @ rows))
+    deviation = jnp.asarray(_deviation(axis, value, left, len(before)), first.dtype)
+    found = unravel(first + jnp.asarray(move, first.dtype))
+    return Fit(found, np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
 def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int) -> Fit:
@@ -91,11 +110,13 @@ def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Calla
         still = still if refused else still + 1 if settled else 0
         if still == _PATIENT or refused == _REFUSED:
             break
-    axis, _, deviation = _told(np.asarray(state.jac).T, history[-1])
+    rows = np.asarray(state.jac, np.float64).T
+    axis, value = _told(rows)
+    deviation = _deviation(axis, value, history[-1], rows.shape[1])
     rate = np.abs(np.asarray(jax.jvp(bounded, (free,), (jnp.ones_like(free),))[1]))
     told = np.isfinite(deviation)
     deviation = jnp.asarray(np.where(told, np.where(told, deviation, 0) * rate, np.inf), free.dtype)
-    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), axis.shape[1])
+    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), axis.T)
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:

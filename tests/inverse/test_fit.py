@@ -66,7 +66,7 @@ def test_deviations_are_those_of_many_noisy_pictures(mesh, cameras, glossy, sky)
     """Fits of unlike noise vary as each says that it does."""
     radiance, random = lit_by(mesh, glossy), np.random.default_rng(0)
     whole = drawn(mesh, radiance, sky, cameras[:1])
-    noise = 0.05 * float(jnp.sqrt(jnp.mean(whole.value**2)))
+    noise = 0.005 * float(jnp.sqrt(jnp.mean(whole.value**2)))
     fits = []
     for _ in range(24):
         value = whole.value + noise * random.normal(size=whole.value.shape).astype(np.float32)
