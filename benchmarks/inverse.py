@@ -62,7 +62,7 @@ def measure(quick: bool, store: pathlib.Path | None):
     views = [camera.orbit(mesh, azimuth=a, elevation=0.3, width=edge, height=edge) for a in (0.3, 2.4, 4.5)]
     exact = path_tracing.available() and not quick
     yield from lights(mesh, sky, views[0], exact, store)
-    yield from materials(mesh, sky, views, exact, store)
+    yield from materials(mesh, sky, views, exact, store, quick)
 
 
 def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathlib.Path | None):
@@ -106,7 +106,7 @@ def band_limited(sky: Environment) -> Environment:
     return Environment(value - jnp.minimum(jnp.min(value), 0) * 1.01)
 
 
-def materials(mesh: Mesh, sky: Environment, views: list[Camera], exact: bool, store: pathlib.Path | None):
+def materials(mesh: Mesh, sky: Environment, views: list[Camera], exact: bool, store: pathlib.Path | None, quick: bool):
     """From three pictures under known light."""
     start = time.perf_counter()
     size = sky.radiance.shape[1]
@@ -115,7 +115,7 @@ def materials(mesh: Mesh, sky: Environment, views: list[Camera], exact: bool, st
     def sharp(roughness):
         return CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=F0)
 
-    table = brdf.lobe.tabulate(sharp, lobes=8, knot=[KNOTS])
+    table = brdf.lobe.tabulate(sharp, lobes=4 if quick else 8, knot=[KNOTS[::2] if quick else KNOTS])
     ready = time.perf_counter() - start
     texel, excess, rest = relight.direct.split(sky, count=TEXELS)
     blurred = relight.lobe.prefilter(rest)
@@ -131,7 +131,7 @@ def materials(mesh: Mesh, sky: Environment, views: list[Camera], exact: bool, st
     true, first = ({key: jnp.asarray(value) for key, value in each.items()} for each in (TRUE, START))
     model = CookTorrance(f0=F0, **TRUE)
     images = [drawn(mesh, model, sky, view, exact, seed=n) for n, view in enumerate(views)]
-    for noise in (0.0, NOISE):
+    for noise in (NOISE,) if quick else (0.0, NOISE):
         random = np.random.default_rng(0)
         scale = noise * np.sqrt(np.mean(np.square([each[each.any(-1)].mean() for each in images])))
         noisy = [np.maximum(each + scale * random.normal(size=each.shape), 0).astype(np.float32) for each in images]

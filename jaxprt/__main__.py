@@ -80,9 +80,7 @@ def _parser() -> argparse.ArgumentParser:
         help="of one of the scene's regions, numbered from 0, Cook-Torrance's model; can change in the dynamic system",
     )
     parser.add_argument("--system", choices=SYSTEMS, nargs="+", help="one, or several")
-    parser.add_argument(
-        "--bounces", type=int, choices=[0, 1, 2], default=2, help="of light, in the dynamic system (default 2)"
-    )
+    parser.add_argument("--bounces", type=int, choices=[0, 1, 2], help="of light, in the dynamic system (default 2)")
     parser.add_argument(
         "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"
     )
@@ -123,8 +121,9 @@ def _check(options: argparse.Namespace) -> None:
                 "--material must be the number of a region and four numbers from 0 to 1, got "
                 f"{' '.join(f'{x:g}' for x in (region, *numbers))}"
             )
-    if options.animate and "dynamic" not in (options.system or ()):
-        raise ValueError("--animate needs --system dynamic")
+    for name in ("animate", "bounces"):
+        if getattr(options, name) is not None and "dynamic" not in (options.system or ()):
+            raise ValueError(f"--{name} needs --system dynamic")
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -144,7 +143,9 @@ def _run(options: argparse.Namespace) -> None:
         elif system == "lobe":
             ready[system] = report.relight_lobe(scene, options.output, lobes=options.lobes)
         else:
-            changing = animation.prepare(scene, options.output, bounces=options.bounces)
+            changing = animation.prepare(
+                scene, options.output, bounces=2 if options.bounces is None else options.bounces
+            )
             # The exact pictures have direct light alone, and so has what is compared with them.
             ready[system] = animation.relit(changing._replace(tensor=None), scene)
     told["precompute"] = {system: each.told for system, each in ready.items()}

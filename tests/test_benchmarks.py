@@ -17,7 +17,7 @@ MOST_ERROR = {
     "factorization": 1e-4,
     "gradients": 1e-7,
     "interreflection": 0.65,
-    "inverse": 0.01,
+    "inverse": 0.1,
     "lobes": 0.15,
     "precompute_separable": 3e-3,
     "rasterize": 1e-3,

@@ -43,12 +43,13 @@ def small():
             (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1.0}),
             (prt.transport.lobe, "precompute", {"size": 8}),
             (prt.brdf.lobe, "tabulate", {"resolution": 8}),
+            (prt.brdf.paths, "factor", {"functions": 2, "terms": 4}),
             (prt.scene.mesh, "ground_plane", {"vertices": 49}),
             (prt.transport.dynamic, "precompute", {"size": 8}),
             (prt.transport.transfer, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
-        for name, value in (("LOBES", 1), ("FUNCTIONS", 2), ("TERMS", 4), ("ROUGHNESS", (0.3, 0.5, 0.5))):
+        for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
             patch.setattr(animation, name, value)
         yield
 
@@ -336,6 +337,7 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     ("options", "message"),
     [
         (["--animate", "4"], "--animate needs --system dynamic"),
+        (["--bounces", "1"], "--bounces needs --system dynamic"),
         (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
         (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
         (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of regions 0 to 0, got 7"),

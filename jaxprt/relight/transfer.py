@@ -95,8 +95,8 @@ def radiance(
 
     Raises:
         TypeError: As of `jaxprt.relight.dynamic.radiance`.
-        ValueError: Likewise; or the tensor is not of the transport's mesh or of sets as
-            large as these.
+        ValueError: Likewise; or the tensor has another number of vertices than the transport, or its sets of BRDFs.
+            That it is of the same mesh is not known and not checked.
 
     Reference: Sun et al. 2007, equations 3 and 4.
     """

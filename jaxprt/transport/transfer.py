@@ -135,7 +135,11 @@ class TransferTensor(eqx.Module):
             size = size + each * held + self.second.error.nbytes
         fits = wrong <= error if error is not None else size <= nbytes
         if not fits.any():
-            reached = f"error must be at least {wrong.min():.3g}" if nbytes is None else f"nbytes at least {size.min()}"
+            reached = (
+                f"error must be at least {wrong.min():.3g}"
+                if nbytes is None
+                else f"nbytes must be at least {size.min()}"
+            )
             raise ValueError(f"{reached}, got {error if nbytes is None else nbytes}")
         cost = np.where(fits, size if nbytes is None else wrong, np.inf)
         mode, component = np.unravel_index(np.argmin(cost), cost.shape)
@@ -178,17 +182,28 @@ def precompute(
         light factor of its region, and for two bounces 96 for each function too.
 
     Raises:
+        TypeError: A mesh or BRDFs of another kind.
         ValueError: Not one BRDF for each region, a set without terms or with lobes, bounces other than 1 and 2, numbers
             below 1, or an edge that is no power of two.
 
     Reference: Sun et al. 2007, sections 3.1 and 4.3.
     """
+    if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
+        raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
+    for number, each in enumerate(brdfs):
+        if not isinstance(each, DynamicBrdf | SeparableBrdf):
+            raise TypeError(
+                f"the BRDF of region {number} must be from jaxprt.brdf.paths.factor or separable.factor, got "
+                f"{type(each).__name__}"
+            )
     region = np.asarray(mesh.region)
     numbers = np.unique(region)
     if len(brdfs) != len(numbers):
         raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
     if bounces not in (1, 2):
         raise ValueError(f"bounces must be 1 or 2, got {bounces}")
+    if not 0 <= least < 1:
+        raise ValueError(f"least must be at least 0 and less than 1, got {least}")
     if min(components, modes, edge, size) < 1 or edge & (edge - 1):
         raise ValueError(
             f"components, modes, edge and size must be at least 1, and edge a power of two, got {components}, {modes}, "

@@ -230,7 +230,7 @@ def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
     assert float(small.error[0]) <= float(few.error[0])
     with pytest.raises(ValueError, match="give either error or nbytes, got error=None and nbytes=None"):
         whole.shorten()
-    with pytest.raises(ValueError, match=r"nbytes at least \d+, got 10"):
+    with pytest.raises(ValueError, match=r"nbytes must be at least \d+, got 10"):
         whole.shorten(nbytes=10)
     with pytest.raises(ValueError, match="error must be at least"):
         few.shorten(error=0.01)
