@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -30,25 +31,28 @@ def apart(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
     """
     compiled = jax.jit(function, static_argnames=static)
 
-    @functools.wraps(function)
-    def step(*argument, **named):
+    def branched(*argument, **named):
         option = {name: named.pop(name) for name in static if name in named}
-        leaf = [jnp.asarray(each) for each in jax.tree.leaves((argument, named))]
-        known = [each for each in leaf if each.size]
-        traced = any(isinstance(each, Tracer) for each in leaf)
-        if not (traced and known and jax.default_backend() == "cpu"):
-            return compiled(*argument, **named, **option)
 
         def own(argument, named):
-            return compiled(*argument, **named, **option)
+            return function(*argument, **named, **option)
 
         def never(argument, named):
             return jax.tree.map(lambda each: jnp.zeros(each.shape, each.dtype), shape)
 
         shape = jax.eval_shape(own, argument, named)
+        first = next(each for each in jax.tree.leaves((argument, named)) if each.size)
         # Branches are not fused with what is around them. The compiler does not see that this one is always taken.
-        first = jax.lax.stop_gradient(known[0]).ravel()[0].astype(jnp.int32)
-        return jax.lax.cond((first | 1) != 0, own, never, argument, named)
+        taken = jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32) | 1
+        return jax.lax.cond(taken != 0, own, never, argument, named)
+
+    inside = jax.jit(branched, static_argnames=static)  # Traced once, also where derivatives are taken outside any jit.
+
+    @functools.wraps(function)
+    def step(*argument, **named):
+        leaf = jax.tree.leaves((argument, {name: each for name, each in named.items() if name not in static}))
+        traced = any(isinstance(each, Tracer) for each in leaf) and any(np.size(each) for each in leaf)
+        return (inside if traced and jax.default_backend() == "cpu" else compiled)(*argument, **named)
 
     return step
 

@@ -131,3 +131,18 @@ def test_steps_take_whole_numbers_and_nothing():
 def test_on_cpus_a_step_inside_a_program_is_a_branch_of_its_own():
     text = jax.jit(apart(lambda x: jnp.sin(x) + 1)).lower(jnp.ones(3)).as_text()
     assert ("case" in text) == (jax.default_backend() == "cpu")
+
+
+def test_a_gradient_outside_any_program_is_compiled_once():
+    traces = []
+
+    def counted(x):
+        traces.append(x)
+        return jnp.sin(x) ** 2
+
+    step = apart(counted)
+    slope = jax.grad(lambda x: jnp.sum(step(x)))
+    first = slope(jnp.ones(3))
+    before = len(traces)
+    np.testing.assert_array_equal(slope(jnp.ones(3)), first)
+    assert len(traces) == before
