@@ -2,7 +2,7 @@
 
 XLA's CPU code repeats a step for each of its uses where it fuses the two; gathers, and loops over vertices, are then
 done many times over. JAX makes gradients of linear maps by transposing what it was given, step by step; that of a
-gather is a scatter, which is ten times as slow. `apart` and `linear` are the cures, under all transformations.
+gather is a scatter, which is five times as slow. `apart` and `linear` are the cures, under all transformations.
 """
 
 import functools

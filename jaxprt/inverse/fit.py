@@ -24,8 +24,8 @@ def light(
     """The light under which an object looks as in pictures, painted ones perhaps.
 
     Few numbers without bounds or a prior, as spherical harmonics are, are solved for at once, in the space of what the
-    pictures tell; what they do not stays as it is at the start. Others are found by projected
-    gradients, accelerated, each number in units of what it changes; or by L-BFGS without bounds.
+    pictures tell; what they do not stays as it is at the start. Others are found by projected gradients, accelerated,
+    each number in units of what it changes; or by L-BFGS without bounds.
 
     Args:
         radiance: Of the light and an eye, of every vertex; linear in the light.

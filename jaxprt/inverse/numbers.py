@@ -41,8 +41,9 @@ def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
 
 
 def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
-    """Refuses starts outside their bounds."""
-    wrong = np.flatnonzero(~((low <= np.asarray(first)) & (np.asarray(first) <= high) & (low < high)))
+    """Refuses starts outside their bounds, as these are in the start's precision."""
+    x = np.asarray(first)
+    wrong = np.flatnonzero(~((low.astype(x.dtype) <= x) & (x <= high.astype(x.dtype)) & (low < high)))
     if wrong.size:
         n = wrong[0]
         raise ValueError(

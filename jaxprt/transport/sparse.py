@@ -54,7 +54,7 @@ class SparseTransport(eqx.Module):
         return SparseTransport(index, value, self.position, self.frame, rms(index, value, self.rms.shape[0]))
 
     def with_transpose(self) -> "SparseTransport":
-        """The same, whose gradient by the light takes about as long as the light itself: without, ten times as long.
+        """The same, whose gradient by the light takes about as long as the light itself: without, five times as long.
 
         It takes 8 bytes more for each coefficient (16 in color), and some again for padding: 1.5 times the transport's
         own. Derivatives by the values need none of it, and are right with it; `keep` drops it.

@@ -78,12 +78,15 @@ def test_deviations_are_those_of_many_noisy_pictures(mesh, cameras, glossy, sky)
 
 
 def test_pictures_from_more_sides_tell_more(mesh, cameras, glossy, sky):
-    radiance = lit_by(mesh, glossy)
-    one, three = (
-        inverse.light(radiance, jnp.zeros_like(sky), drawn(mesh, radiance, sky, cameras[:n])).deviation for n in (1, 3)
-    )
-    rounding = 1e-6  # Both fits are exact but for that, so that only the sizes of derivatives are compared.
-    assert np.linalg.norm(three) < np.linalg.norm(one) + rounding
+    radiance, random, size = lit_by(mesh, glossy), np.random.default_rng(0), []
+    for count in (1, 3):
+        pixels = drawn(mesh, radiance, sky, cameras[:count])
+        noise = 0.005 * float(jnp.sqrt(jnp.mean(pixels.value**2))) * random.normal(size=pixels.value.shape)
+        noisy = eqx.tree_at(lambda p: p.value, pixels, pixels.value + noise.astype(np.float32))
+        found = inverse.light(radiance, jnp.zeros_like(sky), noisy)
+        assert found.rank == sky.size
+        size.append(np.linalg.norm(found.deviation))
+    assert size[1] < 0.2 * size[0]
 
 
 def test_exposures_are_taken_out(mesh, cameras, glossy, sky, close):
@@ -124,7 +127,7 @@ def test_a_prior_makes_light_smooth(mesh, cameras, glossy):
         inverse.light(radiance, start, pixels, lower=0.0, prior=prior, steps=60)
         for prior in (None, lambda light: 1e-2 * inverse.smoothness(light.radiance))
     )
-    assert inverse.smoothness(smooth.value.radiance) < 0.4 * inverse.smoothness(rough.value.radiance)
+    assert inverse.smoothness(smooth.value.radiance) < 0.3 * inverse.smoothness(rough.value.radiance)
     assert smooth.residual[-1] < 0.1
 
 
@@ -175,6 +178,14 @@ def test_a_material_is_found_between_its_bounds(mesh, cameras, sky, two_parts, c
     assert np.all(np.diff(found.residual) <= 1e-7)
 
 
+@pytest.mark.parametrize("place", [0.3, 0.7])
+def test_a_start_may_be_a_bound_that_single_precision_rounds(mesh, cameras, place):
+    pixels = inverse.observe(mesh, [Picture(np.ones((EDGE, EDGE, 3), np.float32), cameras[0])])
+    for bounds in ({"lower": place, "upper": 2.0}, {"lower": 0.0, "upper": place}):
+        gray = inverse.material(lambda m, eye: m * jnp.ones((len(mesh.position), 3)), place, pixels, **bounds)
+        assert float(gray.value) == pytest.approx(min(1.0, bounds["upper"]), abs=1e-3)
+
+
 def test_light_and_material_are_found_up_to_their_scale(mesh, cameras, sky, two_parts, close):
     radiance, true = two_parts
     pixels = drawn(mesh, lambda m, eye: radiance(sky, m, eye), true, cameras)
@@ -195,4 +206,4 @@ def test_smoothness_is_the_mean_square_of_steps_everywhere():
     harmonic_sky = harmonics.evaluate(cubemap.direction(size=64), degree=1)[..., 1:2]  # A slope of sqrt(3 / 4 pi).
     # The mean over the sphere of |grad|^2 is 2 * 3 / (4 pi) / 3; texels are (4 pi / 6)^(1/2) / 64 wide on average.
     expected = 2 / (4 * np.pi) * (4 * np.pi / 6) / 64**2
-    assert float(inverse.smoothness(harmonic_sky)) == pytest.approx(expected, rel=0.1)
+    assert float(inverse.smoothness(harmonic_sky)) == pytest.approx(expected, rel=0.02)
