@@ -9,25 +9,22 @@ no converged one is needed.
 processor with LLVM, which must be installed; `available` tells.
 """
 
-import functools
 import math
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.brdf import CookTorrance, Lambert
+from benchmarks import plugins
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.image import raster
 from jaxprt.scene import Camera, Environment, Mesh, environment
-from jaxprt.sphere import cubemap, harmonics
 
 EDGE = 256  # pixels: about as many as there are vertices
 SAMPLES = (4, 16, 64, 256, 1024)
 _LLVM = 17  # the first that has minima of floats on x86: the process ends where an older one meets them
 _PATHS = 1 << 22  # traced at once: some 200 bytes each
-_SMOOTHEST = 1e-3  # least roughness, as jaxprt.brdf has it
 _ROUGHNESS = {"alpha_u": (2 / 12) ** 0.5, "alpha_v": (2 / 102) ** 0.5}  # of Blinn's distribution with these exponents
 
 
@@ -39,8 +36,8 @@ def measure(glossy: Mesh, ground: Mesh, lights: dict[str, Environment], eye: np.
     matte = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", **_ROUGHNESS}
     shapes = {
-        "glossy": _shape(mitsuba, glossy, {"type": "blendbsdf", "weight": 0.5, "matte": matte, "mirror": mirror}),
-        "ground": _shape(mitsuba, ground, matte),
+        "glossy": shape(mitsuba, glossy, {"type": "blendbsdf", "weight": 0.5, "matte": matte, "mirror": mirror}),
+        "ground": shape(mitsuba, ground, matte),
     }
     edge = 32 if quick else EDGE
     view = mitsuba.ScalarTransform4f().look_at(
@@ -48,7 +45,7 @@ def measure(glossy: Mesh, ground: Mesh, lights: dict[str, Environment], eye: np.
     )
     film = {"type": "hdrfilm", "width": edge, "height": edge, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     for name, light in lights.items():
-        picture = _latlong(light)
+        picture = latlong(light)
         scene = mitsuba.load_dict(
             {
                 "type": "scene",
@@ -80,7 +77,7 @@ def available() -> bool:
 
 def picture(
     mesh: Mesh,
-    materials: Sequence[CookTorrance | Lambert],
+    materials: Sequence[CookTorrance | AshikhminShirley | Lambert],
     light: Environment,
     camera: Camera,
     *,
@@ -128,10 +125,10 @@ def picture(
             "type": "scene",
             # Russian roulette would only add noise at depths that are looked at.
             "integrator": {"type": "path", "max_depth": depth, "rr_depth": 100, "hide_emitters": True},
-            "sensor": _sensor(mitsuba, camera),
-            "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(_latlong(light))},
+            "sensor": sensor(mitsuba, camera),
+            "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(latlong(light))},
             **{
-                f"region{number}": _shape(mitsuba, _part(mesh, region == number), _bsdf(mitsuba, materials[number]))
+                f"region{number}": shape(mitsuba, _part(mesh, region == number), plugins.bsdf(materials[number]))
                 for number in used
             },
         }
@@ -146,7 +143,7 @@ def picture(
     return (total / samples).astype(np.float32)
 
 
-def _sensor(mitsuba, camera: Camera) -> dict:
+def sensor(mitsuba, camera: Camera) -> dict:
     """Mitsuba's camera of the same rays; it looks along +z with +x to the left."""
     eye, target = np.asarray(camera.eye, float), np.asarray(camera.target, float)
     _, up, forward = np.asarray(raster.view_axes(camera), float)
@@ -175,92 +172,21 @@ def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
     return Mesh(position, jnp.asarray(face.reshape(-1, 3), jnp.int32), normal, tangent, region)
 
 
-def _bsdf(mitsuba, material: CookTorrance | Lambert):
-    if isinstance(material, CookTorrance):
-        return _cook_torrance(mitsuba)(material)
-    if isinstance(material, Lambert):
-        albedo = np.broadcast_to(material.albedo, 3).tolist()
-        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
-    raise ValueError(f"materials must be CookTorrance or Lambert, got {type(material).__name__}")
-
-
-@functools.cache
-def _cook_torrance(mitsuba: Any):
-    """The class of Cook and Torrance's model: made once, and only when a variant is set, of which it inherits."""
-    import drjit
-
-    class Plugin(mitsuba.BSDF):
-        """The formula in the docstring of `jaxprt.brdf.CookTorrance`, with none of its code.
-
-        Directions are drawn half by the cosine, half as mirrored at a half vector of Beckmann's distribution.
-        """
-
-        def __init__(self, material: CookTorrance):
-            super().__init__(mitsuba.Properties())
-            color = (material.diffuse, material.specular, material.f0)
-            self.diffuse, self.specular, self.f0 = (mitsuba.Color3f(np.broadcast_to(c, 3).tolist()) for c in color)
-            self.roughness = mitsuba.Float(max(float(material.roughness), _SMOOTHEST))
-            # Else they would be constants of the program, and other materials compile anew.
-            drjit.make_opaque(self.diffuse, self.specular, self.f0, self.roughness)
-            self.m_components = [
-                mitsuba.BSDFFlags.GlossyReflection | mitsuba.BSDFFlags.DiffuseReflection | mitsuba.BSDFFlags.FrontSide
-            ]
-            self.m_flags = self.m_components[0]
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            # Half vectors with tan^2 = -m^2 log(u) have the density D times their cosine.
-            tangent = self.roughness * drjit.safe_sqrt(-drjit.log(1 - sample2.x))
-            sine, cosine = drjit.sincos(2 * drjit.pi * sample2.y)
-            half = drjit.normalize(mitsuba.Vector3f(tangent * cosine, tangent * sine, 1))
-            matte = mitsuba.warp.square_to_cosine_hemisphere(sample2)
-            result = drjit.zeros(mitsuba.BSDFSample3f)
-            result.wo = drjit.select(sample1 < 0.5, matte, 2 * drjit.dot(half, si.wi) * half - si.wi)
-            result.eta, result.sampled_component = 1.0, 0
-            result.sampled_type = mitsuba.UInt32(+mitsuba.BSDFFlags.GlossyReflection)
-            value, result.pdf = self.eval_pdf(ctx, si, result.wo, active)
-            return result, drjit.select(result.pdf > 0, value / result.pdf, 0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            cos_i, cos_o = si.wi.z, wo.z
-            half = drjit.normalize(si.wi + wo)
-            cos_h, cos_d = half.z, drjit.dot(half, wo)
-            lit = active & (cos_i > 0) & (cos_o > 0)
-            tilt = (half.x**2 + half.y**2) / (self.roughness * cos_h) ** 2
-            d = drjit.exp(-tilt) / (drjit.pi * self.roughness**2 * cos_h**4)
-            g = drjit.minimum(1, 2 * cos_h * drjit.minimum(cos_i, cos_o) / cos_d)
-            f = self.f0 + (1 - self.f0) * (1 - cos_d) ** 5
-            value = (self.diffuse + self.specular * (d * g / (cos_i * cos_o)) * f) / drjit.pi * cos_o
-            pdf = (cos_o / drjit.pi + d * cos_h / (4 * cos_d)) / 2
-            return drjit.select(lit, value, 0), drjit.select(lit, pdf, 0)
-
-        def eval(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
-        def traverse(self, callback):
-            pass
-
-        def to_string(self):
-            return "CookTorrance"
-
-    return Plugin
-
-
-def _shape(mitsuba, mesh: Mesh, bsdf):
+def shape(mitsuba, mesh: Mesh, bsdf):
+    """Mitsuba's mesh of a material, with tangents."""
     props = mitsuba.Properties()
     props["bsdf"] = mitsuba.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
-    shape = mitsuba.Mesh("mesh", len(mesh.position), len(mesh.face), has_vertex_normals=True, props=props)
-    parameters = mitsuba.traverse(shape)
+    result = mitsuba.Mesh("mesh", len(mesh.position), len(mesh.face), has_vertex_normals=True, props=props)
+    parameters = mitsuba.traverse(result)
     parameters["vertex_positions"] = np.asarray(mesh.position).ravel()
     parameters["vertex_normals"] = np.asarray(mesh.normal).ravel()
     parameters["faces"] = np.asarray(mesh.face).ravel()
     parameters.update()
-    return shape
+    result.add_attribute(plugins.TANGENT, 3, np.asarray(mesh.tangent).ravel())
+    return result
 
 
-def _latlong(light: Environment) -> np.ndarray:
+def latlong(light: Environment) -> np.ndarray:
     """The light as Mitsuba reads it: the first and last rows are the poles, the center column is +z."""
     height = 4 * light.radiance.shape[-2]
     longitude = np.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
@@ -268,65 +194,3 @@ def _latlong(light: Environment) -> np.ndarray:
     across = np.cos(latitude)
     direction = np.stack([np.sin(longitude) * across, np.sin(latitude), np.cos(longitude) * across], -1)
     return np.array(environment.background(light, jnp.asarray(direction, jnp.float32)), order="C")
-
-
-def fit_light(
-    mesh: Mesh, albedo: float, image: np.ndarray, camera: Camera, *, degree: int, steps: int, samples: int, rate: float
-) -> tuple[np.ndarray, float]:
-    """Harmonics of the light of a picture of a diffuse object, by Mitsuba's own gradients of direct light and Adam.
-
-    Needs LLVM 17 or newer, see `available`.
-
-    Args:
-        mesh: The object.
-        albedo: Of all of it.
-        image: The picture.
-        camera: From where.
-        degree: Of the harmonics.
-        steps: Of Adam.
-        samples: Paths per pixel and step.
-        rate: Of Adam.
-
-    Returns:
-        Coefficients in three colors, and the seconds of all steps but the first, which compiles, times their number.
-    """
-    import drjit
-    import mitsuba
-
-    mitsuba.set_variant("llvm_ad_rgb")
-    edge = 16
-    constant = Environment(jnp.ones((6, edge, edge, 3)))
-    scene = mitsuba.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "prb", "max_depth": 2, "rr_depth": 100, "hide_emitters": True},
-            "sensor": _sensor(mitsuba, camera),
-            "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(_latlong(constant))},
-            "object": _shape(mitsuba, mesh, _bsdf(mitsuba, Lambert(albedo))),
-        }
-    )
-    names = mitsuba.traverse(scene)
-    each = [
-        _latlong(Environment(harmonics.evaluate(cubemap.direction(size=edge), degree=degree)[..., [n] * 3]))[..., 0]
-        for n in range((degree + 1) ** 2)
-    ]
-    basis = np.stack(each, -1)
-    basis = np.concatenate([basis, basis[:, :1]], 1)  # Mitsuba has the first column again behind the last.
-    value = np.zeros((basis.shape[-1], 3))
-    value[0] = np.sqrt(4 * np.pi) * image[image.any(-1)].mean(0) / albedo
-    target = mitsuba.TensorXf(image)
-    first, second, seconds = np.zeros_like(value), np.zeros_like(value), []
-    for step in range(1, steps + 1):
-        start = time.perf_counter()
-        data = mitsuba.TensorXf((basis @ value).astype(np.float32))
-        drjit.enable_grad(data)
-        names["light.data"] = data
-        names.update()
-        seeds: Any = {"seed": 2 * step, "seed_grad": 2 * step + 1}
-        made = mitsuba.render(scene, names, spp=samples, **seeds)
-        drjit.backward(drjit.mean(drjit.square(made - target), axis=None))
-        slope = np.einsum("hwl,hwc->lc", basis, np.array(drjit.grad(data)))
-        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
-        value -= rate * (first / (1 - 0.9**step)) / (np.sqrt(second / (1 - 0.999**step)) + 1e-12)
-        seconds.append(time.perf_counter() - start)
-    return value, float(np.mean(seconds[1:]) * steps)

@@ -9,7 +9,9 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 BENCHMARKS = sorted(
-    path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem not in ("__init__", "harness", "path_tracing")
+    path.stem
+    for path in (ROOT / "benchmarks").glob("*.py")
+    if path.stem not in ("__init__", "harness", "path_tracing", "plugins", "prb")
 )
 # Small cases bound the error too: rounding, or thin features of coarse meshes.
 MOST_ERROR = {

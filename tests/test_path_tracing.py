@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import path_tracing
-from jaxprt.brdf import CookTorrance, Lambert
+from benchmarks import path_tracing, plugins
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.image import raster
 from jaxprt.relight import reference
 from jaxprt.scene import Camera, Environment, builtin
@@ -17,7 +17,14 @@ pytestmark = pytest.mark.skipif(not path_tracing.available(), reason="drjit find
 # Of the norm: the noise of 4,096 samples, and what differs between pixels' squares and centers. Pictures of 128 x 128
 # pixels and 16,384 samples agree to 0.2 % beyond their noise of 0.4 %.
 DIRECT = 0.015
-MATERIALS = (CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], 0.3, [0.1, 0.3, 0.2]), CookTorrance(0.3, 0.5, 0.1, 0.3))
+MATERIALS = (
+    CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], 0.3, [0.1, 0.3, 0.2]),
+    AshikhminShirley(0.3, 0.5, 150.0, 20.0),
+)
+SHARP = (
+    *(CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], roughness, [0.1, 0.3, 0.2]) for roughness in (0.1, 0.3, 0.5)),
+    *(AshikhminShirley([0.4, 0.2, 0.1], [0.1, 0.3, 0.2], nu, nv) for nu, nv in ((20.0, 150.0), (8.0, 2.0))),
+)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +61,7 @@ def plugin():
     def make(material, wi):
         seen = drjit.zeros(mitsuba.SurfaceInteraction3f)
         seen.wi = mitsuba.Vector3f(np.asarray(wi, float).tolist())
-        return mitsuba, path_tracing._cook_torrance(mitsuba)(material), seen
+        return mitsuba, plugins.bsdf(material), seen
 
     return make
 
@@ -72,10 +79,9 @@ def inclined(angle):
     return np.array([np.sin(angle), 0.0, np.cos(angle)], np.float32)
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("material", SHARP)
 @pytest.mark.parametrize("angle", [0.02, 1.0, 1.4])
-def test_material_is_that_of_jaxprt(plugin, roughness, angle):
-    material = CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], roughness, [0.1, 0.3, 0.2])
+def test_material_is_that_of_jaxprt(plugin, material, angle):
     wo, _ = hemisphere()
     mitsuba, bsdf, seen = plugin(material, inclined(angle))
     actual = np.array(bsdf.eval(mitsuba.BSDFContext(), seen, mitsuba.Vector3f(wo.T))).T
@@ -83,10 +89,9 @@ def test_material_is_that_of_jaxprt(plugin, roughness, angle):
     assert np.linalg.norm(actual - expected) < 1e-4 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("material", SHARP)
 @pytest.mark.parametrize("angle", [0.02, 1.0, 1.4])
-def test_samples_follow_their_density_and_weigh_the_albedo(plugin, roughness, angle):
-    material = CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], roughness, [0.1, 0.3, 0.2])
+def test_samples_follow_their_density_and_weigh_the_albedo(plugin, material, angle):
     mitsuba, bsdf, seen = plugin(material, inclined(angle))
     context = mitsuba.BSDFContext()
     wo, area = hemisphere()
@@ -112,7 +117,7 @@ def test_back_of_material_is_black(plugin):
 
 def test_rays_are_those_of_jaxprt(plugin, camera):
     mitsuba, _, _ = plugin(MATERIALS[0], inclined(0.5))
-    sensor = mitsuba.load_dict(path_tracing._sensor(mitsuba, camera))
+    sensor = mitsuba.load_dict(path_tracing.sensor(mitsuba, camera))
     x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(24) + 0.5) / 24)
     ray, _ = sensor.sample_ray(0.0, 0.5, mitsuba.Point2f(x.ravel(), y.ravel()), mitsuba.Point2f(0.5, 0.5))
     np.testing.assert_allclose(np.array(ray.d).T, raster.ray_direction(camera).reshape(-1, 3), atol=1e-6)
@@ -177,7 +182,10 @@ def test_same_seed_gives_the_same_picture(scene, camera, light):
     ("change", "message"),
     [
         ({"materials": MATERIALS[:1]}, "materials must have one for each region, got 1 and region 1"),
-        ({"materials": [MATERIALS[0], None]}, "materials must be CookTorrance or Lambert, got NoneType"),
+        (
+            {"materials": [MATERIALS[0], None]},
+            "materials must be CookTorrance, AshikhminShirley or Lambert, got NoneType",
+        ),
         ({"light": Environment(jnp.ones((2, 6, 4, 4, 3)))}, r"light must be one environment, got a batch \[2\]"),
         ({"depth": 1}, "depth must be at least 2 and samples at least 1, got 1 and 4"),
         ({"samples": 0}, "depth must be at least 2 and samples at least 1, got 2 and 0"),

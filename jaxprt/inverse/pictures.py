@@ -13,6 +13,8 @@ from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap
 
+_BENT = 0.25  # between corners' normals: about 14 degrees
+
 
 def _mask(value) -> Array | None:
     return None if value is None else jnp.asarray(value, bool)
@@ -55,6 +57,9 @@ class Pixels(eqx.Module):
 def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     """Finds what pictures show of a mesh: pixels that see it, not at its silhouette, inside masks, and not saturated.
 
+    Nor do triangles count whose corners' normals differ by more than 14 degrees, or half of the pixels if these are
+    more: there vertices are too far apart for what lies between them.
+
     Raises:
         TypeError: What is no `Picture`.
         ValueError: No pictures; an image or mask of another size than the camera's; images that differ in colors;
@@ -90,7 +95,8 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
     if not (np.isfinite(picture.exposure) and picture.exposure > 0):
         raise ValueError(f"the exposure of picture {number} must be positive, got {picture.exposure}")
     fragments = raster.rasterize(mesh, camera)
-    counts = _inside(np.asarray(fragments.triangle) >= 0)
+    seen = np.asarray(fragments.triangle)
+    counts = _inside(seen >= 0)
     if picture.mask is not None:
         counts &= np.asarray(picture.mask)
     if picture.saturation is not None:
@@ -102,8 +108,16 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
             f"pixels that count must be finite and not negative, {wrong.sum()} of {len(value)} of picture {number} are "
             "not: mask them"
         )
-    vertex = np.asarray(mesh.face)[np.asarray(fragments.triangle)[counts]] + number * len(mesh.position)
-    return vertex, np.asarray(fragments.barycentric)[counts] * picture.exposure, value
+    bent = _bent(mesh, seen[counts])
+    counts[counts] = bent <= np.maximum(_BENT, np.median(bent) if bent.size else 0)
+    vertex = np.asarray(mesh.face)[seen[counts]] + number * len(mesh.position)
+    return vertex, np.asarray(fragments.barycentric)[counts] * picture.exposure, image[counts]
+
+
+def _bent(mesh: Mesh, triangle: np.ndarray) -> np.ndarray:
+    """Largest distance between the unit normals of each triangle's corners."""
+    corner = np.asarray(mesh.normal)[np.asarray(mesh.face)[triangle]]
+    return np.max(np.linalg.norm(corner - np.roll(corner, 1, 1), axis=-1), -1, initial=0)
 
 
 def _inside(seen: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told fro
 _SHARE = 1e-3  # of a number's square outside what is known, that makes it unknown
 _CLEAR = 3.0  # times less than all that is told must an error like what is left make of a direction
 _SETTLED = 1e-6  # relative decrease of the squared residual
+_MINOR = 1e-3  # that a refused step promised
 _PATIENT = 3  # steps without more than that
 _REFUSED = 8  # steps that would only have made it worse; each next is 2, 4, 8, ... times shorter
 _LEAST = 1e-3  # of the largest squared derivative: others count as that
@@ -49,9 +51,14 @@ class Fit(NamedTuple):
         return None if self.told is None else len(self.told)
 
 
-def _jacobian(function: Callable, x: Array) -> Float[Array, "n m"]:
-    """Derivatives by each number, one after another, so that memory is that of one."""
-    return jax.lax.map(lambda each: jax.jvp(function, (x,), (each,))[1], jnp.eye(len(x), dtype=x.dtype))
+def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m"], Float[Array, "n m"]]]:
+    """A function with its derivatives by each number, one after another, so that memory is that of one."""
+
+    def both(x):
+        value, along = jax.linearize(function, x)
+        return value, jax.lax.map(along, jnp.eye(len(x), dtype=x.dtype))
+
+    return jax.jit(both)
 
 
 def _told(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +83,7 @@ def at_once(function: Callable, first: Array, unravel: Callable) -> Fit:
     that is told: what is left of real pictures is no noise that averages out. Truncation as in Hansen 1998,
     "Rank-deficient and discrete ill-posed problems".
     """
-    r, slope = jax.jit(lambda x: (function(x), _jacobian(function, x)))(first)
+    r, slope = _with_slopes(function)(first)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
     axis, value = _told(rows)
     part = -(axis.T @ (rows @ before)) / value**2
@@ -92,22 +99,31 @@ def at_once(function: Callable, first: Array, unravel: Callable) -> Fit:
 
 def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int) -> Fit:
     """By steps of Levenberg and Marquardt in free numbers, which others follow from."""
+    # Not compiled as a whole, jaxopt asks for the same place two or three times: what was made last is kept.
+    both = lru_cache(maxsize=1)(lambda place: evaluate(jnp.asarray(np.frombuffer(place, free.dtype))))
+    evaluate = _with_slopes(function)
     solver = jaxopt.LevenbergMarquardt(
-        function, materialize_jac=True, solver="cholesky", damping_parameter=1e-3, implicit_diff=False
+        lambda u: both(np.asarray(u).tobytes())[0],
+        materialize_jac=True,
+        solver="cholesky",
+        damping_parameter=1e-3,
+        implicit_diff=False,
+        jit=False,
     )
     # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
-    solver._jac_fun = lambda u: _jacobian(function, u).T
-    state, update = jax.jit(solver.init_state)(free), jax.jit(solver.update)
+    solver._jac_fun = lambda u: both(np.asarray(u).tobytes())[1].T
+    state = solver.init_state(free)
     history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
     for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
-        moved, tried = update(free, state)
+        moved, tried = solver.update(free, state)
         if not (np.isfinite(moved).all() and np.isfinite(tried.residual).all()):
             break
         refused = refused + 1 if np.array_equal(moved, free) else 0  # Too long a step: the next is shorter.
+        promised = jnp.abs(tried.delta @ (state.damping_factor * tried.delta - state.gradient))
         free, state = moved, tried
         history.append(float(jnp.linalg.norm(state.residual)))
-        settled = history[-2] ** 2 - history[-1] ** 2 <= _SETTLED * history[-2] ** 2
-        still = still if refused else still + 1 if settled else 0
+        brought, least = (promised, _MINOR) if refused else (history[-2] ** 2 - history[-1] ** 2, _SETTLED)
+        still = still + 1 if brought <= least * history[-2] ** 2 else still if refused else 0
         if still == _PATIENT or refused == _REFUSED:
             break
     rows = np.asarray(state.jac, np.float64).T

@@ -1,0 +1,193 @@
+"""Materials of jaxprt as plugins of Mitsuba 3: the formulas in the docstrings of `jaxprt.brdf`, with none of its code.
+
+Directions are drawn half by the cosine, half as mirrored at a half vector of the model's own distribution. Parameters
+are Mitsuba's, so that `mitsuba.traverse` finds them and its gradients reach them.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+
+_SMOOTHEST = 1e-3  # least roughness, as jaxprt.brdf has it
+TANGENT = "vertex_tangent"  # attribute of shapes
+
+
+def bsdf(material: CookTorrance | AshikhminShirley | Lambert) -> Any:
+    """Mitsuba's material, or what loads as one; a variant must be set.
+
+    Raises:
+        ValueError: A material of another kind.
+    """
+    if isinstance(material, Lambert):
+        albedo = np.broadcast_to(material.albedo, 3).tolist()
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+    if isinstance(material, CookTorrance):
+        return _cook_torrance()(material)
+    if isinstance(material, AshikhminShirley):
+        return _ashikhmin_shirley()(material)
+    raise ValueError(f"materials must be CookTorrance, AshikhminShirley or Lambert, got {type(material).__name__}")
+
+
+def _modules() -> tuple[Any, Any]:
+    """Imported when used: not every machine has them, and what they contain depends on the variant."""
+    import drjit
+    import mitsuba
+
+    return drjit, mitsuba
+
+
+@functools.cache
+def _glossy() -> Any:
+    """The class of both models: made once, and only when a variant is set, of which it inherits."""
+    drjit, mitsuba = _modules()
+
+    class Glossy(mitsuba.BSDF):
+        colors: tuple[str, ...]
+        scalars: tuple[str, ...]
+
+        def __init__(self, material):
+            super().__init__(mitsuba.Properties())
+            for name in self.colors:
+                setattr(self, name, mitsuba.Color3f(np.broadcast_to(getattr(material, name), 3).tolist()))
+            for name in self.scalars:
+                setattr(self, name, mitsuba.Float(float(getattr(material, name))))
+            # Else they would be constants of the program, and other materials compile anew.
+            drjit.make_opaque(*(getattr(self, name) for name in self.colors + self.scalars))
+            self.m_components = [
+                mitsuba.BSDFFlags.GlossyReflection | mitsuba.BSDFFlags.DiffuseReflection | mitsuba.BSDFFlags.FrontSide
+            ]
+            self.m_flags = self.m_components[0]
+
+        def half(self, u):
+            """A half vector of its distribution."""
+            raise NotImplementedError
+
+        def density(self, half):
+            """Of half vectors, by solid angle."""
+            raise NotImplementedError
+
+        def value(self, wi, wo, half, cos_d):
+            """In 1/sr."""
+            raise NotImplementedError
+
+        def frame(self, si):
+            """Directions to the frame of the tangent, and back."""
+            return (lambda w: w), (lambda w: w)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            to, back = self.frame(si)
+            wi, half = to(si.wi), self.half(sample2)
+            matte = mitsuba.warp.square_to_cosine_hemisphere(sample2)
+            result = drjit.zeros(mitsuba.BSDFSample3f)
+            result.wo = back(drjit.select(sample1 < 0.5, matte, 2 * drjit.dot(half, wi) * half - wi))
+            result.eta, result.sampled_component = 1.0, 0
+            result.sampled_type = mitsuba.UInt32(+mitsuba.BSDFFlags.GlossyReflection)
+            value, result.pdf = self.eval_pdf(ctx, si, result.wo, active)
+            return result, drjit.select(result.pdf > 0, value / result.pdf, 0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            to, _ = self.frame(si)
+            wi, wo = to(si.wi), to(wo)
+            lit = active & (wi.z > 0) & (wo.z > 0)
+            half = drjit.normalize(wi + wo)
+            cos_d = drjit.dot(half, wo)
+            value = self.value(wi, wo, half, cos_d) * wo.z
+            pdf = (wo.z / drjit.pi + self.density(half) / (4 * cos_d)) / 2
+            return drjit.select(lit, value, 0), drjit.select(lit, pdf, 0)
+
+        def eval(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def traverse(self, callback):
+            for name in self.colors + self.scalars:
+                callback.put(name, getattr(self, name), mitsuba.ParamFlags.Differentiable)
+
+        def to_string(self):
+            return type(self).__name__
+
+    return Glossy
+
+
+@functools.cache
+def _cook_torrance() -> Any:
+    drjit, mitsuba = _modules()
+
+    class Model(_glossy()):
+        colors, scalars = ("diffuse", "specular", "f0"), ("roughness",)
+
+        def __init__(self, material: CookTorrance):
+            super().__init__(material)
+            self.roughness = drjit.maximum(self.roughness, _SMOOTHEST)
+            drjit.make_opaque(self.roughness)
+
+        def half(self, u):
+            # Half vectors with tan^2 = -m^2 log(u) have the density D times their cosine.
+            tangent = self.roughness * drjit.safe_sqrt(-drjit.log(1 - u.x))
+            sine, cosine = drjit.sincos(2 * drjit.pi * u.y)
+            return drjit.normalize(mitsuba.Vector3f(tangent * cosine, tangent * sine, 1))
+
+        def distribution(self, half):
+            tilt = (half.x**2 + half.y**2) / (self.roughness * half.z) ** 2
+            return drjit.exp(-tilt) / (drjit.pi * self.roughness**2 * half.z**4)
+
+        def density(self, half):
+            return self.distribution(half) * half.z
+
+        def value(self, wi, wo, half, cos_d):
+            g = drjit.minimum(1, 2 * half.z * drjit.minimum(wi.z, wo.z) / cos_d)
+            f = self.f0 + (1 - self.f0) * (1 - cos_d) ** 5
+            return (self.diffuse + self.specular * (self.distribution(half) * g / (wi.z * wo.z)) * f) / drjit.pi
+
+    return Model
+
+
+@functools.cache
+def _ashikhmin_shirley() -> Any:
+    drjit, mitsuba = _modules()
+
+    class Model(_glossy()):
+        colors, scalars = ("diffuse", "specular"), ("nu", "nv")
+
+        def frame(self, si):
+            # Interpolated as the attribute of vertices is, and square to the normal.
+            tangent = si.shape.eval_attribute_3(TANGENT, si)
+            x = si.to_local(mitsuba.Vector3f(tangent.x, tangent.y, tangent.z))
+            length = drjit.sqrt(x.x**2 + x.y**2)
+            flat = length > 1e-6  # Interpolated tangents may cancel, and a lone interaction has none.
+            c, s = drjit.select(flat, x.x / length, 1), drjit.select(flat, x.y / length, 0)
+            return (
+                lambda w: mitsuba.Vector3f(c * w.x + s * w.y, c * w.y - s * w.x, w.z),
+                lambda w: mitsuba.Vector3f(c * w.x - s * w.y, s * w.x + c * w.y, w.z),
+            )
+
+        def half(self, u):
+            # Equations 9 and 10, over all four quadrants at once.
+            sine, cosine = drjit.sincos(2 * drjit.pi * u.x)
+            x, y = cosine * drjit.sqrt(self.nv + 1), sine * drjit.sqrt(self.nu + 1)
+            length = drjit.sqrt(x**2 + y**2)
+            x, y = x / length, y / length
+            z = drjit.power(1 - u.y, 1 / (self.nu * x**2 + self.nv * y**2 + 1))
+            flat = drjit.safe_sqrt(1 - z**2)
+            return mitsuba.Vector3f(flat * x, flat * y, z)
+
+        def density(self, half):
+            slope = half.x**2 + half.y**2
+            exponent = (self.nu * half.x**2 + self.nv * half.y**2) / drjit.maximum(slope, 1e-12)
+            peak = drjit.sqrt((self.nu + 1) * (self.nv + 1)) / (2 * drjit.pi)
+            # Next to the normal 1 - z has no digits, and the sine has.
+            log = drjit.select(slope < 0.01, -slope / 2 - slope**2 / 4, drjit.log(drjit.maximum(half.z, 1e-6)))
+            return peak * drjit.exp(exponent * log)
+
+        def value(self, wi, wo, half, cos_d):
+            f = self.specular + (1 - self.specular) * (1 - cos_d) ** 5
+            lobe = self.density(half) / (4 * cos_d * drjit.maximum(wi.z, wo.z)) * f
+            base = (1 - (1 - wi.z / 2) ** 5) * (1 - (1 - wo.z / 2) ** 5)
+            return lobe + 28 / (23 * drjit.pi) * self.diffuse * (1 - self.specular) * base
+
+    return Model
