@@ -1,15 +1,18 @@
 """What pictures do not tell, tell wrongly, or tell of nothing at all."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxprt import inverse
-from jaxprt.brdf import AshikhminShirley, Lambert, harmonic
-from jaxprt.image import render
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, harmonic, lobe
+from jaxprt.image import rasterize, render
 from jaxprt.inverse import Picture
 from jaxprt.relight import harmonic as relight
+from jaxprt.relight import lobe as relight_lobe
 from jaxprt.scene import builtin, camera
+from jaxprt.transport import lobe as lobe_transport
 
 EDGE = 32
 BANDS = np.sqrt(np.arange(25)).astype(int)
@@ -141,6 +144,65 @@ def test_an_unused_number_is_unknown_and_the_others_are_found(mesh, matte, sky, 
     assert float(found.value["unused"]) == pytest.approx(0.2, abs=1e-4)
     assert np.isfinite(found.deviation["albedo"])
     assert np.isinf(found.deviation["unused"])
+
+
+def test_a_region_that_no_picture_shows_is_unknown_and_the_other_is_found(mesh, matte, sky, view, image):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    behind = (mesh.position @ (view.eye / jnp.linalg.norm(view.eye)) < -0.2)[:, None]
+    found = inverse.material(
+        lambda m, eye: jnp.where(behind, m["behind"], m["front"]) / 0.5 * matte(sky, eye),
+        {"front": jnp.full(3, 0.9), "behind": jnp.full(3, 0.3)},
+        pixels,
+        lower=0.0,
+        upper=1.0,
+    )
+    np.testing.assert_allclose(found.value["front"], 0.5, atol=1e-3)
+    np.testing.assert_allclose(found.value["behind"], 0.3, atol=1e-4)
+    assert np.isfinite(found.deviation["front"]).all()
+    assert np.isinf(found.deviation["behind"]).all()
+
+
+def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view):
+    """Its lobes are finer than the light's texels are wide, and the start's as wide as a window."""
+    light, seen = builtin.studio(size=16), lobe_transport.precompute(mesh, size=16, progress=False)
+    table = lobe.tabulate(
+        lambda m: CookTorrance(diffuse=0.0, specular=1.0, roughness=jnp.exp(m), f0=0.5),
+        lobes=2,
+        knot=[np.log([0.02, 0.06, 0.2, 0.6])],
+    )
+
+    def radiance(m, eye):
+        return m["weight"] * relight_lobe.radiance(seen, table.at(jnp.log(m["roughness"])), light, eye=eye)
+
+    true = {"weight": jnp.array(0.8), "roughness": jnp.array(0.03)}
+    image = render(mesh, radiance(true, view.eye), view)
+    pixels = inverse.observe(mesh, [Picture(image, view, mask=image.min(-1) >= 0)])
+    start = {"weight": jnp.array(0.3), "roughness": jnp.array(0.4)}
+    found = inverse.material(
+        radiance, start, pixels, lower={"weight": 0.0, "roughness": 0.02}, upper={"weight": 2.0, "roughness": 0.6}
+    )
+    assert found.residual[-1] < 1e-4
+    assert float(found.value["weight"]) == pytest.approx(0.8, rel=1e-3)
+    assert float(found.value["roughness"]) == pytest.approx(0.03, rel=1e-3)
+
+
+def test_triangles_too_coarse_for_their_bend_do_not_count(mesh, view, image):
+    whole = inverse.observe(mesh, [Picture(image, view)])
+    nearest = int(jnp.argmax(mesh.position @ view.eye))
+    rotation = np.array([[1, 0, 0], [0, np.cos(0.5), -np.sin(0.5)], [0, np.sin(0.5), np.cos(0.5)]], np.float32)
+    tilted = mesh.normal.at[nearest].set(rotation @ mesh.normal[nearest])
+    less = inverse.observe(eqx.tree_at(lambda each: each.normal, mesh, tilted), [Picture(image, view)])
+    assert np.any(np.asarray(whole.vertex) == nearest)
+    assert not np.any(np.asarray(less.vertex) == nearest)
+    touched = np.any(np.asarray(whole.vertex) == nearest, 1).sum()
+    assert len(less.value) == len(whole.value) - touched
+
+
+def test_half_of_the_pixels_of_a_coarse_mesh_count(view):
+    coarse = builtin.sphere(rings=6, sectors=8)
+    picture = Picture(np.ones((EDGE, EDGE, 3), np.float32), view)
+    seen = np.asarray(rasterize(coarse, view).triangle) >= 0
+    assert 0.4 * seen.sum() < len(inverse.observe(coarse, [picture]).value) <= seen.sum()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])

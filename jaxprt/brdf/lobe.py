@@ -195,7 +195,8 @@ def tabulate(
         lobes: Number of lobes; or
         error: the error of the table, see `LobeBrdf`, that the lobes must reach.
         resolution: Nodes of the view angle. Anisotropic BRDFs have maps of half that on either edge.
-        knot: For a BRDF that varies, the increasing values of each of its one or two parameters.
+        knot: For a BRDF that varies, the increasing values of each of its one or two parameters. Of those that widths
+            are powers of, as roughness and exponents are, take the logarithm: it is what widths are interpolated by.
 
     Returns:
         The table.

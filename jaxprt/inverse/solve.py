@@ -20,6 +20,7 @@ _SHARE = 1e-3  # of a number's square outside what is known, that makes it unkno
 _CLEAR = 3.0  # times less than all that is told must an error like what is left make of a direction
 _SETTLED = 1e-6  # relative decrease of the squared residual
 _MINOR = 1e-3  # that a refused step promised
+_EXACT = 1e-6  # residual that is rounding
 _PATIENT = 3  # steps without more than that
 _REFUSED = 8  # steps that would only have made it worse; each next is 2, 4, 8, ... times shorter
 _LEAST = 1e-3  # of the largest squared derivative: others count as that
@@ -52,7 +53,7 @@ class Fit(NamedTuple):
 
 
 def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m"], Float[Array, "n m"]]]:
-    """A function with its derivatives by each number, one after another, so that memory is that of one."""
+    """A function with its derivatives, linearized once and by one number after another, so that no batch is held."""
 
     def both(x):
         value, along = jax.linearize(function, x)
@@ -124,7 +125,7 @@ def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Calla
         history.append(float(jnp.linalg.norm(state.residual)))
         brought, least = (promised, _MINOR) if refused else (history[-2] ** 2 - history[-1] ** 2, _SETTLED)
         still = still + 1 if brought <= least * history[-2] ** 2 else still if refused else 0
-        if still == _PATIENT or refused == _REFUSED:
+        if still == _PATIENT or refused == _REFUSED or history[-1] < _EXACT:
             break
     rows = np.asarray(state.jac, np.float64).T
     axis, value = _told(rows)
