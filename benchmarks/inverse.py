@@ -53,6 +53,7 @@ NOISE = 0.02
 FINE = 6  # degree of the base's harmonics
 PATCH = 0.5  # albedo of the ground
 ASKED = 0.03
+TOLD = 0.025  # relative L2 to which combinations of harmonics count as told
 PEER_SAMPLES, PEER_RATE = 16, 0.05  # of prb
 LIGHT_STEPS, MATERIAL_STEPS = 600, 150
 
@@ -97,7 +98,7 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
         image = drawn(mesh, [Lambert(ALBEDO)], light, view, exact, seed=0)
         pixels = inverse.observe(mesh, [inverse.Picture(image, view)])
         start = time.perf_counter()
-        found = inverse.light(radiance, jnp.zeros_like(true), pixels)
+        found = inverse.light(radiance, jnp.zeros_like(true), pixels, error=TOLD)
         seconds = time.perf_counter() - start
         finite = np.isfinite(found.deviation)
         line = {

@@ -101,6 +101,30 @@ def test_much_noise_leaves_less_that_is_told_and_that_is_right(mesh, matte, sky,
     assert wrong < 0.02
 
 
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("error", [0.03, 0.1])
+def test_what_is_told_is_as_right_as_asked(mesh, matte, sky, view, image, noise, error):
+    pixels = inverse.observe(mesh, [Picture(noisy(image, noise), view)])
+    found = inverse.light(matte, jnp.zeros_like(sky), pixels, error=error)
+    assert found.rank >= 3
+    wrong = np.linalg.norm(found.told @ np.ravel(found.value - sky)) / np.linalg.norm(found.told @ np.ravel(sky))
+    assert wrong < 2 * error
+
+
+def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, matte, sky, view):
+    """What is left of the pictures is no noise but harmonics of higher degrees, in patterns wider than any block."""
+    light = builtin.daylight(size=16)
+    tables = [harmonic.tabulate(Lambert(0.5), degree=degree, resolution=8) for degree in (2, 4)]
+    low, high = (lambda x, eye, table=table: relight.unshadowed_radiance(mesh, table, x, eye=eye) for table in tables)
+    image = render(mesh, high(relight.project(light, degree=4), view.eye), view)
+    found = inverse.light(low, jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
+    true = relight.project(light, degree=2)
+    wrong = np.linalg.norm(found.told @ np.ravel(found.value - true)) / np.linalg.norm(found.told @ np.ravel(true))
+    assert found.residual[-1] > 1e-3
+    assert found.rank >= 3
+    assert wrong < 0.3
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_wrong_exposure_scales_the_light_and_nothing_else(mesh, matte, view, image, factor):
     right, wrong = (fit(mesh, matte, Picture(image, view, exposure=each)) for each in (1.0, factor))
@@ -205,6 +229,33 @@ def test_half_of_the_pixels_of_a_coarse_mesh_count(view):
     assert 0.4 * seen.sum() < len(inverse.observe(coarse, [picture]).value) <= seen.sum()
 
 
+@pytest.mark.parametrize(
+    ("radiance", "message"),
+    [
+        (lambda x, eye: jnp.exp(x), "must be linear in the light"),
+        (lambda x, eye: x * jnp.nan, "must be finite"),
+        (lambda x, eye: x[:-5], r"radiance must be \[482, 3\], vertices and colors of the pictures, got \[477, 3\]"),
+        (lambda x, eye: x[:, :1], r"got \[482, 1\]"),
+        (lambda x, eye: x[:, 0], r"got \[482\]"),
+        (lambda x, eye: None, "got NoneType"),
+    ],
+)
+def test_radiance_that_cannot_be_fitted_is_refused(mesh, view, image, radiance, message):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    with pytest.raises(ValueError, match=message):
+        inverse.light(lambda x, eye: radiance(x * jnp.ones((len(mesh.position), 3)), eye), jnp.ones(3), pixels)
+
+
+def test_material_that_is_nowhere_finite_beyond_a_place_is_approached(mesh, view):
+    pixels = inverse.observe(mesh, [Picture(np.full((EDGE, EDGE, 3), 0.6, np.float32), view)])
+    white = jnp.ones((len(mesh.position), 3))
+    for broken, expected in ((0.7, 0.6), (0.45, 0.45)):
+        found = inverse.material(lambda x, eye, at=broken: jnp.where(x > at, jnp.nan, x**3 / 0.36) * white, 0.3, pixels)
+        assert np.isfinite(found.residual).all()
+        assert float(found.value) == pytest.approx(expected, rel=0.05)
+        assert float(found.value) <= broken
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
 def test_broken_pixels_are_refused_where_they_count(mesh, view, image, value):
     broken = image.copy()
@@ -229,6 +280,16 @@ def test_broken_pixels_are_refused_where_they_count(mesh, view, image, value):
         (lambda i, v: [Picture(i, v, exposure=0.0)], ValueError, "exposure of picture 0 must be positive, got 0"),
         (lambda i, v: [Picture(i, v), Picture(i[..., :1], v)], ValueError, r"as many colors, got \[1, 3\]"),
         (lambda i, v: [Picture(0 * i, v)], ValueError, "must not be black"),
+        (lambda i, v: Picture(i, v), TypeError, "a sequence of them, got one Picture"),
+        (lambda i, v: [Picture(i[..., 0], v)], ValueError, r"linear radiance \[h, w, 1 or 3\] .* float32\[32, 32\]"),
+        (lambda i, v: [Picture((255 * i).astype(np.uint8), v)], ValueError, r"got uint8\[32, 32, 3\]"),
+        (lambda i, v: [Picture(np.ones((EDGE, EDGE, 4), np.float32), v)], ValueError, "alpha belongs to the mask"),
+        (
+            lambda i, v: [Picture(i, v, mask=np.ones((EDGE, EDGE, 1)))],
+            ValueError,
+            r"mask of picture 0 must be \[h, w\]",
+        ),
+        (lambda i, v: [Picture(i, v, exposure=np.ones(3))], TypeError, "exposure must be one number, got an array"),
     ],
 )
 def test_pictures_that_cannot_be_used_are_refused(mesh, view, image, pictures, error, message):
@@ -240,7 +301,7 @@ def test_pictures_that_cannot_be_used_are_refused(mesh, view, image, pictures, e
     ("start", "options", "error", "message"),
     [
         ({"a": 0.5}, {"lower": 0.6}, ValueError, "number 0 is 0.5, the bounds are 0.6 and inf"),
-        ({"a": 0.5}, {"lower": 0.5, "upper": 0.5}, ValueError, "between its bounds"),
+        ({"a": 0.5}, {"lower": 0.5, "upper": 0.5}, ValueError, "lower bounds must be less"),
         ({"a": 0.5}, {"lower": {"b": 0.1}}, ValueError, "one number, or made like the start"),
         ({"a": 0.5, "b": "red"}, {}, TypeError, "arrays and numbers, in a pytree, got a str"),
         ({"a": np.nan}, {}, ValueError, "finite numbers"),

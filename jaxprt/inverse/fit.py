@@ -19,6 +19,7 @@ def light(
     lower: float | None = None,
     upper: float | None = None,
     prior: Callable[[PyTree], Float[Array, ""]] | None = None,
+    error: float = 0.05,
     steps: int = 200,
 ) -> Fit:
     """The light under which an object looks as in pictures, painted ones perhaps.
@@ -34,15 +35,20 @@ def light(
         lower: Bound of all numbers, as 0.
         upper: Likewise.
         prior: Added to half the squared residual; as `smoothness` of the texels or their sum, times a weight.
+        error: Of what is solved for at once, the relative L2 to which combinations count as told, as far as parts of
+            the pictures disagree about them: the less error, the fewer.
         steps: At most so many.
 
     Raises:
         TypeError: The start has what are no numbers.
-        ValueError: Bounds that exclude the start, or each other, or steps below 1.
+        ValueError: Bounds that exclude the start, or each other; steps below 1; radiance of another shape than the mesh
+            and the pictures have, that is not finite, or, where it is solved for at once, not linear.
 
     Reference: Nocedal and Wright 2006, chapters 10 and 16.
     """
     first, unravel = numbers.raveled(start, steps)
+    if not 0 < error < np.inf:
+        raise ValueError(f"the error must be positive, got {error}")
     low, high = (
         np.full(first.shape, none if each is None else each) for each, none in ((lower, -np.inf), (upper, np.inf))
     )
@@ -52,7 +58,7 @@ def light(
         return pictures.residual(radiance, unravel(x), pixels)
 
     if len(first) <= solve.DENSE and prior is None and lower is None and upper is None:
-        return solve.at_once(function, first, unravel)
+        return solve.at_once(function, first, unravel, error)
     return solve.descend(function, first, unravel, (low, high), prior, steps)
 
 
@@ -68,7 +74,8 @@ def material(
     """The material that looks as in pictures under a known light: parameters of a model, coordinates, weights.
 
     Levenberg and Marquardt's steps, of numbers that are free: those between bounds are sines, those beyond one bound
-    hyperbolas; numbers whose bounds are positive and more than 100 times apart go by their logarithm.
+    hyperbolas; numbers whose bounds are positive and more than 100 times apart go by their logarithm. A start at a
+    bound is moved inside, by a hundredth of the range.
 
     Args:
         radiance: Of the material and an eye, of every vertex; differentiable in the material.
@@ -80,8 +87,8 @@ def material(
 
     Raises:
         TypeError: The start has what are no numbers.
-        ValueError: Bounds of another structure, that exclude the start, or each other; more than 512 numbers; or steps
-            below 1.
+        ValueError: Bounds of another structure, that exclude the start, or each other; more than 512 numbers; steps
+            below 1; or radiance of another shape than the mesh and the pictures have, or that is not finite.
 
     Reference: Madsen, Nielsen, Tingleff 2004, "Methods for non-linear least squares problems".
     """
@@ -153,4 +160,4 @@ def jointly(
         held = jnp.linalg.norm(u[: len(lit)]) - 1
         return jnp.append(left, held) if scale else left
 
-    return solve.marquardt(function, jnp.concatenate([lit / found, free]), whole, unravel, steps)
+    return solve.marquardt(function, jnp.concatenate([lit / found, free]), whole, unravel, steps, held=int(scale))

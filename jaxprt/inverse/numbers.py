@@ -43,7 +43,11 @@ def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
 def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
     """Refuses starts outside their bounds, as these are in the start's precision."""
     x = np.asarray(first)
-    wrong = np.flatnonzero(~((low.astype(x.dtype) <= x) & (x <= high.astype(x.dtype)) & (low < high)))
+    crossed = np.flatnonzero(~(low < high))
+    if crossed.size:
+        n = crossed[0]
+        raise ValueError(f"lower bounds must be less than upper ones, number {n} has {low[n]:.6g} and {high[n]:.6g}")
+    wrong = np.flatnonzero(~((low.astype(x.dtype) <= x) & (x <= high.astype(x.dtype))))
     if wrong.size:
         n = wrong[0]
         raise ValueError(

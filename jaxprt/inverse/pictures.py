@@ -20,6 +20,12 @@ def _mask(value) -> Array | None:
     return None if value is None else jnp.asarray(value, bool)
 
 
+def _exposure(value) -> float:
+    if np.ndim(value):
+        raise TypeError(f"the exposure must be one number, got an array of shape {np.shape(value)}")
+    return float(value)
+
+
 class Picture(eqx.Module):
     """A picture of the object. NumPy arrays become arrays.
 
@@ -34,7 +40,7 @@ class Picture(eqx.Module):
     image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
     camera: Camera
     mask: Bool[Array, "_ _"] | None = eqx.field(converter=_mask, default=None)
-    exposure: float = eqx.field(converter=float, default=1.0)
+    exposure: float = eqx.field(converter=_exposure, default=1.0)
     saturation: float | None = None
 
 
@@ -46,12 +52,14 @@ class Pixels(eqx.Module):
         vertex: Three vertices of each pixel, those of picture n from n times the number of vertices on.
         weight: Their barycentric weights, times the exposure.
         value: What the pixel has.
+        vertices: How many the mesh has.
     """
 
     eye: Float[Array, "n 3"]
     vertex: Int[Array, "p 3"]
     weight: Float[Array, "p 3"]
     value: Float[Array, "p c"]
+    vertices: int = eqx.field(static=True)
 
 
 def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
@@ -62,10 +70,14 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
 
     Raises:
         TypeError: What is no `Picture`.
-        ValueError: No pictures; an image or mask of another size than the camera's; images that differ in colors;
+        ValueError: No pictures; an image that is not of floating point, gray or in three colors; an image or mask of
+            another size than the camera's; images that differ in colors;
             pixels that count and are negative or not finite; exposures that are not positive; pictures that are black;
             or no pixel that counts.
     """
+    if isinstance(pictures, Picture):
+        raise TypeError("pictures must be a sequence of them, got one Picture")
+    pictures = list(pictures)
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
     parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]
@@ -78,7 +90,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     if not np.any(value):
         raise ValueError("pictures must not be black wherever they count")
     eye = jnp.stack([each.camera.eye for each in pictures])
-    return Pixels(eye, jnp.asarray(vertex), jnp.asarray(weight), jnp.asarray(value))
+    return Pixels(eye, jnp.asarray(vertex), jnp.asarray(weight), jnp.asarray(value), len(mesh.position))
 
 
 def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -87,6 +99,14 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
         raise TypeError(f"picture {number} must be a Picture, got {type(picture).__name__}")
     image, camera = np.asarray(picture.image), picture.camera
     size = (camera.height, camera.width)
+    if image.ndim != 3 or image.shape[2] not in (1, 3) or not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(
+            f"the image of picture {number} must be linear radiance [h, w, 1 or 3] of floating point, got "
+            f"{image.dtype}{list(image.shape)}: alpha belongs to the mask, and `jaxprt.image.decode_srgb` decodes "
+            "values / 255"
+        )
+    if picture.mask is not None and picture.mask.ndim != 2:
+        raise ValueError(f"the mask of picture {number} must be [h, w], got {list(picture.mask.shape)}")
     for name, array in {"image": image, "mask": picture.mask}.items():
         if array is not None and array.shape[:2] != size:
             raise ValueError(
@@ -136,6 +156,10 @@ def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Ar
         pixels: What was observed.
     """
     color = jax.vmap(lambda eye: radiance(parameters, eye))(pixels.eye)
+    required = (len(pixels.eye), pixels.vertices, pixels.value.shape[1])
+    if getattr(color, "shape", None) != required:
+        got = list(color.shape[1:]) if hasattr(color, "shape") else type(color).__name__
+        raise ValueError(f"the radiance must be {list(required[1:])}, vertices and colors of the pictures, got {got}")
     color = color.reshape(-1, color.shape[-1])
     made = sum(pixels.weight[:, i, None] * color[pixels.vertex[:, i]] for i in range(3))
     return ((made - pixels.value) / jnp.linalg.norm(pixels.value)).ravel()

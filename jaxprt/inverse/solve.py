@@ -17,7 +17,9 @@ with warnings.catch_warnings():
 DENSE = 512  # numbers whose derivatives are held, all of them
 _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told from rounding
 _SHARE = 1e-3  # of a number's square outside what is known, that makes it unknown
-_CLEAR = 3.0  # times less than all that is told must an error like what is left make of a direction
+_BLOCKS = 32  # of pixels
+_TINY = 1e-30
+_LINEAR = 1e-3  # of the start's residual, that a linear function may be off
 _SETTLED = 1e-6  # relative decrease of the squared residual
 _MINOR = 1e-3  # that a refused step promised
 _EXACT = 1e-6  # residual that is rounding
@@ -35,8 +37,9 @@ class Fit(NamedTuple):
     Attributes:
         value: The light or material, as the start is made; where pictures do not tell, the start's.
         residual: Difference from the pictures relative to them, in L2: at the start and after each step.
-        deviation: Standard deviation of each number, were what is left of the residual independent noise; infinite for
-            what the pictures do not tell. Of many numbers (over 512) a lower bound, since others may make up for each.
+        deviation: Standard deviation of each number, as far as parts of the pictures disagree about it; infinite for
+            what the pictures do not tell. What all parts have in common, as a material that no number can be, is not in
+            it. Of many numbers (over 512) a lower bound, since others may make up for each.
         told: Orthonormal combinations of the numbers that the pictures tell, in a row as `ravel_pytree` has them; of a
             material those of its free numbers. None of many numbers.
     """
@@ -70,36 +73,72 @@ def _told(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return axis[:, known], value[known]
 
 
-def _deviation(axis: np.ndarray, value: np.ndarray, left: float, pixels: int) -> np.ndarray:
+def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """By how much what is left may have moved each direction, as blocks of neighboring pixels disagree about it.
+
+    What is left of noisy pictures is independent from pixel to pixel and averages out; what is left of a scene that
+    differs is not, and does so from block to block at best.
+
+    Reference: Liang and Zeger 1986, the variance that is robust against what clusters have in common.
+    """
+    part = (axis.T @ rows) * left
+    count = min(_BLOCKS, part.shape[1])
+    edge = np.linspace(0, part.shape[1], count + 1).astype(int)[:-1]
+    blocks = np.add.reduceat(part, edge, axis=1) / value[:, None] ** 2
+    least = np.linalg.norm(left) / np.sqrt(max(1, part.shape[1] - len(value))) / value  # of independent noise
+    size = np.linalg.norm(blocks, axis=1) * np.sqrt(count / max(1, count - 1))
+    return blocks * (np.maximum(size, least) / np.maximum(np.linalg.norm(blocks, axis=1), _TINY))[:, None]
+
+
+def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Of each number; infinite outside the directions."""
-    noise = left**2 / max(1, pixels - len(value))
-    deviation = np.sqrt(noise * np.sum((axis / value) ** 2, 1))
+    deviation = np.linalg.norm(axis @ scores, axis=1)
     return np.where(1 - np.sum(axis**2, 1) > _SHARE, np.inf, deviation)
 
 
-def at_once(function: Callable, first: Array, unravel: Callable) -> Fit:
+def _finite(*arrays: Array) -> None:
+    if not all(np.isfinite(each).all() for each in arrays):
+        raise ValueError("the radiance at the start, and its derivatives, must be finite, got NaN or infinities")
+
+
+def at_once(function: Callable, first: Array, unravel: Callable, error: float) -> Fit:
     """A linear problem, by singular values; what is not told stays as it is.
 
-    Nor is a direction told in which an error like what is left, all of it in one pattern, would make a third of all
-    that is told: what is left of real pictures is no noise that averages out. Truncation as in Hansen 1998,
-    "Rank-deficient and discrete ill-posed problems".
+    Nor are directions told whose deviations would together be more than the error allows of all that is told.
+    Truncation as in Hansen 1998, "Rank-deficient and discrete ill-posed problems".
     """
-    r, slope = _with_slopes(function)(first)
+    evaluate = _with_slopes(function)
+    r, slope = evaluate(first)
+    _finite(r, slope)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
     axis, value = _told(rows)
     part = -(axis.T @ (rows @ before)) / value**2
-    least = np.linalg.norm(before + axis @ part @ rows)
-    while len(value) and not (keep := value * np.linalg.norm(part) > _CLEAR * least).all():
+    while len(value):
+        scores = _scores(axis, value, rows, before + axis @ part @ rows)
+        wrong = np.linalg.norm(scores, axis=1)
+        best = np.argsort(wrong)
+        good = np.cumsum(wrong[best] ** 2) <= error**2 * np.cumsum(part[best] ** 2)
+        keep = np.isin(np.arange(len(value)), best[: np.max(np.flatnonzero(good), initial=-1) + 1])
+        if keep.all():
+            break
         axis, value, part = axis[:, keep], value[keep], part[keep]
-    move = axis @ part
-    left = float(np.linalg.norm(before + move @ rows))
-    deviation = jnp.asarray(_deviation(axis, value, left, len(before)), first.dtype)
-    found = unravel(first + jnp.asarray(move, first.dtype))
-    return Fit(found, np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
+    else:
+        scores = np.zeros((0, 1))
+    found = first + jnp.asarray(axis @ part, first.dtype)
+    left, expected = float(jnp.linalg.norm(evaluate(found)[0])), np.linalg.norm(before + axis @ part @ rows)
+    if not abs(left - expected) < _LINEAR * np.linalg.norm(before):
+        raise ValueError(
+            f"the radiance must be linear in the light: the residual should be {expected:.3g}, and is {left:.3g}; "
+            "other functions can be fitted by material"
+        )
+    deviation = jnp.asarray(_deviation(axis, scores), first.dtype)
+    return Fit(unravel(found), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
-def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int) -> Fit:
-    """By steps of Levenberg and Marquardt in free numbers, which others follow from."""
+def marquardt(
+    function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int, *, held: int = 0
+) -> Fit:
+    """By steps of Levenberg and Marquardt in free numbers, which others follow from; the last residuals are held."""
     # Not compiled as a whole, jaxopt asks for the same place two or three times: what was made last is kept.
     both = lru_cache(maxsize=1)(lambda place: evaluate(jnp.asarray(np.frombuffer(place, free.dtype))))
     evaluate = _with_slopes(function)
@@ -114,11 +153,16 @@ def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Calla
     # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
     solver._jac_fun = lambda u: both(np.asarray(u).tobytes())[1].T
     state = solver.init_state(free)
+    _finite(state.residual, state.jac)
     history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
     for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
         moved, tried = solver.update(free, state)
-        if not (np.isfinite(moved).all() and np.isfinite(tried.residual).all()):
-            break
+        if not all(np.isfinite(each).all() for each in (moved, tried.residual, tried.jac)):
+            grow = state.increase_factor
+            tried = state._replace(
+                damping_factor=state.damping_factor * grow, increase_factor=2 * grow, delta=tried.delta
+            )
+            moved = free
         refused = refused + 1 if np.array_equal(moved, free) else 0  # Too long a step: the next is shorter.
         promised = jnp.abs(tried.delta @ (state.damping_factor * tried.delta - state.gradient))
         free, state = moved, tried
@@ -127,13 +171,14 @@ def marquardt(function: Callable, free: Array, bounded: Callable, unravel: Calla
         still = still + 1 if brought <= least * history[-2] ** 2 else still if refused else 0
         if still == _PATIENT or refused == _REFUSED or history[-1] < _EXACT:
             break
-    rows = np.asarray(state.jac, np.float64).T
+    rows, left = np.asarray(state.jac, np.float64).T, np.asarray(state.residual, np.float64)
     axis, value = _told(rows)
-    deviation = _deviation(axis, value, history[-1], rows.shape[1])
+    deviation = _deviation(axis, _scores(axis, value, rows, left))
+    told = axis if not held else _told(rows[:, :-held])[0]
     rate = np.abs(np.asarray(jax.jvp(bounded, (free,), (jnp.ones_like(free),))[1]))
-    told = np.isfinite(deviation)
-    deviation = jnp.asarray(np.where(told, np.where(told, deviation, 0) * rate, np.inf), free.dtype)
-    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), axis.T)
+    known = np.isfinite(deviation)
+    deviation = jnp.asarray(np.where(known, np.where(known, deviation, 0) * rate, np.inf), free.dtype)
+    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), told.T)
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
@@ -168,6 +213,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
     else:
         solver = jaxopt.LBFGS(value, maxiter=steps, implicit_diff=False)
         state, update = solver.init_state(y), jax.jit(solver.update)
+    _finite(*jax.value_and_grad(value)(y))
     far = jax.jit(lambda y: (jnp.linalg.norm(function(size * y)), value(y)))
     history, last, still = [float(far(y)[0])], float(far(y)[1]), 0
     for _ in range(steps):
