@@ -65,8 +65,8 @@ class Pixels(eqx.Module):
 def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     """Finds what pictures show of a mesh: pixels that see it, not at its silhouette, inside masks, and not saturated.
 
-    Nor do triangles count whose corners' normals differ by more than 14 degrees, or half of the pixels if these are
-    more: there vertices are too far apart for what lies between them.
+    Nor do triangles count whose corners' normals differ by more than 14 degrees: there vertices are too far apart for
+    what lies between them. Of a picture that has more of such pixels than others the less bent half counts.
 
     Raises:
         TypeError: What is no `Picture`.
