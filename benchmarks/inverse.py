@@ -3,8 +3,8 @@
     python -m benchmarks.inverse [--quick] [--store FOLDER] [--output FILE]
 
 The bunny (36,000 vertices), pictures of 256 x 256 pixels by Mitsuba 3's path tracer, direct light. `error` is relative
-L2 of what was found, `residual` that of the pictures; `deviation` is the largest of the numbers' deviations relative to
-their norm, as the fit itself says. Precomputation is `precompute_seconds`, and `table_seconds` of the lobes, and not in
+L2 of what was found, `residual` that of the pictures, `rank` how many combinations of numbers they tell, `known` how
+many numbers by themselves. Precomputation is `precompute_seconds`, and `table_seconds` of the lobes, and not in
 `seconds`, which compile.
 
 Lines `light`: 25 spherical harmonics of the light in three colors from one picture, of what the pictures determine:
@@ -23,7 +23,7 @@ With --quick, or where LLVM 17 is missing, which Mitsuba needs, pictures are of 
 import pathlib
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -78,9 +78,10 @@ def measure(quick: bool, store: pathlib.Path | None):
     start = time.perf_counter()
     lobes = tabulated(quick)
     seconds = time.perf_counter() - start
-    for line in materials(mesh, sky, views, lobes, exact, store, quick):
+    case = Case(mesh, sky, views, lobes, exact, store, quick)
+    for line in materials(case):
         yield {**line, "table_seconds": seconds}
-    yield together(mesh, sky, views, lobes, exact, store, quick)
+    yield together(case)
 
 
 def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathlib.Path | None):
@@ -108,8 +109,7 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
                 "residual": float(found.residual[-1]),
                 "rank": found.rank,
             },
-            **{"deviation": float(np.max(found.deviation[finite], initial=0)) / norm(true), "bytes": vectors.nbytes},
-            "precompute_seconds": ready,
+            **{"known": int(finite.sum()), "bytes": vectors.nbytes, "precompute_seconds": ready},
         }
         if exact:
             path, seconds = prb.fit_light(
@@ -125,6 +125,18 @@ def band_limited(sky: Environment) -> Environment:
     size = sky.radiance.shape[1]
     value = harmonics.evaluate(cubemap.direction(size=size), degree=DEGREE) @ coefficient
     return Environment(value - jnp.minimum(jnp.min(value), 0) * 1.01)
+
+
+class Case(NamedTuple):
+    """What pictures are drawn of, and what explains them."""
+
+    mesh: Mesh
+    sky: Environment
+    views: list[Camera]
+    lobes: LobeBrdf
+    exact: bool
+    store: pathlib.Path | None
+    quick: bool
 
 
 class Shares(eqx.Module):
@@ -179,16 +191,9 @@ class Coated:
         return glossy + material["diffuse"] * (1 - s) * under
 
 
-def materials(
-    mesh: Mesh,
-    sky: Environment,
-    views: list[Camera],
-    lobes: LobeBrdf,
-    exact: bool,
-    store: pathlib.Path | None,
-    quick: bool,
-):
+def materials(case: Case):
     """From three pictures under known light."""
+    mesh, sky, views, lobes, exact, store, quick = case
     coated = Coated(mesh, lobes, sky.radiance.shape[1], FINE, store)
     texel, excess, rest = relight.direct.split(sky, count=TEXELS)
     blurred, coefficient = relight.lobe.prefilter(rest), relight.harmonic.project(rest, degree=FINE)
@@ -222,16 +227,9 @@ def materials(
         yield line
 
 
-def together(
-    mesh: Mesh,
-    sky: Environment,
-    views: list[Camera],
-    lobes: LobeBrdf,
-    exact: bool,
-    store: pathlib.Path | None,
-    quick: bool,
-):
+def together(case: Case):
     """Light and material from three pictures, beside a ground of known color."""
+    mesh, sky, views, lobes, exact, store, quick = case
     ground = scene.mesh.ground_plane(mesh, vertices=500 if quick else 4000, extent=1.5)
     whole = scene.mesh.join([mesh, ground])
     light, size = band_limited(sky), sky.radiance.shape[1]

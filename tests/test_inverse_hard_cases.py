@@ -11,7 +11,7 @@ from jaxprt.image import rasterize, render
 from jaxprt.inverse import Picture
 from jaxprt.relight import harmonic as relight
 from jaxprt.relight import lobe as relight_lobe
-from jaxprt.scene import builtin, camera
+from jaxprt.scene import Environment, builtin, camera
 from jaxprt.transport import lobe as lobe_transport
 
 EDGE = 32
@@ -122,7 +122,23 @@ def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, matte, sky, v
     wrong = np.linalg.norm(found.told @ np.ravel(found.value - true)) / np.linalg.norm(found.told @ np.ravel(true))
     assert found.residual[-1] > 1e-3
     assert found.rank >= 3
-    assert wrong < 0.3
+    assert wrong < 0.25  # More than asked for: no block is free of such a pattern.
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_of_a_sun_some_is_told_although_most_of_it_is_too_fine(mesh, view, degree):
+    """Of what is left out nothing may make the rest doubtful, until nothing remains."""
+    light = np.zeros((6, 16, 16, 3), np.float32)
+    light[2, 8:11, 3:6] = 50
+    tables = [harmonic.tabulate(Lambert(0.5), degree=each, resolution=8) for each in (degree, 6)]
+    low, high = (lambda x, eye, table=table: relight.unshadowed_radiance(mesh, table, x, eye=eye) for table in tables)
+    image = render(mesh, high(relight.project(Environment(jnp.asarray(light)), degree=6), view.eye), view)
+    pixels = inverse.observe(mesh, [Picture(np.maximum(image, 0), view)])
+    found = inverse.light(low, jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
+    true = relight.project(Environment(jnp.asarray(light)), degree=degree)
+    wrong = np.linalg.norm(found.told @ np.ravel(found.value - true)) / np.linalg.norm(found.told @ np.ravel(true))
+    assert found.rank >= 9
+    assert wrong < 0.1
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
@@ -244,6 +260,22 @@ def test_radiance_that_cannot_be_fitted_is_refused(mesh, view, image, radiance, 
     pixels = inverse.observe(mesh, [Picture(image, view)])
     with pytest.raises(ValueError, match=message):
         inverse.light(lambda x, eye: radiance(x * jnp.ones((len(mesh.position), 3)), eye), jnp.ones(3), pixels)
+
+
+@pytest.mark.parametrize(
+    ("radiance", "bound", "prior"),
+    [
+        (lambda x, eye: x * jnp.nan, {"lower": 0.0}, None),
+        (lambda x, eye: jnp.sqrt(x), {"lower": 0.0}, None),  # of zero: the slope is infinite
+        (lambda x, eye: x, {}, lambda x: jnp.sum(jnp.sqrt(x))),
+        (lambda x, eye: x, {}, lambda x: jnp.sum(x) * jnp.nan),
+    ],
+)
+def test_light_by_descent_from_where_nothing_is_finite_is_refused(mesh, view, image, radiance, bound, prior):
+    pixels = inverse.observe(mesh, [Picture(image, view)])
+    white = jnp.ones((len(mesh.position), 3))
+    with pytest.raises(ValueError, match="must be finite, got NaN"):
+        inverse.light(lambda x, eye: radiance(x, eye) * white, jnp.zeros(3), pixels, prior=prior, **bound)
 
 
 def test_material_that_is_nowhere_finite_beyond_a_place_is_approached(mesh, view):

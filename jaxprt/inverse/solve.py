@@ -19,6 +19,7 @@ _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told fro
 _SHARE = 1e-3  # of a number's square outside what is known, that makes it unknown
 _BLOCKS = 32  # of pixels
 _TINY = 1e-30
+_ROUNDED = 1e-9  # of squared singular values
 _LINEAR = 1e-3  # of the start's residual, that a linear function may be off
 _SETTLED = 1e-6  # relative decrease of the squared residual
 _MINOR = 1e-3  # that a refused step promised
@@ -79,15 +80,22 @@ def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndar
     What is left of noisy pictures is independent from pixel to pixel and averages out; what is left of a scene that
     differs is not, and does so from block to block at best.
 
-    Reference: Liang and Zeger 1986, the variance that is robust against what clusters have in common.
+    Each block moves the directions by (S^2 - J_b^T J_b)^-1 J_b^T r_b when it is left out, with singular values S.
+
+    Reference: Efron 1982, the jackknife; Bell and McCaffrey 2002 for clusters that the fit has partly followed.
     """
-    part = (axis.T @ rows) * left
-    count = min(_BLOCKS, part.shape[1])
-    edge = np.linspace(0, part.shape[1], count + 1).astype(int)[:-1]
-    blocks = np.add.reduceat(part, edge, axis=1) / value[:, None] ** 2
-    least = np.linalg.norm(left) / np.sqrt(max(1, part.shape[1] - len(value))) / value  # of independent noise
-    size = np.linalg.norm(blocks, axis=1) * np.sqrt(count / max(1, count - 1))
-    return blocks * (np.maximum(size, least) / np.maximum(np.linalg.norm(blocks, axis=1), _TINY))[:, None]
+    along, count = axis.T @ rows, min(_BLOCKS, len(left))
+    whole, blocks = np.diag(value**2), []
+    for part in np.array_split(np.arange(len(left)), count):
+        own = along[:, part]
+        without = whole * (1 + _ROUNDED) - own @ own.T  # Never singular, also where one block tells all.
+        blocks.append(np.linalg.solve(without, own @ left[part]))
+    moved = np.stack(blocks, 1) * np.sqrt((count - 1) / count)
+    least = np.linalg.norm(left) / np.sqrt(max(1, len(left) - len(value))) / value  # of independent noise
+    size = np.linalg.norm(moved, axis=1)
+    # So many blocks tell a deviation to one part in sqrt(2 blocks): three of these are no sign of clusters.
+    size, known = np.where(size > least * (1 + 3 / np.sqrt(2 * count)), size, least), size
+    return moved * (size / np.maximum(known, _TINY))[:, None]
 
 
 def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
@@ -98,7 +106,9 @@ def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
 
 def _finite(*arrays: Array) -> None:
     if not all(np.isfinite(each).all() for each in arrays):
-        raise ValueError("the radiance at the start, and its derivatives, must be finite, got NaN or infinities")
+        raise ValueError(
+            "the radiance at the start (or prior), and its derivatives, must be finite, got NaN or infinities"
+        )
 
 
 def at_once(function: Callable, first: Array, unravel: Callable, error: float) -> Fit:
@@ -113,17 +123,15 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
     axis, value = _told(rows)
     part = -(axis.T @ (rows @ before)) / value**2
-    while len(value):
-        scores = _scores(axis, value, rows, before + axis @ part @ rows)
-        wrong = np.linalg.norm(scores, axis=1)
+    # What is told of a direction does not depend on the others. The first pass leaves out those that only follow what
+    # the numbers cannot explain, the second judges by what then remains; more would judge by light left out.
+    for _ in range(2):
+        wrong = np.linalg.norm(_scores(axis, value, rows, before + axis @ part @ rows), axis=1)
         best = np.argsort(wrong)
         good = np.cumsum(wrong[best] ** 2) <= error**2 * np.cumsum(part[best] ** 2)
-        keep = np.isin(np.arange(len(value)), best[: np.max(np.flatnonzero(good), initial=-1) + 1])
-        if keep.all():
-            break
+        keep = best[: np.max(np.flatnonzero(good), initial=-1) + 1]
         axis, value, part = axis[:, keep], value[keep], part[keep]
-    else:
-        scores = np.zeros((0, 1))
+    scores = _scores(axis, value, rows, before + axis @ part @ rows)
     found = first + jnp.asarray(axis @ part, first.dtype)
     left, expected = float(jnp.linalg.norm(evaluate(found)[0])), np.linalg.norm(before + axis @ part @ rows)
     if not abs(left - expected) < _LINEAR * np.linalg.norm(before):
@@ -206,19 +214,21 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         for _ in range(_POWER):
             along = along / jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)
             along = curved(y, along)
-        step = float(1 / (_SAFETY * jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)))
+        length = float(1 / (_SAFETY * jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)))
         box = jaxopt.projection.projection_box
-        solver: Any = jaxopt.ProjectedGradient(value, box, stepsize=step, maxiter=steps, implicit_diff=False)
+        solver: Any = jaxopt.ProjectedGradient(value, box, stepsize=length, maxiter=steps, implicit_diff=False)
         state, update = solver.init_state(y, limit), jax.jit(lambda y, state: solver.update(y, state, limit))
     else:
         solver = jaxopt.LBFGS(value, maxiter=steps, implicit_diff=False)
         state, update = solver.init_state(y), jax.jit(solver.update)
-    _finite(*jax.value_and_grad(value)(y))
     far = jax.jit(lambda y: (jnp.linalg.norm(function(size * y)), value(y)))
-    history, last, still = [float(far(y)[0])], float(far(y)[1]), 0
-    for _ in range(steps):
+    norm, now = far(y)
+    _finite(square, norm, now)
+    history, last, still = [float(norm)], float(now), 0
+    for step in range(steps):
         moved, state = update(y, state)
         if not np.isfinite(moved).all():
+            _finite(*([] if step else [moved]))  # The prior's derivatives: the others are checked.
             break
         y = moved
         norm, now = map(float, far(y))
