@@ -54,6 +54,7 @@ SIDEWAYS = {
     ("sphere", "rotation", "harmonics"),
     ("scene", "occluder", "mesh"),
     ("scene", "shapes", "mesh"),
+    ("scene", "texture", "mesh"),
     ("transport", "bounce", "visibility"),
     ("transport", "interreflection", "bounce"),
     ("transport", "bounce", "paths"),

@@ -122,6 +122,7 @@ HOST = {
     "brdf.separable.join": "puts arrays side by side, and makes an error that is NaN",
     "scene.mesh": "loads, checks and builds meshes",
     "scene.mesh_file": "reads files",
+    "scene.texture.dpdu": "reads a mesh on the host",
     "scene.occluder": "simplifies meshes on the host",
     "scene.builtin": "builds meshes and lights",
     "scene.shapes": "builds meshes",

@@ -11,6 +11,7 @@ Reference: Sun, Zhou, Chen, Lin, Shi, Guo 2007, section 5, has such scenes.
 import itertools
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -101,7 +102,7 @@ def corner(mesh: Mesh, *, cells: int = 64) -> Mesh:
     high = high + unit * np.array([_NEAR, _ABOVE, _FAR])
     cell = max(high[0] - low[0], high[2] - low[2]) / cells
     sides = _shell(np.stack([low, high]), _CORNER_ROUND * unit, cell, ((1, 0), (2, 0), (0, 1)))
-    whole = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, jnp.zeros_like(mesh.region))
+    whole = eqx.tree_at(lambda each: each.region, mesh, jnp.zeros_like(mesh.region))
     return join([whole, *(assemble([side]) for side in sides)])
 
 

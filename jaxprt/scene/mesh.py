@@ -28,6 +28,7 @@ class Mesh(eqx.Module):
         normal: Unit shading normals.
         tangent: Unit tangents, orthogonal to the normals.
         region: Number of the material region that each vertex belongs to, from 0.
+        texture: Coordinates of each vertex in images, as `texture.lookup` takes them; None where there are none.
     """
 
     position: Float[Array, "v 3"]
@@ -35,6 +36,7 @@ class Mesh(eqx.Module):
     normal: Float[Array, "v 3"]
     tangent: Float[Array, "v 3"]
     region: Int[Array, " v"]
+    texture: Float[Array, "v 2"] | None = None
 
 
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
@@ -42,7 +44,8 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
 
     Vertices and faces keep the file's order; nothing is merged. Polygons become fans of triangles. Where an OBJ's
     corners differ in normal or texture coordinates, a vertex is split. All geometries of a scene are
-    placed by their nodes and joined. Materials and textures are neither needed nor read, save for glTF's names.
+    placed by their nodes and joined. Materials and images are neither needed nor read, save for glTF's names; texture
+    coordinates are, and are 0 where only a part of the file has them or they are not finite.
 
     Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
     by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither
@@ -61,8 +64,9 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
             name missing vertices. An OBJ that was cut off between two faces cannot be told from a whole one.
     """
     path = pathlib.Path(path)
-    position, face, normal, region = mesh_file.read(path, groups=groups)
-    return _make(position, face, normal, None, region, name=str(path), welded=path.suffix.lower() != ".stl")
+    position, face, normal, region, texture = mesh_file.read(path, groups=groups)
+    welded = path.suffix.lower() != ".stl"
+    return _make(position, face, normal, None, region, texture, name=str(path), welded=welded)
 
 
 def make_mesh(
@@ -72,6 +76,7 @@ def make_mesh(
     normal: Float[ArrayLike, "v 3"] | None = None,
     tangent: Float[ArrayLike, "v 3"] | None = None,
     region: Integer[ArrayLike, " v"] | None = None,
+    texture: Float[ArrayLike, "v 2"] | None = None,
     name: str = "mesh",
 ) -> Mesh:
     """Makes a mesh of arrays in memory, with the checks of ``load_mesh``.
@@ -85,16 +90,17 @@ def make_mesh(
         tangent: Tangents of any length, made orthogonal to the normals; ``directions.tangent`` where it is None,
             and for those that are zero, NaN or parallel to the normal.
         region: Numbers from 0; None makes all 0.
+        texture: Coordinates in images, (0, 0) for the lower left corner and (1, 1) for the upper right one.
         name: What to call the mesh in messages.
 
     Returns:
         The mesh, in float32 and int32.
 
     Raises:
-        ValueError: An array has another shape or kind of number, there are no vertices or faces, a position is not
-            finite, a face names a missing vertex, or a region is negative.
+        ValueError: An array has another shape or kind of number, there are no vertices or faces, a position or texture
+            coordinate is not finite, a face names a missing vertex, or a region is negative.
     """
-    return _make(position, face, normal, tangent, region, name=name, welded=False)
+    return _make(position, face, normal, tangent, region, texture, name=name, welded=False)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -104,7 +110,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
         meshes: One or more; the numbers of their regions may have gaps.
 
     Returns:
-        A mesh that ``split`` takes apart again.
+        A mesh that ``split`` takes apart again. Where some have texture coordinates, those of others are (0, 0).
 
     Raises:
         ValueError: There are no meshes.
@@ -125,7 +131,11 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
         for field in ("position", "normal", "tangent")
     )
     face, region = (jnp.asarray(np.concatenate(field), jnp.int32) for field in (face, region))
-    return Mesh(position, face, normal, tangent, region)
+    texture = None
+    if any(mesh.texture is not None for mesh in meshes):
+        each = [np.zeros((len(mesh.position), 2)) if mesh.texture is None else mesh.texture for mesh in meshes]
+        texture = jnp.asarray(np.concatenate(each), position.dtype)
+    return Mesh(position, face, normal, tangent, region, texture)
 
 
 def split(mesh: Mesh) -> list[Mesh]:
@@ -151,7 +161,8 @@ def split(mesh: Mesh) -> list[Mesh]:
         position, normal, tangent = (
             jnp.asarray(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
         )
-        parts.append(Mesh(position, jnp.asarray(own_face), normal, tangent, jnp.zeros(len(own), jnp.int32)))
+        texture = None if mesh.texture is None else jnp.asarray(np.asarray(mesh.texture)[own])
+        parts.append(Mesh(position, jnp.asarray(own_face), normal, tangent, jnp.zeros(len(own), jnp.int32), texture))
     return parts
 
 
@@ -166,28 +177,32 @@ def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     if not same or np.linalg.det(matrix) < 0:
         raise ValueError(f"rotation must be a 3 x 3 matrix that turns and nothing else, got {matrix.tolist()}")
     place, normal, tangent = (v @ jnp.asarray(rotation, v.dtype).T for v in (mesh.position, mesh.normal, mesh.tangent))
-    return Mesh(place, mesh.face, normal, tangent, mesh.region)
+    return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture)
 
 
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
-    """The mesh brushed along one direction: its tangents are that direction, projected to every tangent plane.
+    """The mesh brushed along a direction: its tangents are that direction, projected to every tangent plane.
 
     Where it is parallel to the normal, the normal's own tangent of `sphere.directions` takes its place.
 
     Args:
         mesh: The mesh.
-        direction: In the world, of any length.
+        direction: In the world, of any length: one, or one for each vertex, as of `texture.dpdu`. Of the latter zeros
+            count as parallel to the normal.
 
     Raises:
-        ValueError: The direction is zero, or not three finite numbers.
+        ValueError: The direction is zero, or not three finite numbers; or those of vertices are not.
 
     Reference: Kautz, Sloan, Snyder 2002, section 6.
     """
     along = np.asarray(direction, np.float64)
-    if along.shape != (3,) or not np.all(np.isfinite(along)) or not np.any(along):
+    if along.ndim > 1:
+        along = _finite(along, "direction", mesh.normal.shape, "mesh")
+    elif along.shape != (3,) or not np.all(np.isfinite(along)) or not np.any(along):
         raise ValueError(f"direction must be three finite numbers that are not all zero, got {along.tolist()}")
-    same = jnp.broadcast_to(jnp.asarray(along / np.abs(along).max(), mesh.normal.dtype), mesh.normal.shape)
-    return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, same)[:, 0])
+    scaled = along / np.maximum(np.abs(along).max(-1, keepdims=True), np.finfo(np.float64).tiny)
+    every = jnp.broadcast_to(jnp.asarray(scaled, mesh.normal.dtype), mesh.normal.shape)
+    return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, every)[:, 0])
 
 
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
@@ -235,7 +250,7 @@ def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
     return (corner + np.array([0, columns, columns + 1, 0, columns + 1, 1])).reshape(-1, 3)
 
 
-def _make(position, face, normal, tangent, region, *, name: str, welded: bool) -> Mesh:
+def _make(position, face, normal, tangent, region, texture, *, name: str, welded: bool) -> Mesh:
     position = _array(position, "position", (None, 3), name)
     with np.errstate(over="ignore"):  # What overflows float32 is reported below.
         position = position.astype(np.float32)
@@ -243,6 +258,7 @@ def _make(position, face, normal, tangent, region, *, name: str, welded: bool) -
     face = _array(face, "face", (None, 3), name, whole=True)
     region = np.zeros(count, np.int32) if region is None else _array(region, "region", (count,), name, whole=True)
     _check(position, face, region, name)
+    texture = None if texture is None else jnp.asarray(_finite(texture, "texture", (count, 2), name), jnp.float32)
     given = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
     length = np.linalg.norm(given, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
@@ -253,7 +269,8 @@ def _make(position, face, normal, tangent, region, *, name: str, welded: bool) -
     brought = brought.astype(np.float64)
     brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
     normal, tangent = _frame(given, brought)
-    return Mesh(jnp.asarray(position), jnp.asarray(face, jnp.int32), normal, tangent, jnp.asarray(region, jnp.int32))
+    face, region = (jnp.asarray(each, jnp.int32) for each in (face, region))
+    return Mesh(jnp.asarray(position), face, normal, tangent, region, texture)
 
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
@@ -267,15 +284,23 @@ def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole
     return array
 
 
+def _finite(value, field: str, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """A field as an array of finite numbers."""
+    array = _array(value, field, shape, name)
+    with np.errstate(over="ignore"):
+        wrong = np.flatnonzero(~np.isfinite(array.astype(np.float32)).all(1))
+    if wrong.size:
+        raise ValueError(
+            f"{name}: {field} must be finite, got {wrong.size} of {len(array)} that are not, "
+            f"the first is {array[wrong[0]].tolist()} at vertex {wrong[0]}"
+        )
+    return array
+
+
 def _check(position: np.ndarray, face: np.ndarray, region: np.ndarray, name: str) -> None:
     if not len(position) or not len(face):
         raise ValueError(f"{name} must hold vertices and faces, got {len(position)} vertices and {len(face)} faces")
-    wrong = np.flatnonzero(~np.isfinite(position).all(1))
-    if wrong.size:
-        raise ValueError(
-            f"{name}: positions must be finite, got {wrong.size} of {len(position)} that are not, "
-            f"the first is {position[wrong[0]].tolist()} at vertex {wrong[0]}"
-        )
+    _finite(position, "positions", position.shape, name)
     wrong = np.flatnonzero(((face < 0) | (face >= len(position))).any(1))
     if wrong.size:
         raise ValueError(

@@ -12,8 +12,8 @@ import trimesh
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
-def read(path: pathlib.Path, *, groups: bool) -> tuple[np.ndarray, ...]:
-    """Positions, faces, normals (NaN where the file has none) and regions; see `jaxprt.scene.load_mesh`."""
+def read(path: pathlib.Path, *, groups: bool) -> tuple[np.ndarray | None, ...]:
+    """Positions, faces, normals (NaN where the file has none), regions, and texture coordinates if it has them."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
@@ -108,8 +108,8 @@ def _absolute(index: str, count: int) -> str:
 
 
 def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
-    """Positions, faces, normals (NaN where the file has none) and regions of all geometries in their places."""
-    parts, labels = [], {}
+    """Positions, faces, normals, regions and texture coordinates of all geometries in their places."""
+    parts, labels, textured = [], {}, False
     first = 0
     nodes = list(scene.graph.nodes_geometry)
     for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
@@ -133,8 +133,14 @@ def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
         material = getattr(getattr(geometry.visual, "material", None), "name", None)
         label = node if groups or suffix == ".obj" or not material else (material,)
         region = np.full(len(position), labels.setdefault(label, len(labels)))
-        parts.append((position, face + first, normal, region))
+        texture = np.zeros((len(position), 2))
+        given = getattr(geometry.visual, "uv", None)
+        if given is not None and len(given) == len(position):
+            textured, own = True, np.asarray(given, np.float64)[:, :2]  # OBJs may have a third, which no image needs.
+            texture = np.where(np.isfinite(own), own, 0)
+        parts.append((position, face + first, normal, region, texture))
         first += len(position)
     if not parts:
         raise ValueError(f"{name} must hold vertices and faces, got no faces")
-    return tuple(np.concatenate(field) for field in zip(*parts, strict=True))
+    *fields, texture = (np.concatenate(field) for field in zip(*parts, strict=True))
+    return *fields, texture if textured else None

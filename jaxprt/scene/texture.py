@@ -1,8 +1,11 @@
-"""Images on surfaces: the color of a texture at each vertex."""
+"""Images on surfaces: the color of a texture at each vertex, and how it lies there."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from jaxprt.scene.mesh import Mesh
 
 
 @jax.jit
@@ -17,7 +20,7 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
 
     Args:
         image: The texture, first row on top; linear values, not sRGB-encoded ones, if it is to be an albedo.
-        coordinate: Places u to the right and v up, over width and height.
+        coordinate: Places u to the right and v up, over width and height: `Mesh.texture`.
 
     Returns:
         Values of the image, for example weights of `relight.separable.modulate`.
@@ -35,3 +38,32 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
     upper = (1 - right) * texel(0, 0) + right * texel(0, 1)
     lower = (1 - right) * texel(1, 0) + right * texel(1, 1)
     return (1 - down) * upper + down * lower
+
+
+def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
+    """How a point moves on the surface as the texture's coordinate u grows, in world units: for `mesh.brush`.
+
+    The mean of the faces around a vertex, weighted by their areas; zero where faces cover nothing of the texture.
+
+    Raises:
+        ValueError: The mesh has no texture coordinates.
+
+    Reference: Pharr, Jakob, Humphreys 2023, "Physically Based Rendering", section 6.5.
+    """
+    if mesh.texture is None:
+        raise ValueError("the mesh must have texture coordinates, got none: `mesh.make_mesh` takes them")
+    face = np.asarray(mesh.face)
+    corner, place = (np.asarray(each, np.float64)[face] for each in (mesh.position, mesh.texture))
+    edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
+    covered = np.linalg.det(step)
+    along = edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:]
+    # A sum of two products that cancel to within what float32 coordinates tell says nothing.
+    least = 4 * np.finfo(np.float32).eps * np.abs(place).max((1, 2)) * np.abs(step).max((1, 2))
+    known = np.abs(covered) > least
+    along = np.where(known, 1 / np.where(known, covered, 1), 0)[:, None] * along
+    area = np.where(known, np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1), 0)
+    vertex, weight = face.ravel(), np.repeat(area, 3)
+    total = np.bincount(vertex, weight, len(mesh.position))
+    weighted = weight[:, None] * np.repeat(along, 3, axis=0)
+    mean = np.stack([np.bincount(vertex, weighted[:, axis], len(total)) for axis in range(3)], -1)
+    return mean / np.where(total > 0, total, 1)[:, None]

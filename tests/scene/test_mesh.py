@@ -21,7 +21,7 @@ def write(folder, name, content):
 
 
 def assert_equal(a: Mesh, b: Mesh):
-    for field in ("position", "face", "normal", "tangent", "region"):
+    for field in ("position", "face", "normal", "tangent", "region", "texture"):
         np.testing.assert_array_equal(getattr(a, field), getattr(b, field), err_msg=field)
 
 
@@ -45,6 +45,37 @@ def test_a_ball_comes_back_from_every_format_with_its_vertices_in_order(tmp_path
     np.testing.assert_array_equal(mesh.face, source.faces)
     close(mesh.normal, source.vertices, tolerance=ICOSPHERE)
     assert_frames(mesh)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_texture_coordinates_come_back_and_follow_joining_splitting_and_turning(tmp_path, suffix, close):
+    source = ball()
+    place = np.random.default_rng(0).uniform(-1, 2, (len(source.vertices), 2))
+    source.visual = trimesh.visual.TextureVisuals(uv=place)
+    source.export(tmp_path / f"ball.{suffix}")
+    mesh = load_mesh(tmp_path / f"ball.{suffix}")
+    close(mesh.texture, place, tolerance=1e-5)
+    plain = builtin.plane(cells=2)
+    first, second = split(join([mesh, plain]))
+    assert_equal(first, mesh)
+    np.testing.assert_array_equal(second.texture, np.zeros((len(plain.position), 2)))
+    np.testing.assert_array_equal(turn(mesh, np.eye(3)).texture, mesh.texture)
+    assert join([plain, plain]).texture is None
+
+
+@pytest.mark.parametrize("names", ["st", "uv"])
+def test_texture_coordinates_of_a_ply_have_either_name(tmp_path, names):
+    properties = "".join(f"property float {name}\n" for name in "xyz" + names)
+    header = f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\n"
+    lines = "property list uchar int vertex_indices\nend_header\n0 0 0 0.5 2\n1 0 0 0.25 0.5\n0 1 0 -1 0\n3 0 1 2\n"
+    found = load_mesh(write(tmp_path, "uv.ply", header + lines)).texture
+    np.testing.assert_array_equal(found, [[0.5, 2], [0.25, 0.5], [-1, 0]])
+
+
+def test_texture_coordinates_of_a_file_that_are_not_finite_are_zero(tmp_path):
+    lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt nan 0.5\nvt 0.5 0.25\nvt 1 0.75\nf 1/1 2/2 3/3\n"
+    found = load_mesh(write(tmp_path, "nan.obj", lines)).texture
+    np.testing.assert_array_equal(found, [[0, 0.5], [0.5, 0.25], [1, 0.75]])
 
 
 def test_suffixes_may_be_capitals_and_paths_strings(tmp_path):
@@ -134,6 +165,7 @@ def test_arrays_come_out_in_single_precision(x64):
             "got 2 of 4 .* at vertex 1",
         ),
         ({"position": SQUARE * 1e39}, "positions must be finite, got 3 of 4"),
+        ({"texture": SQUARE[:, :2] * 1e39}, "hat: texture must be finite, got 3 of 4"),
         ({"region": np.array([0, 0, -1, 0])}, "regions must not be negative, got 1 of 4 .* -1 at vertex 2"),
     ],
 )
@@ -148,6 +180,7 @@ def test_impossible_arrays_are_refused_with_name_count_and_first_offender(change
     ("change", "message"),
     [
         ({"position": SQUARE[:, :2]}, r"hat: position must be real numbers \[any, 3\], got float64 \[4, 2\]"),
+        ({"texture": SQUARE}, r"hat: texture must be real numbers \[4, 2\], got float64 \[4, 3\]"),
         ({"position": SQUARE.ravel()}, r"hat: position must be real numbers \[any, 3\], got float64 \[12\]"),
         ({"position": SQUARE.astype(complex)}, r"position must be real numbers .* got complex128"),
         ({"face": np.array([[0, 1, 2, 3]])}, r"hat: face must be integers \[any, 3\], got int64 \[1, 4\]"),
@@ -353,6 +386,25 @@ def test_brushed_tangents_are_the_direction_in_every_tangent_plane():
     np.testing.assert_allclose(
         mesh.tangent[off_poles], (flat / np.maximum(length, 1e-3)[:, None])[off_poles], atol=1e-4
     )
+
+
+def test_every_vertex_may_be_brushed_along_its_own_direction(close):
+    mesh = builtin.sphere(rings=9, sectors=12)
+    along = (
+        np.random.default_rng(0).normal(size=mesh.position.shape)
+        * np.geomspace(1e-12, 1e12, len(mesh.position))[:, None]
+    )
+    along[5] = 0
+    brushed = brush(mesh, along)
+    assert_frames(brushed)
+    one = brush(mesh, along[7])
+    close(brushed.tangent[7], one.tangent[7], tolerance=1e-5)
+    close(brushed.tangent[5], directions.tangent(mesh.normal[5:6])[0], tolerance=1e-5)
+    along[3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"direction must be finite, got 1 of .* at vertex 3"):
+        brush(mesh, along)
+    with pytest.raises(ValueError, match=r"direction must be real numbers \[.*, 3\], got float64 \[4, 3\]"):
+        brush(mesh, along[:4])
 
 
 @pytest.mark.parametrize("direction", [[0, 0, 0], [np.nan, 0, 1], [1, 2]])

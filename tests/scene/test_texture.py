@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
-import trimesh
 
-from jaxprt.scene import load_mesh, texture
+from jaxprt.scene import builtin, load_mesh, texture
+from jaxprt.scene.mesh import brush, grid_face, make_mesh
 
 # Three rows of four texels: hundreds count rows from the top, units columns from the left.
 LABEL = jnp.asarray(100.0 * np.arange(3)[:, None, None] + np.arange(4)[:, None])
@@ -54,16 +54,71 @@ def test_the_gradient_in_the_image_is_the_weight_of_each_texel(close):
     close(gradient, expected)
 
 
-@pytest.mark.parametrize("name", ["meshes/spot.obj", "meshes_awkward/fuze.obj"])
-def test_coordinates_that_trimesh_reads_are_those_of_the_loaded_vertices(data, name):
-    mesh, read = load_mesh(data / name), trimesh.load(data / name, process=False, skip_materials=True)
-    np.testing.assert_array_equal(mesh.position, np.asarray(read.vertices, np.float32))
+@pytest.mark.parametrize("name", ["meshes/spot.obj", "meshes_awkward/fuze.obj", "meshes_awkward/quadknot.obj"])
+def test_texture_coordinates_are_the_files(data, name):
+    mesh = load_mesh(data / name)
     lines = (data / name).read_text().splitlines()
-    written, corner, faces = (
-        [line.split()[1:] for line in lines if line.startswith(key)] for key in ("vt ", "v ", "f ")
-    )
-    # Of the first vertex of the first face, as the file has it.
-    vertex, coordinate = (int(number) - 1 for number in faces[0][0].split("/")[:2])
-    own = np.flatnonzero((np.asarray(mesh.position) == np.asarray(corner[vertex][:3], np.float32)).all(1))
-    uv = np.asarray(read.visual.uv)[own]
-    assert np.abs(uv - np.asarray(written[coordinate][:2], float)).max(1).min() < 1e-6
+    place, corner, faces = ([line.split()[1:] for line in lines if line.startswith(key)] for key in ("vt ", "v ", "f "))
+    fans = [(face[0], *face[k : k + 2]) for face in faces for k in range(1, len(face) - 1)]
+    index = np.array([[each.split("/")[:2] for each in fan] for fan in fans], int) - 1
+    written = [np.array([each[:count] for each in rows], float) for rows, count in ((corner, 3), (place, 2))]
+    expected = np.concatenate([rows[index[..., k]] for k, rows in enumerate(written)], -1)
+    face = np.asarray(mesh.face)
+    actual = np.concatenate([np.asarray(mesh.position)[face], np.asarray(mesh.texture)[face]], -1)
+    # trimesh orders an OBJ's faces by material, and splits polygons by another diagonal: as sets of corners.
+    corners = [np.unique(each.reshape(-1, 5).astype(np.float32).round(5), axis=0) for each in (expected, actual)]
+    np.testing.assert_allclose(*corners, atol=2e-5)
+
+
+def test_files_without_texture_coordinates_have_none(data):
+    assert load_mesh(data / "meshes" / "stanford_bunny.ply").texture is None
+
+
+def affine(place):
+    """Vertices of a square whose texture is turned, stretched and sheared, with the images of u and v."""
+    inverse = np.linalg.inv([[2.0, 0.5], [-1.0, 3.0]])
+    position = np.column_stack([place @ inverse.T, np.zeros(len(place))])
+    return position, np.append(inverse[:, 0], 0)
+
+
+def test_dpdu_of_an_affine_texture_is_the_same_everywhere():
+    u, v = np.meshgrid(np.linspace(-3, 5, 7), np.linspace(0, 1, 5))
+    place = np.column_stack([u.ravel(), v.ravel()])
+    position, along = affine(place)
+    face = grid_face(rows=5, columns=7)
+    found = texture.dpdu(make_mesh(position, face, texture=place))
+    np.testing.assert_allclose(found, np.broadcast_to(along, found.shape), atol=1e-5)
+    mirrored = texture.dpdu(make_mesh(position, face, texture=place * [-1, 1]))
+    np.testing.assert_allclose(mirrored, np.broadcast_to(-along, found.shape), atol=1e-5)
+
+
+def test_a_globe_is_brushed_along_its_circles_of_latitude():
+    rows, columns = 33, 65
+    v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+    polar, azimuth = np.pi * (1 - v.ravel()), 2 * np.pi * u.ravel()
+    position = np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    place = np.column_stack([u.ravel(), v.ravel()])
+    mesh = make_mesh(position, grid_face(rows=rows, columns=columns), normal=position, texture=place)
+    found = texture.dpdu(mesh)
+    east = np.column_stack([-np.sin(azimuth), np.cos(azimuth), 0 * azimuth])
+    inside = np.sin(polar) > 0.3
+    expected = 2 * np.pi * np.sin(polar)[:, None] * east
+    # Faces end where they do: their chords are to one side of a vertex at the seam.
+    np.testing.assert_allclose(found[inside], expected[inside], atol=0.06 * 2 * np.pi)
+    inner = inside & (u.ravel() > 0) & (u.ravel() < 1)
+    np.testing.assert_allclose(found[inner], expected[inner], atol=0.012 * 2 * np.pi)
+    tangent = np.asarray(brush(mesh, found).tangent)
+    assert np.min(np.sum(tangent * east, 1)[inner]) > 0.999
+    assert np.isfinite(tangent).all()
+
+
+def test_faces_that_cover_nothing_of_the_texture_do_not_count():
+    place = np.array([[0.3, 0.4], [0.3, 0.4], [0.3, 0.4], [0.5, 0.4], [0.3, 0.6]])
+    position = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0]])
+    found = texture.dpdu(make_mesh(position, np.array([[0, 1, 2], [2, 3, 4]]), texture=place))
+    np.testing.assert_allclose(found, [[0, 0, 0]] * 2 + [[5, 0, 0]] * 3, atol=1e-5)
+
+
+def test_a_mesh_without_texture_coordinates_has_no_dpdu():
+    with pytest.raises(ValueError, match="must have texture coordinates, got none"):
+        texture.dpdu(builtin.plane(cells=1))
