@@ -30,7 +30,7 @@ bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable 
 		$(filter-out __init__ harness path_tracing,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
 	$(BIN)/python -m benchmarks.$(NAME) $(ARGS)
 
-tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, about an hour: ARGS="--mesh stanford_bunny" for one
+tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half an hour: ARGS="--mesh stanford_bunny" for one
 	$(BIN)/python -m benchmarks.tables $(ARGS)
 
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place

@@ -7,7 +7,7 @@ ground with one, 96 coefficients a vertex and term, light of 6 x 64 x 64 texels,
 Transport is stored in whole numbers, as in the paper. `peer` are the paper's figures, of a 2.6 GHz Pentium 4 with a
 GeForce 5900 in 2004, so their ratio is of two machines and of two meshes: of three meshes the files have fewer vertices
 than the paper's. `error` is what storing in whole numbers changes in the light tuples. All meshes
-together take half an hour to an hour on two cores. Without JAXPRT_DATA, and with `--quick`, a small embedded scene
+together take twenty minutes to an hour on two cores. Without JAXPRT_DATA, and with `--quick`, a small embedded scene
 stands in, which has no peer.
 """
 

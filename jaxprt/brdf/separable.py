@@ -98,6 +98,10 @@ def factor(
     C(wi, wi') = sum_l (l + 1/2)^-2 (2l + 1) / (4 pi) P_l(wi . wi') the covariance of natural light, whose spectrum
     falls like that. Light maps are the projections U^T M, gray for any BRDF, so that transport is gray too.
 
+    Nine real environments, without their brightest texels, fall with exponents of .4 to 2.8 instead of 2, 1.8 in the
+    mean; between 1.5 and 3 the radiance of 16 terms under them changes by 1 %. Factored apart from the diffuse part, a
+    specular one needs more terms in all: two are 6 to 18 % farther off than together, 16 are 4 to 7 %.
+
     Maps are parabolic: on the orthographic disk the last texel before the rim spans 14 degrees at 48 x 48, and at
     grazing angles, where glossy BRDFs are brightest, bilinear lookup is then off by more than all else.
 
