@@ -45,7 +45,9 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     Vertices and faces keep the file's order; nothing is merged. Polygons become fans of triangles. Where an OBJ's
     corners differ in normal or texture coordinates, a vertex is split. All geometries of a scene are
     placed by their nodes and joined. Materials and images are neither needed nor read, save for glTF's names; texture
-    coordinates are, and are 0 where only a part of the file has them or they are not finite.
+    coordinates are, and are 0 where only some geometries of the file have them or they are not finite. All
+    faces of an OBJ's material or group must have them; a glTF's geometry needs a material, and its transforms of
+    textures are not applied.
 
     Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
     by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither

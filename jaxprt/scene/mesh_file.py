@@ -1,6 +1,7 @@
 """Meshes in files: what trimesh reads of each format, with the damage that it passes over refused."""
 
 import io
+import json
 import pathlib
 import re
 import warnings
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+WHOLE = {5121: 255, 5123: 65535}  # glTF's component types of whole numbers, and what stands for 1
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
@@ -19,7 +21,9 @@ def read(path: pathlib.Path, *, groups: bool) -> tuple[np.ndarray | None, ...]:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
     if not path.is_file():
         raise FileNotFoundError(f"there is no mesh file {path}")
-    return _concatenate(_load(path, suffix, groups), suffix, groups, str(path))
+    scene = _load(path, suffix, groups)
+    scale = _texture_scale(path) if suffix in (".glb", ".gltf") else 1
+    return _concatenate(scene, suffix, groups, scale, str(path))
 
 
 def _load(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
@@ -81,7 +85,7 @@ def _obj_text(path: pathlib.Path) -> str:
     lines = [line.strip() for line in text.splitlines()]
     count = {"v": 0, "vt": 0, "vn": 0}
     absolute = lines.copy()
-    faces = []  # Line number, number of corners, lowest and highest vertex.
+    faces = []  # Line number, number of corners, lowest and highest vertex, and texture coordinate if any.
     for number, line in enumerate(lines):
         kind, _, rest = line.partition(" ")
         if kind in count:
@@ -91,15 +95,28 @@ def _obj_text(path: pathlib.Path) -> str:
             if "-" in rest or "#" in rest:
                 corners = ["/".join(map(_absolute, corner.split("/"), count.values())) for corner in corners]
                 absolute[number] = "f " + " ".join(corners)
-            vertex = [int(index) if index.isdecimal() else 0 for index in (c.partition("/")[0] for c in corners)]
-            faces.append((number, len(vertex), min(vertex, default=0), max(vertex, default=0)))
-    wrong = [number for number, corners, low, high in faces if corners < 3 or low < 1 or high > count["v"]]
+            index = [corner.split("/") for corner in corners]
+            vertex = [_whole(each[0]) for each in index]
+            place = [_whole(each[1]) for each in index if len(each) > 1 and each[1]]
+            ends = [min(vertex, default=0), max(vertex, default=0), min(place, default=1), max(place, default=0)]
+            faces.append((number, len(vertex), *ends))
+    wrong = [line for line, corners, low, high, *_ in faces if corners < 3 or low < 1 or high > count["v"]]
     if wrong:
         raise ValueError(
             f"{path}: faces must name three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
             f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
         )
+    wrong = [line for line, *_, low, high in faces if low < 1 or high > count["vt"]]
+    if wrong:
+        raise ValueError(
+            f"{path}: faces must name texture coordinates 1 to {count['vt']} or none, got {len(wrong)} of "
+            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
+        )
     return "\n".join(absolute)
+
+
+def _whole(index: str) -> int:
+    return int(index) if index.isdecimal() else 0
 
 
 def _absolute(index: str, count: int) -> str:
@@ -107,7 +124,20 @@ def _absolute(index: str, count: int) -> str:
     return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
 
 
-def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
+def _texture_scale(path: pathlib.Path) -> int:
+    """By what the whole numbers are too large, with which a glTF may store texture coordinates; else 1."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    header = json.loads(content)
+    parts = [part["attributes"] for mesh in header.get("meshes", []) for part in mesh["primitives"]]
+    kinds = {header["accessors"][part["TEXCOORD_0"]]["componentType"] for part in parts if "TEXCOORD_0" in part}
+    if len(kinds) > 1 and kinds & WHOLE.keys():
+        raise ValueError(f"{path}: texture coordinates must all be of one type, got component types {sorted(kinds)}")
+    return WHOLE.get(kinds.pop(), 1) if kinds else 1
+
+
+def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, scale: int, name: str):
     """Positions, faces, normals, regions and texture coordinates of all geometries in their places."""
     parts, labels, textured = [], {}, False
     first = 0
@@ -136,8 +166,11 @@ def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, name: str):
         texture = np.zeros((len(position), 2))
         given = getattr(geometry.visual, "uv", None)
         if given is not None and len(given) == len(position):
-            textured, own = True, np.asarray(given, np.float64)[:, :2]  # OBJs may have a third, which no image needs.
-            texture = np.where(np.isfinite(own), own, 0)
+            # OBJs may have one, and v is 0 then, or a third, which no image needs.
+            textured, own = True, np.asarray(given, np.float64)[:, :2]
+            if scale > 1:  # trimesh has turned whole numbers upside down in their own type, which wraps.
+                own = np.stack([own[:, 0] / scale, 1 - (1 - own[:, 1]) % (scale + 1) / scale], 1)
+            texture[:, : own.shape[1]] = np.where(np.isfinite(own), own, 0)
         parts.append((position, face + first, normal, region, texture))
         first += len(position)
     if not parts:

@@ -15,7 +15,9 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
     Coordinates are as in OBJ files, and as trimesh gives those of glTF: (0, 0) is the lower left corner of the image
     and (1, 1) the upper right one. Centers of texels lie half a texel inside.
 
-    A vertex takes the texture at one place: details finer than the mesh's edges are not averaged but missed.
+    A vertex takes the texture at one place: details finer than the mesh's edges are not averaged but missed. Pictures
+    show them by `lookup(image, interpolate(fragments, mesh.face, mesh.texture))` of `image.raster`, for each pixel.
+    Opposite edges of the image are blended, as it repeats: at u = 0 and at u = 1 is the mean of the two.
     Linear in the image; in the coordinates differentiable except where they pass the center of a row or column.
 
     Args:
@@ -24,7 +26,13 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
 
     Returns:
         Values of the image, for example weights of `relight.separable.modulate`.
+
+    Raises:
+        ValueError: The image has no axis of colors, or coordinates are no pairs.
     """
+    if image.ndim != 3 or coordinate.shape[-1:] != (2,):
+        got = f"{list(image.shape)} and {list(coordinate.shape)}"
+        raise ValueError(f"image must be [h, w, c] and coordinates [..., 2], got {got}")
     height, width = image.shape[:2]
     u, v = coordinate[..., 0], coordinate[..., 1]
     # Reduced to one period first: multiplied by the width, far coordinates would lose digits.
@@ -43,7 +51,9 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
 def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     """How a point moves on the surface as the texture's coordinate u grows, in world units: for `mesh.brush`.
 
-    The mean of the faces around a vertex, weighted by their areas; zero where faces cover nothing of the texture.
+    The mean of the faces around a vertex, weighted by how much of the texture they cover; zero where they cover
+    nothing. Faces on which it points the other way, beyond a seam at which the texture is mirrored, count with the
+    opposite sign: what is brushed looks alike from both ends.
 
     Raises:
         ValueError: The mesh has no texture coordinates.
@@ -56,14 +66,15 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     corner, place = (np.asarray(each, np.float64)[face] for each in (mesh.position, mesh.texture))
     edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
     covered = np.linalg.det(step)
-    along = edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:]
-    # A sum of two products that cancel to within what float32 coordinates tell says nothing.
+    # What cancels to within what float32 coordinates tell says nothing.
     least = 4 * np.finfo(np.float32).eps * np.abs(place).max((1, 2)) * np.abs(step).max((1, 2))
-    known = np.abs(covered) > least
-    along = np.where(known, 1 / np.where(known, covered, 1), 0)[:, None] * along
-    area = np.where(known, np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1), 0)
-    vertex, weight = face.ravel(), np.repeat(area, 3)
-    total = np.bincount(vertex, weight, len(mesh.position))
-    weighted = weight[:, None] * np.repeat(along, 3, axis=0)
-    mean = np.stack([np.bincount(vertex, weighted[:, axis], len(total)) for axis in range(3)], -1)
+    covered = np.where(np.abs(covered) > least, covered, 0)
+    weighted = np.sign(covered)[:, None] * (edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:])
+    vertex, weight, along = face.ravel(), np.repeat(np.abs(covered), 3), np.repeat(weighted, 3, axis=0)
+    order = np.argsort(weight, kind="stable")
+    first = np.zeros((len(mesh.position), 3))
+    first[vertex[order]] = along[order]  # The last to be written covers most.
+    along = np.where(np.sum(along * first[vertex], 1, keepdims=True) < 0, -along, along)
+    total = np.bincount(vertex, weight, len(first))
+    mean = np.stack([np.bincount(vertex, along[:, axis], len(first)) for axis in range(3)], -1)
     return mean / np.where(total > 0, total, 1)[:, None]

@@ -1,3 +1,7 @@
+import base64
+import json
+import struct
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -70,6 +74,56 @@ def test_texture_coordinates_of_a_ply_have_either_name(tmp_path, names):
     lines = "property list uchar int vertex_indices\nend_header\n0 0 0 0.5 2\n1 0 0 0.25 0.5\n0 1 0 -1 0\n3 0 1 2\n"
     found = load_mesh(write(tmp_path, "uv.ply", header + lines)).texture
     np.testing.assert_array_equal(found, [[0.5, 2], [0.25, 0.5], [-1, 0]])
+
+
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+@pytest.mark.parametrize(("kind", "dtype"), [(5121, np.uint8), (5123, np.uint16)])
+def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_shares(tmp_path, suffix, kind, dtype):
+    most = np.iinfo(dtype).max
+    # Rows are of four bytes at least, as glTF wants vertex attributes.
+    raw = np.array([[0, most], [most, most], [most, 0], [most // 5, 0]], dtype)
+    stride = max(4, 2 * raw.itemsize)
+    packed = b"".join(row.tobytes().ljust(stride, b"\0") for row in raw)
+    position, face = SQUARE.astype(np.float32).tobytes(), SQUARE_FACE.astype(np.uint16).tobytes()
+    data = position + packed + face
+    views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(position)}]
+    views += [{"buffer": 0, "byteOffset": len(position), "byteLength": len(packed), "byteStride": stride}]
+    views += [{"buffer": 0, "byteOffset": len(position) + len(packed), "byteLength": len(face)}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}]
+    accessors += [{"bufferView": 1, "componentType": kind, "normalized": True, "count": 4, "type": "VEC2"}]
+    accessors += [{"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"}]
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    header = {
+        **{"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]},
+        **{"materials": [{"name": "a"}], "bufferViews": views, "accessors": accessors},
+        "buffers": [{"byteLength": len(data)} | ({"uri": uri} if suffix == "gltf" else {})],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]},
+        ],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    content = text
+    if suffix == "glb":
+        data += b"\0" * (-len(data) % 4)
+        content = struct.pack("<4s4I", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A) + text
+        content += struct.pack("<2I", len(data), 0x004E4942) + data
+    found = load_mesh(write(tmp_path, f"whole.{suffix}", content)).texture
+    np.testing.assert_allclose(found, np.column_stack([raw[:, 0] / most, 1 - raw[:, 1] / most]), atol=1e-6)
+
+
+@pytest.mark.parametrize("index", ["9", "-9", "0", "x"])
+def test_faces_that_name_missing_texture_coordinates_are_refused(tmp_path, index):
+    lines = f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/{index} 3/3\n"
+    with pytest.raises(ValueError, match=r"must name texture coordinates 1 to 3 or none, got 1 of 1 .* in line 7"):
+        load_mesh(write(tmp_path, "missing.obj", lines))
+
+
+def test_a_texture_of_one_coordinate_has_another_of_zero(tmp_path):
+    found = load_mesh(
+        write(tmp_path, "one.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.5\nvt 0.25\nvt 1\nf 1/1 2/2 3/3\n")
+    ).texture
+    np.testing.assert_array_equal(found, [[0.5, 0], [0.25, 0], [1, 0]])
 
 
 def test_texture_coordinates_of_a_file_that_are_not_finite_are_zero(tmp_path):

@@ -119,6 +119,30 @@ def test_faces_that_cover_nothing_of_the_texture_do_not_count():
     np.testing.assert_allclose(found, [[0, 0, 0]] * 2 + [[5, 0, 0]] * 3, atol=1e-5)
 
 
+def test_a_texture_that_is_mirrored_at_shared_vertices_is_brushed_without_a_seam():
+    x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(1, -1, 21))
+    position = np.column_stack([x.ravel(), y.ravel(), -0.15 * (x**2 + y**2).ravel()])
+    place = np.column_stack([np.abs(y).ravel(), x.ravel()])
+    mesh = make_mesh(position, grid_face(rows=21, columns=21), texture=place)
+    tangent = np.asarray(brush(mesh, texture.dpdu(mesh)).tangent)
+    assert np.min(np.abs(tangent[:, 1])) > 0.93  # Along y, of which the surface's slope takes a little.
+
+
+def test_a_face_that_squeezes_the_texture_does_not_decide_alone():
+    """On the second face u runs along y, a thousand times as far as along x on the first."""
+    position = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]])
+    place = np.array([[0.0, 0], [1, 0], [0, 1], [1e-3, 1]])
+    found = texture.dpdu(make_mesh(position, np.array([[0, 1, 2], [0, 2, 3]]), texture=place))[0]
+    assert found[0] > 0.85 * np.linalg.norm(found)  # As far apart from the first as of two equal ones.
+
+
+@pytest.mark.parametrize(("image", "place"), [((8, 16), (5, 2)), ((8, 16, 3), (5, 3)), ((8, 16, 3), (2, 5))])
+@pytest.mark.usefixtures("unchecked")
+def test_lookups_of_other_shapes_are_refused(image, place):
+    with pytest.raises(ValueError, match=r"image must be \[h, w, c\] and coordinates \[..., 2\], got \["):
+        texture.lookup(jnp.ones(image), jnp.ones(place))
+
+
 def test_a_mesh_without_texture_coordinates_has_no_dpdu():
     with pytest.raises(ValueError, match="must have texture coordinates, got none"):
         texture.dpdu(builtin.plane(cells=1))
