@@ -19,7 +19,7 @@ PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
 ROOMS = ["__main__", "animation", "report", "inverse", "plan", "relight", "image", "transport", "brdf", "scene"]
-ROOMS += ["linalg", "sphere", "files", "staging"]
+ROOMS += ["linalg", "sphere", "files", "staging", "require"]
 SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 
 # Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.

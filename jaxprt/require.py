@@ -1,0 +1,32 @@
+"""Checks of values where they enter the package, with errors that name what was required and what came.
+
+Values inside `jax.jit`, `jax.vmap` or `jax.grad` are not known while Python runs: these checks let them pass. There a
+NaN reaches every vertex that reads it.
+"""
+
+from typing import Any
+
+import numpy as np
+from jax.core import Tracer
+
+
+def finite(name: str, value: Any) -> None:
+    """Refuses NaN and infinity.
+
+    Args:
+        name: What the value is, for the message: "the eye".
+        value: A number or an array.
+
+    Raises:
+        ValueError: Some values are not finite; says how many, and where the first one is.
+    """
+    if isinstance(value, Tracer):
+        return
+    known = np.asarray(value)
+    if known.dtype.kind != "f" or np.isfinite(known).all():
+        return
+    wrong = np.argwhere(~np.isfinite(known))
+    where = f", first at {tuple(map(int, wrong[0]))}" if known.ndim else ""
+    raise ValueError(
+        f"{name} must be finite, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
+    )

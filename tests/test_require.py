@@ -1,0 +1,30 @@
+"""Checks of values where they enter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import require
+
+
+@pytest.mark.parametrize("value", [1.0, 3, np.ones((2, 3)), jnp.zeros(4), np.array([1, 2]), np.zeros(0)])
+def test_finite_values_pass(value):
+    require.finite("the eye", value)
+
+
+def test_the_message_counts_and_names_the_first_value_that_is_not_finite():
+    with pytest.raises(
+        ValueError, match=r"the eye must be finite, got 2 of 6 values that are not, first at \(0, 2\): inf"
+    ):
+        require.finite("the eye", np.array([[0, 1, np.inf], [np.nan, 2, 3]]))
+    with pytest.raises(ValueError, match="the weight must be finite, got 1 of 1 values that are not: nan"):
+        require.finite("the weight", float("nan"))
+
+
+def test_traced_values_pass_and_stay_as_they_are():
+    def through(x):
+        require.finite("x", x)
+        return 2 * x
+
+    assert jnp.isnan(jax.jit(through)(jnp.asarray(jnp.nan)))
