@@ -346,6 +346,7 @@ EXAMPLES = {
     "sphere.directions.normalize": example(lambda draw: call(draw.normal(5, 3))),
     "sphere.directions.tangent": example(lambda draw: call(draw.unit(5))),
     "sphere.directions.frame": example(lambda draw: call(draw.unit(5), draw.normal(5, 3))),
+    "sphere.directions.view": example(lambda draw: call(draw.rotation(5), draw.normal(5, 3), draw.normal(3))),
     "sphere.directions.to_local": example(lambda draw: call(draw.rotation(2), draw.unit(5))),
     "sphere.cubemap.direction": example(nothing, size=3),
     "sphere.cubemap.point": example(nothing, size=3),
@@ -508,6 +509,7 @@ EXAMPLES = {
         lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)),
         gradient=("attribute",),
     ),
+    "image.raster.front": example(lambda draw: call(draw.fragments(2, 3), draw.mesh(), draw.camera()), gradient=()),
     "image.raster.render": example(
         lambda draw: call(draw.mesh(), draw.normal(6, 3), draw.camera(), background=draw.uniform(5, 6, 3)),
         gradient=("color",),  # The background is hidden here.

@@ -277,14 +277,12 @@ def test_eyes_in_odd_places_give_finite_radiance(lambert, mirror):
     transport = precompute(mesh, size=8, progress=False)
     places = (mesh.position[7], jnp.zeros(3), jnp.array([1e15, 1e15, -1e15]), mesh.position[7] * (1 + 1e-6))
     for table in (lambert, mirror):
-        for number, eye in enumerate(places):
+        for eye in places:
             color = np.asarray(harmonic.radiance(transport, table, light, eye=eye))
             assert np.isfinite(color).all()
-            if number == 1:
-                assert not color.any()  # From inside all are seen from behind.
 
 
-def test_views_below_the_horizon_are_black_with_and_without_transfer(lambert):
+def test_views_below_the_horizon_see_what_grazing_views_see_with_and_without_transfer(lambert):
     mesh = builtin.plane(cells=2)
     light = harmonic.project(WHITE, degree=4)
     transport = precompute(mesh, size=8, progress=False)
@@ -294,7 +292,7 @@ def test_views_below_the_horizon_are_black_with_and_without_transfer(lambert):
             harmonic.radiance(transport, lambert, light, eye=eye),
             harmonic.unshadowed_radiance(mesh, lambert, light, eye=eye),
         ):
-            assert np.asarray(color).any() == (height > 0)
+            np.testing.assert_allclose(color, 0.5, rtol=FURNACE)
 
 
 def test_one_coefficient_is_the_mean_of_the_light():

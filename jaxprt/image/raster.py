@@ -86,7 +86,7 @@ def render(
     view many times keep the result of `rasterize` and call `interpolate`.
 
     Args:
-        mesh: What is drawn, both sides of it; radiance is black on the back.
+        mesh: What is drawn. Its back, see `front`, is black.
         color: Linear radiance of each vertex towards the camera.
         camera: From where.
         background: What is seen past the mesh; black if not given.
@@ -97,10 +97,20 @@ def render(
     if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
         raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
     fragments = rasterize(mesh, camera)
-    image = interpolate(fragments, mesh.face, color)
+    image = jnp.where(front(fragments, mesh, camera)[..., None], interpolate(fragments, mesh.face, color), 0)
     if background is None:
         return image
     return jnp.where((fragments.triangle >= 0)[..., None], image, background)
+
+
+@jax.jit
+def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w"]:
+    """Whether each pixel shows the front of a surface: not all three vertices of its triangle look away from the eye.
+
+    At silhouettes normals of a triangle point to both sides, and it counts as front. The back of a surface is black.
+    """
+    away = jnp.sum(mesh.normal * (camera.eye - mesh.position), -1) < 0
+    return ~jnp.all(away[mesh.face], -1)[fragments.triangle] & (fragments.triangle >= 0)
 
 
 @jax.jit

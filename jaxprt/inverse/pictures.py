@@ -116,7 +116,7 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
         raise ValueError(f"the exposure of picture {number} must be positive, got {picture.exposure}")
     fragments = raster.rasterize(mesh, camera)
     seen = np.asarray(fragments.triangle)
-    counts = _inside(seen >= 0)
+    counts = _inside(seen >= 0) & np.asarray(raster.front(fragments, mesh, camera))
     if picture.mask is not None:
         counts &= np.asarray(picture.mask)
     if picture.saturation is not None:

@@ -87,15 +87,15 @@ def radiance(
         eye: Position of the viewer in world units.
 
     Returns:
-        Linear radiance per vertex in the light's units; zero where the eye is below a vertex's horizon.
+        Linear radiance per vertex in the light's units; that of the grazing view where the eye is below a vertex's
+        horizon.
         Differentiable in the BRDF's parameters, the excess and the eye.
 
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     size = transport.size
     frame = jnp.moveaxis(transport.frame, 0, 2)
-    wo = directions.normalize(jnp.stack([_along(axis, eye - transport.position) for axis in frame], -1)).T
-    facing = wo[2] > 0
+    wo = directions.view(transport.frame, transport.position, eye).T
     # Vertices last, which XLA's CPU code turns into vectors of them.
     value = jax.vmap(jax.vmap(brdf, in_axes=(1, 1), out_axes=1), in_axes=(1, None), out_axes=1)
 
@@ -103,7 +103,7 @@ def radiance(
         texel, excess, visible = argument
         direction = cubemap.direction(size=size).reshape(-1, 3)[texel]
         wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
-        sent = value(wi, wo) * _flux(frame[2], texel, visible, size=size) * facing
+        sent = value(wi, wo) * _flux(frame[2], texel, visible, size=size)
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
     count = max(1, min(_GROUP, len(texel)))

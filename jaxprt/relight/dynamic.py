@@ -20,7 +20,6 @@ from jaxprt.relight.lobe import LobeLight, LobeView
 from jaxprt.scene.environment import Environment
 from jaxprt.staging import apart
 from jaxprt.transport.dynamic import DynamicTransport, RegionTransport
-from jaxprt.transport.lobe import LobeTransport
 
 
 def _floating(value: ArrayLike) -> Array:
@@ -66,14 +65,14 @@ class RegionView(eqx.Module):
         brdf: The BRDF.
         factor: Of each row and term without the diffuse one, if there are others.
         looked: Where rows read the light for their lobes, if there are any.
-        diffuse: Albedo of each row, zero where it looks away; None in a region that does not change.
+        diffuse: Albedo of each row or of all; None in a region that does not change.
         specular: What all but the diffuse part is multiplied by, of each row or of all; likewise.
     """
 
     brdf: Mixed | SeparableBrdf
     factor: Float[Array, "q r c"] | None
     looked: LobeView | None
-    diffuse: Float[Array, "q d"] | None
+    diffuse: Float[Array, "_ d"] | None
     specular: Float[Array, "_ e"] | None
 
 
@@ -173,7 +172,6 @@ def view_side(
         mixed = _mixed(brdf, material.share)
         looked = None if mixed.lobe is None else lobe.look(own.seen, mixed.lobe, eye=eye)
         diffuse, specular = (_by_row(each, own.vertex) for each in (material.diffuse, material.specular))
-        diffuse = _facing(diffuse, own.seen, eye)
         factor = separable.view_tuple(own.terms, mixed.terms, eye) if mixed.terms.terms else None
         region.append(RegionView(mixed, factor, looked, diffuse, specular))
     return DynamicView(eye, tuple(region))
@@ -227,13 +225,6 @@ def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
 def _gathered(rows: tuple[Array, ...], place: Array) -> Array:
     colors = max(each.shape[1] for each in rows)
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[place]
-
-
-@jax.jit
-def _facing(diffuse: Array, seen: LobeTransport, eye: Array) -> Array:
-    """Albedo of the rows that the eye can see; of the others nothing."""
-    above = jnp.sum(seen.frame[:, 2] * (eye - seen.position), 1) > 0
-    return jnp.where(above[:, None], diffuse, 0)
 
 
 def _by_row(value: Array, vertex: Array) -> Array:

@@ -155,10 +155,8 @@ def view_coefficients(
     *parameter: Float[Array, " v"],
     eye: Float[Array, "3"],
 ) -> Float[Array, "lm c v"]:
-    """The BRDF's coefficients for every vertex's view, in its frame: the view side; zero below the horizon."""
-    offset, frame = directions.normalize(eye - position), right_handed(frame)
-    wo = jnp.stack([sum(frame[:, i, j] * offset[:, j] for j in range(3)) for i in range(3)], -1)
-    return brdf.coefficients(wo, *parameter)
+    """The BRDF's coefficients for every vertex's view, in its frame: the view side."""
+    return brdf.coefficients(directions.view(right_handed(frame), position, eye), *parameter)
 
 
 @jax.jit

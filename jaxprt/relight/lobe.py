@@ -124,9 +124,7 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) ->
 @apart
 def _places(position: Array, frame: Array, brdf: LobeBrdf, eye: Array) -> tuple[Lobes, tuple[Array, ...]]:
     """Lobes of each vertex, and face, place on it and spread of each."""
-    offset = [eye[i] - position[:, i] for i in range(3)]
-    local = [sum(frame[:, i, j] * offset[j] for j in range(3)) for i in range(3)]
-    lobe = brdf.lookup(directions.normalize(jnp.stack(local, -1)))
+    lobe = brdf.lookup(directions.view(frame, position, eye))
     world = [sum(lobe.mean[j] * frame[:, j, i] for j in range(3)) for i in range(3)]
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 

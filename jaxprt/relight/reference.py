@@ -85,7 +85,7 @@ def integrate(
         eye: Position of the viewer.
 
     Returns:
-        Linear radiance [*l b c]; zero where the eye is below a vertex's horizon.
+        Linear radiance [*l b c]; that of the grazing view where the eye is below a vertex's horizon.
 
     Reference: Wang, Tran, Luebke 2004, equation 1.
     """
@@ -97,11 +97,11 @@ def integrate(
     def one(argument):
         visible, place, axes = argument
         flux = jnp.maximum(directions.to_local(axes, area)[:, 2], 0) * visible.astype(axes.dtype) / visibility.LEVELS
-        wo = directions.normalize(axes @ (eye - place))
+        wo = directions.view(axes, place, eye)
         value = brdf(directions.to_local(axes, direction), jnp.broadcast_to(wo, direction.shape))
         if jnp.ndim(value) != 2 or value.shape[0] != len(direction):
             raise ValueError(f"the BRDF must return [{len(direction)}, c] here, got {list(jnp.shape(value))}")
-        value = value * (flux * (wo[2] > 0))[:, None]
+        value = value * flux[:, None]
         value = jnp.broadcast_to(value, (value.shape[0], max(value.shape[1], table.shape[-1])))
         return jnp.einsum("...dc,dc->...c", table, value)
 

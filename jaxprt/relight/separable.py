@@ -201,7 +201,7 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
 
 @jax.jit
 def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
-    """The view side: view maps looked up at each vertex's direction to the eye; zero where it looks away.
+    """The view side: view maps looked up at each vertex's direction to the eye.
 
     Args:
         transport: Whose vertices.
@@ -213,8 +213,7 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
-    local = jnp.einsum("vij,vj->vi", transport.frame, eye - transport.position)
-    return brdf.view(directions.normalize(local))
+    return brdf.view(directions.view(transport.frame, transport.position, eye))
 
 
 @partial(jax.jit, static_argnames=("terms",))

@@ -282,7 +282,7 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
     """Coefficients of the lobes of each row, and albedo of their diffuse part."""
     if lobe is None:
         return jnp.zeros(((DEGREE + 1) ** 2, 1, len(position)), position.dtype), jnp.zeros_like(position[:, :1].T)
-    each = lobe.lookup(_view(position, frame, eye))
+    each = lobe.lookup(directions.view(frame, position, eye))
     band = mixture.bands(each.concentration, degree=DEGREE)
     basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=DEGREE), -1, 0)
     # Written out lobe by lobe: a reduction over the middle axis costs XLA's CPU code ten times as much.
@@ -295,12 +295,8 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
 @apart
 def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
     """Coefficients of a factored BRDF at each row."""
-    view = brdf.view(_view(position, frame, eye))
+    view = brdf.view(directions.view(frame, position, eye))
     return jnp.einsum("sk,qke->seq", paths.project(brdf, degree=DEGREE), view)
-
-
-def _view(position: Array, frame: Array, eye: Array) -> Array:
-    return directions.normalize(jnp.einsum("qij,qj->qi", frame, eye - position))
 
 
 def _mean(value: Array, inside: Array) -> Array:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+_GRAZING = 0.01  # least cosine of a view
 _PARALLEL = 32  # Rounding errors: a tangent this close to the normal has no direction of its own.
 
 
@@ -93,6 +94,32 @@ def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> F
     axes = jnp.expand_dims(frame, -1)
     local = [sum(direction[:, j] * axes[..., i, j, :] for j in range(3)) for i in range(3)]
     return jnp.stack(local, -1)
+
+
+@jax.jit
+def view(frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Float[Array, "3"]) -> Float[Array, "*v 3"]:
+    """Local unit directions to the eye, raised to 0.6 degrees above the horizon where they are lower.
+
+    A vertex can look away from the eye while a triangle around it is visible: at every silhouette. Interpolation over
+    the triangle then needs a radiance there, that of the grazing view; black would draw a dark rim.
+
+    Args:
+        frame: Rows are tangent, bitangent, normal.
+        position: Points in world units.
+        eye: Position of the viewer.
+
+    Returns:
+        Unit directions. Where the eye is straight behind a point, the direction lies along its tangent.
+    """
+    offset = [eye[i] - position[..., i] for i in range(3)]
+    local = normalize(jnp.stack([sum(frame[..., i, j] * offset[j] for j in range(3)) for i in range(3)], -1))
+    low = local[..., 2] < _GRAZING
+    square = local[..., 0] ** 2 + local[..., 1] ** 2
+    behind = low & (square < jnp.finfo(local.dtype).eps)
+    scale = jnp.sqrt((1 - _GRAZING**2) / jnp.where(low & ~behind, square, 1))
+    raised = [jnp.where(behind, scale, local[..., 0] * scale), jnp.where(behind, 0, local[..., 1] * scale)]
+    flat = jnp.stack([*raised, jnp.full_like(raised[0], _GRAZING)], -1)
+    return jnp.where(low[..., None], flat, local)
 
 
 _tangent = tangent  # The argument of ``frame`` hides the function.

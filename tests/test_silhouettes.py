@@ -1,0 +1,76 @@
+"""Silhouettes in pictures by every system: vertices look away from the eye where triangles around them are seen."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import jaxprt as prt
+from jaxprt.sphere import directions
+
+ALBEDO = 0.5
+QUADRATURE = 0.01  # Texels of 8 x 8 faces that the horizon cuts, lobes, and 25 harmonics.
+WHITE = prt.scene.Environment(jnp.ones((6, 8, 8, 1)))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    mesh = prt.scene.mesh.make_mesh(ball.vertices, ball.faces, normal=ball.vertices)
+    camera = prt.scene.camera.orbit(mesh, elevation=0.3, width=48, height=48)
+    return mesh, camera, prt.transport.direct.precompute(mesh, size=8, progress=False)
+
+
+def separable(mesh, visible, eye):
+    brdf = prt.brdf.separable.factor(prt.brdf.Lambert(ALBEDO), terms=1, resolution=8)
+    transport = prt.transport.separable.precompute(mesh, brdf, keep=384, size=8, progress=False)
+    return prt.relight.separable.radiance(transport, brdf, WHITE, eye=eye)
+
+
+def harmonic(mesh, visible, eye):
+    table = prt.brdf.harmonic.tabulate(prt.brdf.Lambert(ALBEDO), degree=2, resolution=8)
+    seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
+    matrix = prt.transport.harmonic.transfer(seen, visible.frame, degree=2)
+    transport = prt.transport.harmonic.TransferMatrix(matrix[:, None], visible.position, visible.frame)
+    return prt.relight.harmonic.radiance(transport, table, prt.relight.harmonic.project(WHITE, degree=2), eye=eye)
+
+
+def lobe(mesh, visible, eye):
+    table = prt.brdf.lobe.tabulate(prt.brdf.Lambert(ALBEDO), lobes=1, resolution=4)
+    return prt.relight.lobe.radiance(prt.transport.lobe.compress(visible), table, WHITE, eye=eye)
+
+
+def texels(mesh, visible, eye):
+    texel, white = jnp.arange(384), jnp.ones((384, 1))
+    return prt.relight.direct.radiance(visible, prt.brdf.Lambert(ALBEDO), texel, white, eye=eye)
+
+
+def reference(mesh, visible, eye):
+    seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
+    return prt.relight.reference.integrate(seen, visible.position, visible.frame, prt.brdf.Lambert(ALBEDO), WHITE, eye)
+
+
+@pytest.mark.parametrize("system", [separable, harmonic, lobe, texels, reference])
+def test_a_diffuse_ball_in_white_light_has_no_dark_rim(scene, system):
+    mesh, camera, visible = scene
+    color = system(mesh, visible, camera.eye)
+    picture = np.asarray(prt.image.render(mesh, color, camera))[..., 0]
+    inside = np.asarray(prt.image.rasterize(mesh, camera).triangle) >= 0
+    np.testing.assert_allclose(picture[inside], ALBEDO, rtol=QUADRATURE)
+    assert not picture[~inside].any()
+
+
+def test_the_back_of_a_surface_is_black(scene):
+    mesh, camera, _ = scene
+    back = prt.scene.mesh.make_mesh(mesh.position, mesh.face, normal=-np.asarray(mesh.normal))
+    picture = prt.image.render(back, jnp.ones((len(mesh.position), 1)), camera)
+    assert not np.asarray(picture)[16:32, 16:32].any()
+
+
+def test_views_above_the_horizon_stay_and_those_below_are_raised_in_their_own_azimuth(close):
+    frame = directions.frame(jnp.array([[0.0, 0.6, 0.8]] * 5), jnp.array([[1.0, 0, 0]] * 5))
+    local = np.array([[0.6, 0, 0.8], [0, 1, 0], [0.6, 0, -0.8], [-0.36, 0.48, -0.8], [0, 0, -1]])
+    position = -3 * jnp.einsum("vij,vi->vj", frame, jnp.asarray(local, jnp.float32))
+    flat = np.sqrt(1 - 1e-4)
+    expected = [[0.6, 0, 0.8], [0, flat, 0.01], [flat, 0, 0.01], [-0.6 * flat, 0.8 * flat, 0.01], [flat, 0, 0.01]]
+    close(directions.view(frame, position, jnp.zeros(3)), np.array(expected))
