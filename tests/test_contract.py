@@ -42,6 +42,8 @@ HOST = {
     "report": "measures, and writes files",
     "animation": "the same",
     "files": "reads and writes files",
+    "require": "checks values",
+    "image.raster.front": "gives truth values",
     "transport.visibility": "traces rays",
     "transport.blocks": "runs workers and writes files",
     "transport.separable.precompute": "traces rays",
@@ -509,7 +511,6 @@ EXAMPLES = {
         lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)),
         gradient=("attribute",),
     ),
-    "image.raster.front": example(lambda draw: call(draw.fragments(2, 3), draw.mesh(), draw.camera()), gradient=()),
     "image.raster.render": example(
         lambda draw: call(draw.mesh(), draw.normal(6, 3), draw.camera(), background=draw.uniform(5, 6, 3)),
         gradient=("color",),  # The background is hidden here.

@@ -304,7 +304,7 @@ def test_the_background_is_seen_where_nothing_is():
     image = raster.render(mesh, color, camera, background=background)
     seen = np.asarray(raster.rasterize(mesh, camera).triangle >= 0)
     np.testing.assert_array_equal(image[~seen], background[~seen])
-    np.testing.assert_array_equal(image[seen], raster.render(mesh, color, camera)[seen])
+    np.testing.assert_allclose(image[seen], raster.render(mesh, color, camera)[seen], rtol=1e-6)
 
 
 def test_vmap_over_colors_equals_a_loop():

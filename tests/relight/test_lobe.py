@@ -54,6 +54,11 @@ def light():
     return builtin.daylight(size=SIZE)
 
 
+def facing(visible):
+    """Vertices that the eye sees from above their horizon."""
+    return np.einsum("vi,vi->v", visible.frame[:, 2], EYE - visible.position) > 0
+
+
 def all_texels(visible, brdf, light):
     seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
     return np.asarray(reference.integrate(seen, visible.position, visible.frame, brdf, light, EYE))
@@ -64,7 +69,8 @@ def test_radiance_is_that_of_all_texels(name, visible, transport, tables, light,
     texel, excess, rest = texels.split(light, count=8)
     color = lobe.radiance(transport, tables[name], rest, eye=EYE)
     color = color + texels.radiance(transport, BRDFS[name], texel, excess, eye=EYE)
-    close(color, all_texels(visible, BRDFS[name], light), tolerance=COARSE[name])
+    seen = facing(visible)
+    close(np.asarray(color)[seen], all_texels(visible, BRDFS[name], light)[seen], tolerance=COARSE[name])
 
 
 def test_light_that_grows_towards_the_open_side_counts_more():
@@ -96,9 +102,9 @@ def test_a_furnace_gives_back_its_albedo(tables):
     white = Environment(jnp.ones((6, SIZE, SIZE, 1)))
     color = np.asarray(lobe.radiance(open_above, tables["glossy"], white, eye=EYE))
     expected = all_texels(frames, BRDFS["glossy"], white)
-    facing = expected[:, 0] > 0
-    np.testing.assert_allclose(color[facing], expected[facing], rtol=GRAZING)
-    assert abs(color[facing].sum() / expected[facing].sum() - 1) < FURNACE
+    seen = facing(frames)
+    np.testing.assert_allclose(color[seen], expected[seen], rtol=GRAZING)
+    assert abs(color[seen].sum() / expected[seen].sum() - 1) < FURNACE
 
 
 def test_blurred_light_is_the_mean_over_lobes(light):

@@ -52,9 +52,7 @@ def hemisphere(random, count):
 def test_white_furnace_leaves_a_convex_white_body_invisible():
     mesh = prt.scene.builtin.sphere(rings=8, sectors=12)
     color = reference.radiance(mesh, Lambert(1.0), Environment(jnp.ones((6, SIZE, SIZE, 3))), eye=EYE)
-    facing = np.sum(np.asarray(mesh.normal * (EYE - mesh.position)), 1) > 1e-4
-    np.testing.assert_allclose(color[facing], 1, atol=HORIZON)
-    np.testing.assert_array_equal(color[~facing], 0)
+    np.testing.assert_allclose(color, 1, atol=HORIZON)
 
 
 def test_integration_equals_a_loop_over_texels_in_float64(random, close):
@@ -67,7 +65,10 @@ def test_integration_equals_a_loop_over_texels_in_float64(random, close):
     for vertex in range(4):
         axes = np.asarray(frame[vertex], np.float64)
         wo = axes @ np.asarray(EYE - position[vertex], np.float64)
-        wo = jnp.asarray(wo / np.linalg.norm(wo), jnp.float32)
+        wo = wo / np.linalg.norm(wo)
+        if wo[2] < 0.01:  # seen as grazing
+            wo = np.append(wo[:2] / np.linalg.norm(wo[:2]) * np.sqrt(1 - 1e-4), 0.01)
+        wo = jnp.asarray(wo, jnp.float32)
         for texel in range(len(direction)):
             cosine = max(0, area[texel] @ axes[2]) * float(seen[vertex, texel]) / 16
             if cosine:

@@ -61,9 +61,7 @@ def test_white_furnace_leaves_a_convex_white_body_invisible():
     brdf = factor(Lambert(1.0), terms=1, resolution=12)
     transport = precompute(mesh, brdf, keep=6 * SIZE**2, size=SIZE, progress=False)
     color = relight(transport, brdf, Environment(jnp.ones((6, SIZE, SIZE, 3))))
-    facing = np.sum(np.asarray(mesh.normal * (EYE - mesh.position)), 1) > 1e-4
-    np.testing.assert_allclose(color[facing], 1, atol=HORIZON)
-    np.testing.assert_array_equal(color[~facing], 0)
+    np.testing.assert_allclose(color, 1, atol=HORIZON)
 
 
 def test_radiance_is_linear_in_the_light(transport, factored, close, random):
@@ -127,7 +125,9 @@ def test_light_tuple_times_view_tuple_is_radiance(transport, factored, close, ra
 def test_view_tuples_are_the_view_maps_at_the_direction_to_the_eye(transport, factored, close):
     offset = np.asarray(EYE - transport.position, np.float64)
     local = np.einsum("vij,vj->vi", transport.frame, offset / np.linalg.norm(offset, axis=1, keepdims=True))
-    close(separable.view_tuple(transport, factored, EYE), factored.view(jnp.asarray(local, jnp.float32)))
+    above = local[:, 2] > 0.01
+    expected = factored.view(jnp.asarray(local, jnp.float32))
+    close(separable.view_tuple(transport, factored, EYE)[above], expected[above])
 
 
 def test_projection_keeps_energy_and_transforms_each_face_by_itself(random, close):
