@@ -167,14 +167,14 @@ def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, in
 @jax.jit
 def change_light(transport, visible, brdf, rest, texel, excess, view, eye):
     """Radiance of one object after a change of light: the view tuple is kept."""
-    smooth = transport.ordered(combine(light_tuple(transport, rest), view))
+    smooth = combine(light_tuple(transport, rest), view)
     return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 
 @jax.jit
 def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
     """Radiance of one object after a change of view: the light tuple is kept."""
-    smooth = transport.ordered(combine(lit, view_tuple(transport, factored, eye)))
+    smooth = combine(lit, view_tuple(transport, factored, eye))
     return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 

@@ -323,7 +323,7 @@ def radiance(ready: Ready | LobeReady, light: Environment, *, eye: Float[Array, 
 def _by_terms(ready: Ready, light: Environment, eye: Array) -> Array:
     texel, excess, rest = texels.split(light, count=ready.texels)
     smooth = combine(light_tuple(ready.transport, rest), view_tuple(ready.transport, ready.factored, eye))
-    return ready.transport.ordered(smooth) + texels.radiance(ready.visible, ready.brdf, texel, excess, eye=eye)
+    return smooth + texels.radiance(ready.visible, ready.brdf, texel, excess, eye=eye)
 
 
 def _checked(environments: Sequence[Environment], error: float) -> int:

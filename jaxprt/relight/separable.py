@@ -24,7 +24,7 @@ class Transport(Protocol):
     """What relighting asks of precomputed transport, however it is stored.
 
     Attributes:
-        position: Vertex positions in world units. Clustered transport has vertices in an order of its own.
+        position: Vertex positions in world units, in the mesh's order.
         frame: Rows are tangent, bitangent, normal.
         rms: Root mean square over vertices and terms of each coefficient.
     """
@@ -40,10 +40,6 @@ class Transport(Protocol):
 
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
         """Transport times light coefficients, per vertex, term and color."""
-        ...
-
-    def ordered(self, value: Float[Array, "v *c"]) -> Float[Array, "w *c"]:
-        """What was computed by the transport's rows, in the order of the vertices."""
         ...
 
 
@@ -185,7 +181,7 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
             all costs no more here, since the light is read through a dense table.
 
     Returns:
-        The light-modulated tuple of every vertex.
+        The light-modulated tuple of every vertex, in the mesh's order.
 
     Raises:
         ValueError: The light is a batch, or its cubemap is not six faces of the transport's size.
@@ -209,7 +205,7 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
         eye: Position of the viewer in world units.
 
     Returns:
-        The view-modulated tuple of every vertex.
+        The view-modulated tuple of every vertex, in the mesh's order.
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
@@ -224,12 +220,11 @@ def modulate(
 
     A texture over all of one BRDF is n = 1; a texture on its diffuse part is `jaxprt.brdf.separable.join` of that part
     and the rest, with weight 1 for the rest. Neither transport nor the light tuple depends on the weights, so new ones
-    cost no more than a view change. Linear in the weights, and differentiable in them. Rows are the transport's:
-    with `ClusteredTransport` take the weights of `transport.vertex`.
+    cost no more than a view change. Linear in the weights, and differentiable in them.
 
     Args:
         view: `view_tuple` of the joined BRDF.
-        weight: Of each row of the transport (its vertices), basis BRDF, and color or all colors alike.
+        weight: Of each vertex, in the mesh's order, each basis BRDF, and each color or all colors alike.
         terms: Number of terms of each basis BRDF, in the order of `jaxprt.brdf.separable.join`.
 
     Returns:
@@ -295,4 +290,4 @@ def radiance(
     if brdf.terms != transport.terms:
         raise ValueError(f"the BRDF must have the transport's {transport.terms} terms, got {brdf.terms}")
     lit = light_tuple(transport, light, light_keep=light_keep)
-    return transport.ordered(combine(lit, view_tuple(transport, brdf, eye)))
+    return combine(lit, view_tuple(transport, brdf, eye))

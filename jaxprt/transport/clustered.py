@@ -34,16 +34,16 @@ _SAMPLE = 24  # vertices of a cluster that choose its coefficients
 class ClusteredTransport(eqx.Module):
     """Principal components of the transport of each cluster of vertices.
 
-    Rows are vertices in the order of the clusters, the last of a smaller cluster repeated: `ordered` takes what was
-    computed by row to the order of the vertices.
+    Weights are stored by row: vertices in the order of their clusters, the last vertex of a smaller cluster repeated.
+    Everything else, and what `apply` returns, is in the order of the vertices.
 
     Attributes:
         index: Numbers of the coefficients among the 6 n n that each cluster keeps, the most important first.
         mode: Its l modes of the light on those coefficients, the leading first.
         core: What each mode gives to each of n vectors and each term.
         weight: What each vertex takes of each vector, the leading first.
-        position: Positions of the rows in world units.
-        frame: Their tangents, bitangents and normals.
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
         vertex: Vertex of each row.
         place: Row of each vertex.
         rms: Root mean square over rows and terms of each coefficient as kept.
@@ -53,8 +53,8 @@ class ClusteredTransport(eqx.Module):
     mode: Float16[Array, "p k l"]
     core: Float16[Array, "p l n r"]
     weight: Float[Array, "p m n"]
-    position: Float[Array, "q 3"]
-    frame: Float[Array, "q 3 3"]
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
     vertex: Int[Array, " q"]
     place: Int[Array, " v"]
     rms: Float[Array, " b"]
@@ -89,8 +89,8 @@ class ClusteredTransport(eqx.Module):
         return ClusteredTransport(index, mode, core, weight, self.position, self.frame, self.vertex, self.place, rms)
 
     @jax.jit
-    def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "q r c"]:
-        """Transport times light coefficients, by row: each cluster's modes meet the light once.
+    def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
+        """Transport times light coefficients, per vertex: each cluster's modes meet the light once.
 
         Args:
             coefficient: Coefficients of the light.
@@ -100,24 +100,26 @@ class ClusteredTransport(eqx.Module):
         """
         return linear(_relit, _transposed, self, coefficient)
 
-    def ordered(self, value: Float[Array, "q *c"]) -> Float[Array, "v *c"]:
-        """What was computed by row, in the order of the vertices."""
-        return value[self.place]
-
 
 def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
+    """Writes each cluster's rows where its vertices are: a gather after the loop would double what is written."""
     _, modes, vectors, terms = transport.core.shape
     light = coefficient[transport.index.astype(jnp.int32)]
     dtype = light.dtype
+    count, rows = len(transport.place), len(transport.vertex)
+    # Rows that no vertex is read from are written past the end, which is dropped.
+    at = jnp.where(_read(transport), transport.vertex, count + jnp.arange(rows)).reshape(len(light), -1)
 
-    def one(argument):
-        mode, core, weight, light = argument
+    def one(result, argument):
+        mode, core, weight, light, at = argument
         met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
         vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
-        return weight.astype(dtype) @ vector.reshape(vectors, -1)
+        found = weight.astype(dtype) @ vector.reshape(vectors, -1)
+        return result.at[at].set(found, mode="drop", unique_indices=True), None
 
-    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, light))
-    return found.reshape(len(transport.position), terms, -1)
+    start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
+    clusters = (transport.mode, transport.core, transport.weight, light, at)
+    return jax.lax.scan(one, start, clusters)[0].reshape(count, terms, -1)
 
 
 def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
@@ -126,15 +128,22 @@ def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
     dtype = cotangent.dtype
 
     def one(argument):
-        mode, core, weight, cotangent = argument
-        vector = (weight.astype(dtype).T @ cotangent.reshape(len(weight), -1)).reshape(vectors, terms, -1)
+        mode, core, weight, at, read = argument
+        vector = (weight.astype(dtype).T @ jnp.where(read, cotangent[at], 0)).reshape(vectors, terms, -1)
         met = core.reshape(modes, vectors * terms).astype(dtype) @ vector.reshape(vectors * terms, -1)
         return mode.astype(dtype) @ met
 
-    rows = cotangent.reshape(clusters, -1, *cotangent.shape[1:])
-    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, rows))
+    at = transport.vertex.reshape(clusters, -1)
+    read = _read(transport).reshape(*at.shape, 1)
+    cotangent = cotangent.reshape(len(cotangent), -1)
+    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, at, read))
     start = jnp.zeros((len(transport.rms), found.shape[2]), dtype)
     return start.at[transport.index.astype(jnp.int32)].add(found)
+
+
+def _read(transport: ClusteredTransport) -> Array:
+    """Rows that a vertex is read from: one of those that stand for the same vertex."""
+    return transport.place[transport.vertex] == jnp.arange(len(transport.vertex))
 
 
 def precompute(
@@ -211,8 +220,8 @@ def precompute(
         mode,
         core,
         weight,
-        direct.position[row],
-        direct.frame[row],
+        direct.position,
+        direct.frame,
         jnp.asarray(row, jnp.int32),
         jnp.asarray(place),
         rms,

@@ -30,17 +30,17 @@ _FEWEST = 32  # vertices
 
 
 class RegionTransport(eqx.Module):
-    """Transport of one region, by rows: vertices in the order of their clusters, some repeated.
+    """Transport of the vertices of one region, in the mesh's order.
 
     Attributes:
         terms: Of the light factors; the last term is constant, for the diffuse part, where BRDFs change.
-        seen: What each row sees: bits of all texels, and pyramids where the BRDFs have lobes.
-        vertex: Vertex of the mesh of each row.
+        seen: What each vertex sees: bits of all texels, and pyramids where the BRDFs have lobes.
+        vertex: Number of each vertex in the mesh.
     """
 
     terms: ClusteredTransport
     seen: LobeTransport
-    vertex: Int[Array, " q"]
+    vertex: Int[Array, " w"]
 
     @property
     def nbytes(self) -> int:
@@ -53,7 +53,7 @@ class DynamicTransport(eqx.Module):
 
     Attributes:
         region: Transport of each region, in the order of their numbers.
-        place: Of each vertex of the mesh, its row among those of all regions one after another.
+        place: Of each vertex of the mesh, its number among the vertices of all regions one after another.
     """
 
     region: tuple[RegionTransport, ...]
@@ -118,7 +118,7 @@ def precompute(
                 f"jaxprt.brdf.separable.factor, got {type(brdf).__name__}"
             )
     pyramids.scales(size)
-    regions, rows, first = [], np.zeros(len(mesh.position), np.int32), 0
+    regions = []
     for number, brdf in zip(numbers.tolist(), brdfs, strict=True):
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)
         folder = None if path is None else pathlib.Path(path) / f"region_{number}"
@@ -135,10 +135,9 @@ def precompute(
         )
         at = folder and folder / "clusters.prt"
         each = compress(visible, brdf, vectors, modes, keep, path=at, executor=executor, progress=progress)
-        rows[vertex] = first + np.asarray(each.terms.place)
-        first += len(each.vertex)
-        regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex[np.asarray(each.vertex)], jnp.int32)))
-    return DynamicTransport(tuple(regions), jnp.asarray(rows))
+        regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex, jnp.int32)))
+    place = np.argsort(np.concatenate([each.vertex for each in regions]))
+    return DynamicTransport(tuple(regions), jnp.asarray(place, jnp.int32))
 
 
 def compress(
@@ -173,12 +172,11 @@ def compress(
         progress=progress,
     )
     seen = pyramids.compress(visible)
-    row = terms.vertex
     # The diffuse part is a term: no transfer vectors. Without lobes nothing reads means.
     lobes = isinstance(brdf, DynamicBrdf) and brdf.lobe is not None
-    level = seen.level[row] if lobes else seen.level[:, : 6 * seen.size**2 // 8][row]
-    seen = LobeTransport(level, seen.vector[:0, row], terms.position, terms.frame, seen.size)
-    return RegionTransport(terms, seen, row)
+    level = seen.level if lobes else seen.level[:, : 6 * seen.size**2 // 8]
+    seen = LobeTransport(level, seen.vector[:0], seen.position, seen.frame, seen.size)
+    return RegionTransport(terms, seen, jnp.arange(count))
 
 
 def light_factors(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:

@@ -66,10 +66,6 @@ class QuantizedTransport(eqx.Module):
         total, _ = jax.lax.scan(step, jnp.zeros((vertices * terms, colors), dtype), rows)
         return total.reshape(vertices, terms, -1) * self.quantum
 
-    def ordered(self, value: Float[Array, "v *c"]) -> Float[Array, "v *c"]:
-        """The same: rows are in the order of the vertices."""
-        return value
-
     @property
     def terms(self) -> int:
         """Number of BRDF terms r."""

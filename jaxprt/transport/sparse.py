@@ -94,10 +94,6 @@ class SparseTransport(eqx.Module):
             return _gather(self, coefficient)
         return linear(_gather, _scatter, self, coefficient)
 
-    def ordered(self, value: Float[Array, "v *c"]) -> Float[Array, "v *c"]:
-        """The same: rows are in the order of the vertices."""
-        return value
-
     @property
     def terms(self) -> int:
         """Number of BRDF terms r."""

@@ -202,7 +202,7 @@ def test_rms_is_that_of_the_dense_rows(whole, small, close):
 
 def test_apply_is_the_dense_product_and_linear(small, random, close):
     light, other = (jnp.asarray(random.normal(size=(ALL, 3)), jnp.float32) for _ in range(2))
-    expected = np.einsum("qdr,dc->qrc", dense(small), np.asarray(light, np.float64))
+    expected = np.einsum("vdr,dc->vrc", by_vertex(small), np.asarray(light, np.float64))
     close(small.apply(light), expected)
     close(small.apply(2 * light - other), 2 * small.apply(light) - small.apply(other))
     close(small.apply(light[:, :1])[..., 0], expected[..., 0])
@@ -215,14 +215,14 @@ def test_derivatives_by_the_light_are_the_transposed_matrix(small, random, close
     value, pull = jax.vjp(small.apply, light)
     back = random.normal(size=value.shape)
     (found,) = pull(jnp.asarray(back, jnp.float32))
-    close(found, np.einsum("qdr,qrc->dc", dense(small), back))
+    close(found, np.einsum("vdr,vrc->dc", by_vertex(small), back))
 
 
 def test_in_float64_only_what_is_stored_is_rounded(small, random, close, x64):
     light = random.normal(size=(ALL, 3))
     value = small.apply(jnp.asarray(light))
     assert value.dtype == np.float64
-    close(value, np.einsum("qdr,dc->qrc", dense(small), light))
+    close(value, np.einsum("vdr,dc->vrc", by_vertex(small), light))
 
 
 def test_slopes_of_radiance_by_the_light_are_radiance_itself(small, brdf, random, close):
@@ -252,13 +252,24 @@ def test_slopes_by_stored_numbers_are_finite(small, brdf):
     assert np.asarray(slope.weight).any()
 
 
-def test_rows_are_vertices_by_cluster_and_are_put_back_in_order(whole, mesh):
+def test_rows_are_vertices_by_cluster_and_everything_that_is_given_is_in_the_order_of_the_mesh(whole, seen):
     assert sorted(set(np.asarray(whole.vertex).tolist())) == list(range(VERTICES))
-    np.testing.assert_array_equal(whole.ordered(whole.vertex.astype(float)), np.arange(VERTICES))
-    np.testing.assert_array_equal(whole.ordered(whole.position), mesh.position)
-    np.testing.assert_array_equal(whole.ordered(whole.frame)[:, 2], whole.frame[whole.place, 2])
+    np.testing.assert_array_equal(whole.vertex[whole.place], np.arange(VERTICES))
     assert not np.array_equal(whole.vertex[:VERTICES], np.arange(VERTICES))
+    same((whole.position, whole.frame), (seen.position, seen.frame))
     assert isinstance(whole, separable.Transport)
+
+
+def test_tuples_and_weights_of_a_texture_are_in_the_order_of_the_mesh(whole, seen, brdf, random, close):
+    """As README shows them: one side changes, the other is kept."""
+    light = builtin.daylight(size=SIZE)
+    level = jnp.asarray(seen.seen(np.arange(VERTICES)))
+    expected = reference.integrate(level, seen.position, seen.frame, brdf, light, EYE)
+    lit, view = separable.light_tuple(whole, light), separable.view_tuple(whole, brdf, EYE)
+    close(separable.combine(lit, view), expected, tolerance=HALF)
+    texture = random.uniform(size=(VERTICES, 1, 3)).astype(np.float32)
+    painted = separable.modulate(view, jnp.asarray(texture), terms=(TERMS,))
+    close(separable.combine(lit, painted), expected * texture[:, 0], tolerance=HALF)
 
 
 def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, random, close):
