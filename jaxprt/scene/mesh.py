@@ -47,7 +47,8 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     placed by their nodes and joined. Materials and images are neither needed nor read, save for glTF's names; texture
     coordinates are, and are 0 where only some geometries of the file have them or they are not finite. All
     faces of an OBJ's material or group must have them; a glTF's geometry needs a material, and its transforms of
-    textures are not applied.
+    textures are not applied. Where an OBJ's faces name texture coordinates that the file does not have, its material
+    is loaded without them, with a warning.
 
     Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
     by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither

@@ -108,10 +108,15 @@ def _obj_text(path: pathlib.Path) -> str:
         )
     wrong = [line for line, *_, low, high in faces if low < 1 or high > count["vt"]]
     if wrong:
-        raise ValueError(
-            f"{path}: faces must name texture coordinates 1 to {count['vt']} or none, got {len(wrong)} of "
-            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
+        warnings.warn(
+            f"{path}: faces should name texture coordinates 1 to {count['vt']} or none, got {len(wrong)} of "
+            f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}: their materials "
+            "are loaded without texture coordinates",
+            stacklevel=5,
         )
+    for number in wrong:
+        corners = [corner.split("/") for corner in absolute[number].partition("#")[0].split()[1:]]
+        absolute[number] = "f " + " ".join("//".join([each[0], *each[2:]]) for each in corners)
     return "\n".join(absolute)
 
 

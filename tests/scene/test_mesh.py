@@ -113,10 +113,20 @@ def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_shares(tmp_path, suf
 
 
 @pytest.mark.parametrize("index", ["9", "-9", "0", "x"])
-def test_faces_that_name_missing_texture_coordinates_are_refused(tmp_path, index):
-    lines = f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/{index} 3/3\n"
-    with pytest.raises(ValueError, match=r"must name texture coordinates 1 to 3 or none, got 1 of 1 .* in line 7"):
-        load_mesh(write(tmp_path, "missing.obj", lines))
+def test_faces_that_name_missing_texture_coordinates_are_loaded_without_them_and_a_warning_says_so(tmp_path, index):
+    lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 -1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl sound\nf 1/1/1 2/2/1 3/3/1\n"
+    damaged = f"usemtl damaged\nf 1/1/1 2/{index}/1 3/3/1\n"
+    with pytest.warns(UserWarning, match=r"missing.obj: faces should name .* 1 to 3 or none, got 1 of 2 .* in line 11"):
+        mesh = load_mesh(write(tmp_path, "missing.obj", lines + damaged))
+    place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(mesh.position, np.concatenate([place, place]))
+    np.testing.assert_array_equal(mesh.face, [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(mesh.normal, np.tile([0, 0, -1], (6, 1)))
+    np.testing.assert_array_equal(mesh.texture, [[0, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 0]])
+    with pytest.warns(UserWarning, match="1 to 0 or none, got 1 of 1 .* in line 4"):
+        mesh = load_mesh(write(tmp_path, "none.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3  # a comment\n"))
+    assert mesh.texture is None
+    np.testing.assert_array_equal(mesh.position, place)
 
 
 def test_a_texture_of_one_coordinate_has_another_of_zero(tmp_path):
