@@ -8,7 +8,9 @@ color = prt.plan.radiance(ready, light, eye=eye)
 import math
 import os
 import pathlib
+import statistics
 import time
+import timeit
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import NamedTuple
@@ -20,6 +22,7 @@ import numpy as np
 import tqdm
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf import lobe as lobes
 from jaxprt.brdf import separable as brdfs
 from jaxprt.brdf.lobe import LobeBrdf
@@ -81,6 +84,8 @@ class Plan(eqx.Module):
         seconds: Of a light change on this machine.
         nbytes: Of transport and visibility.
         precompute_seconds: On this machine.
+        vertices: Number of vertices of the mesh that it was made for.
+        size: Edge of the cubemap faces of the lights that it was made with, in texels.
     """
 
     clusters: int
@@ -94,6 +99,8 @@ class Plan(eqx.Module):
     seconds: float
     nbytes: int
     precompute_seconds: float
+    vertices: int
+    size: int
 
 
 class LobePlan(eqx.Module):
@@ -106,6 +113,8 @@ class LobePlan(eqx.Module):
         seconds: Of a change of light or view on this machine.
         nbytes: Of visibility.
         precompute_seconds: On this machine, the fit of the lobes included.
+        vertices: Number of vertices of the mesh that it was made for.
+        size: Edge of the cubemap faces of the lights that it was made with, in texels.
     """
 
     lobes: int
@@ -114,6 +123,8 @@ class LobePlan(eqx.Module):
     seconds: float
     nbytes: int
     precompute_seconds: float
+    vertices: int
+    size: int
 
 
 class Ready(eqx.Module):
@@ -178,13 +189,14 @@ def separable(
         The plan.
 
     Raises:
-        ValueError: No lights, lights of different sizes, an error that is not positive, or one that no step reaches.
+        ValueError: No lights, lights of different sizes, NaN or infinity in them, in the error or from the BRDF, an
+            error that is not positive, or one that no step reaches.
     """
     size = _checked(environments, error)
     clusters = max(1, round(len(mesh.position) / _MEMBERS))
     member = clustered.cluster(mesh.position, mesh.normal, clusters=clusters)
     chosen = member[np.random.default_rng(0).permutation(clusters)[:_SAMPLE]]
-    share = clusters / len(chosen)
+    share, member = clusters / len(chosen), np.arange(chosen.size).reshape(chosen.shape)
     start = time.perf_counter()
     visible = direct.precompute(mesh, size=size, occluder=occluder, vertex=chosen.ravel(), progress=False)
     rays = time.perf_counter() - start
@@ -197,7 +209,7 @@ def separable(
             middle = (low + high) // 2
             sizes = _fitted(_LADDER[middle], chosen.shape[1], size)
             start = time.perf_counter()
-            ready = _sample(visible, brdf, chosen, sizes)
+            ready = _ready(visible, brdf, sizes, member=member, progress=False)
             seconds = share * (rays + time.perf_counter() - start)
             wrong = max(_error(ready, light, judged, views, at) for light, at in zip(environments, exact, strict=True))
             bar.update()
@@ -206,8 +218,7 @@ def separable(
                 continue
             nbytes = int((ready.transport.nbytes + visible.nbytes) * share)
             once = share * _seconds(lambda ready=ready: radiance(ready, environments[0], eye=jnp.asarray(views[0])))
-            cost = {"error": wrong, "seconds": once, "nbytes": nbytes, "precompute_seconds": seconds}
-            high, plan = middle, Plan(clusters=clusters, **sizes._asdict(), **cost)
+            high, plan = middle, Plan(clusters, *sizes, wrong, once, nbytes, seconds, len(mesh.position), size)
     if plan is None:
         raise ValueError(f"error must be at least {wrong * MARGIN:.3g}, which the largest sizes reach; got {error}")
     return plan
@@ -253,7 +264,8 @@ def lobe(
             light = _seconds(lambda: blurred.prefilter(environments[0]))
             once = _seconds(lambda ready=ready: radiance(ready, environments[0], eye=jnp.asarray(views[0])))
             once = light + share * max(once - light, 0)
-            return LobePlan(count, ready.texels, wrong, once, int(share * transport.nbytes), seconds)
+            cost = wrong, once, int(share * transport.nbytes), seconds
+            return LobePlan(count, ready.texels, *cost, len(mesh.position), size)
     raise ValueError(f"error must be at least {reached * MARGIN:.3g}, which the most lobes reach; got {error}")
 
 
@@ -262,7 +274,7 @@ def precompute(
     brdf: Callable,
     plan: Plan | LobePlan,
     *,
-    size: int = 64,
+    size: int | None = None,
     occluder: Mesh | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -274,7 +286,7 @@ def precompute(
         mesh: The vertices to light, as in the plan.
         brdf: Their BRDF, as in the plan.
         plan: The plan.
-        size: Edge of the light's cubemap faces in texels, as in the plan.
+        size: Edge of the light's cubemap faces in texels; the plan's if None, and no other.
         occluder: What casts shadows; the mesh itself if None.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None.
@@ -284,21 +296,23 @@ def precompute(
         What `radiance` needs.
 
     Raises:
-        ValueError: As in `jaxprt.transport.direct.precompute` and `jaxprt.transport.clustered.precompute`.
+        ValueError: Another number of vertices or size than the plan's, or as in `precompute` of the transports.
     """
+    if len(mesh.position) != plan.vertices:
+        raise ValueError(f"the mesh must have the plan's {plan.vertices} vertices, got {len(mesh.position)}")
+    if size not in (None, plan.size):
+        raise ValueError(f"size must be the plan's {plan.size}, got {size}")
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     run = {"executor": executor, "progress": progress}
     if isinstance(plan, LobePlan):
-        transport = pyramids.precompute(mesh, size=size, occluder=occluder, path=folder and folder / "lobes.prt", **run)
+        at = folder and folder / "lobes.prt"
+        transport = pyramids.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
         return LobeReady(transport, brdf, lobes.tabulate(brdf, lobes=plan.lobes), plan.texels)
     at = folder and folder / "visibility.prt"
-    visible = direct.precompute(mesh, size=size, occluder=occluder, path=at, **run)
-    factored = brdfs.factor(brdf, terms=plan.terms, resolution=plan.resolution)
-    sizes = {name: getattr(plan, name) for name in ("clusters", "vectors", "modes", "keep")}
-    transport = clustered.precompute(visible, factored, **sizes, path=folder and folder / "clusters.prt", **run)
-    return Ready(visible, brdf, factored, transport, plan.texels)
+    visible = direct.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
+    return _ready(visible, brdf, plan, clusters=plan.clusters, path=folder and folder / "clusters.prt", **run)
 
 
 def radiance(ready: Ready | LobeReady, light: Environment, *, eye: Float[Array, "3"]) -> Float[Array, "v c"]:
@@ -333,8 +347,10 @@ def _checked(environments: Sequence[Environment], error: float) -> int:
     shapes = sorted({str(list(light.radiance.shape)) for light in environments})
     if len(shapes) != 1 or environments[0].radiance.ndim != 4:
         raise ValueError(f"environments must be of one size [6, n, n, c], got {', '.join(shapes)}")
-    if not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
+    for number, light in enumerate(environments):
+        require.finite(f"the radiance of environment {number}", light.radiance)
+    if not 0 < error < math.inf:
+        raise ValueError(f"error must be positive and finite, got {error}")
     return environments[0].radiance.shape[1]
 
 
@@ -351,7 +367,9 @@ def _exact(visible: DirectTransport, judged: np.ndarray, brdf, environments, vie
     batch = Environment(jnp.stack([light.radiance for light in environments]))
     seen, position, frame = jnp.asarray(visible.seen(judged)), visible.position[judged], visible.frame[judged]
     each = [reference.integrate(seen, position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
-    return np.stack(each, 1)
+    exact = np.stack(each, 1)
+    require.finite("what the BRDF makes of the lights, by light, view, vertex and color,", exact)
+    return exact
 
 
 def _fitted(step: _Sizes, members: int, size: int) -> _Sizes:
@@ -361,32 +379,22 @@ def _fitted(step: _Sizes, members: int, size: int) -> _Sizes:
     return _Sizes(terms, resolution, vectors, min(modes, keep, vectors * terms), keep, min(count, 6 * size * size - 1))
 
 
-def _sample(visible: DirectTransport, brdf, chosen: np.ndarray, sizes: _Sizes) -> Ready:
-    """Transport of the sampled clusters only."""
-    terms, resolution, vectors, modes, keep, count = sizes
-    factored = brdfs.factor(brdf, terms=terms, resolution=resolution)
-    member = np.arange(chosen.size).reshape(chosen.shape)
-    transport = clustered.precompute(
-        visible, factored, member=member, vectors=vectors, modes=modes, keep=keep, progress=False
-    )
-    return Ready(visible, brdf, factored, transport, count)
+def _ready(visible: DirectTransport, brdf: Callable, sizes: Plan | _Sizes, **options) -> Ready:
+    """Transport in these sizes; the options are those of `clustered.precompute`."""
+    factored = brdfs.factor(brdf, terms=sizes.terms, resolution=sizes.resolution)
+    limits = {name: getattr(sizes, name) for name in ("vectors", "modes", "keep")}
+    transport = clustered.precompute(visible, factored, **limits, **options)
+    return Ready(visible, brdf, factored, transport, sizes.texels)
 
 
-def _error(
-    ready: Ready | LobeReady, light: Environment, judged: np.ndarray, views: np.ndarray, exact: np.ndarray
-) -> float:
+def _error(ready, light: Environment, judged: np.ndarray, views: np.ndarray, exact: np.ndarray) -> float:
     """Relative L2 error of some vertices over all views."""
     now = np.stack([np.asarray(radiance(ready, light, eye=jnp.asarray(eye)))[judged] for eye in views])
     whole = float(np.linalg.norm(exact))
-    return float(np.linalg.norm(now - exact)) / whole if whole > 0 else 0.0
+    return float(np.nan_to_num(np.linalg.norm(now - exact), nan=np.inf)) / (whole if whole > 0 else 1.0)
 
 
 def _seconds(function: Callable) -> float:
     """Median of five calls, compiled before."""
     jax.block_until_ready(function())
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+    return statistics.median(timeit.repeat(lambda: jax.block_until_ready(function()), number=1, repeat=5))

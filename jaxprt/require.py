@@ -30,3 +30,19 @@ def finite(name: str, value: Any) -> None:
     raise ValueError(
         f"{name} must be finite, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
     )
+
+
+def between(name: str, value: int | None, low: int, high: int) -> None:
+    """Refuses a number outside a range.
+
+    Args:
+        name: What the number is, for the message: "terms".
+        value: The number; None passes.
+        low: The least that is allowed.
+        high: The most that is allowed.
+
+    Raises:
+        ValueError: The number is outside the range.
+    """
+    if value is not None and not low <= value <= high:
+        raise ValueError(f"{name} must be between {low} and {high}, got {value}")

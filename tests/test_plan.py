@@ -74,11 +74,45 @@ def test_an_error_that_no_number_of_lobes_reaches_is_refused(mesh, sky, monkeypa
     [
         ([], 0.1, "environments must be at least one, got none"),
         ([4, 8], 0.1, "must be of one size"),
-        ([8], 0.0, "error must be positive, got 0"),
-        ([8], np.nan, "error must be positive, got nan"),
+        ([8], 0.0, "error must be positive and finite, got 0"),
+        ([8], np.nan, "error must be positive and finite, got nan"),
+        ([8], np.inf, "error must be positive and finite, got inf"),
     ],
 )
 def test_impossible_plans_are_refused(mesh, make, lights, error, message):
     lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
     with pytest.raises(ValueError, match=message):
         make(mesh, BRDF, lights, error=error, progress=False)
+
+
+@pytest.mark.parametrize("make", [plan.separable, plan.lobe])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(mesh, make, value):
+    sky = np.ones((6, 8, 8, 3), np.float32)
+    damaged = sky.copy()
+    damaged[2, 3, 4, 1] = value
+    lights = [Environment(jnp.asarray(each)) for each in (sky, damaged)]
+    with pytest.raises(ValueError, match=r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)"):
+        make(mesh, BRDF, lights, error=ASKED, progress=False)
+
+
+def test_a_brdf_that_is_not_finite_has_no_plan(mesh, sky):
+    """It had one of error 0."""
+    broken = AshikhminShirley(diffuse=np.nan)
+    with pytest.raises(ValueError, match=r"what the BRDF makes of the lights, .* must be finite, got"):
+        plan.separable(mesh, broken, [sky], error=ASKED, progress=False)
+
+
+@pytest.mark.parametrize(
+    "planned",
+    [
+        plan.Plan(1, 2, 8, 1, 1, 1, 1, ASKED, 0.0, 0, 0.0, 110, 32),
+        plan.LobePlan(2, 1, ASKED, 0.0, 0, 0.0, 110, 32),
+    ],
+    ids=["separable", "lobe"],
+)
+def test_a_plan_is_for_its_own_size_of_light_and_its_own_mesh(mesh, planned):
+    with pytest.raises(ValueError, match="size must be the plan's 32, got 64"):
+        plan.precompute(mesh, BRDF, planned, size=64, progress=False)
+    with pytest.raises(ValueError, match="the mesh must have the plan's 110 vertices, got 9"):
+        plan.precompute(builtin.plane(cells=2), BRDF, planned, progress=False)

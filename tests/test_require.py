@@ -28,3 +28,11 @@ def test_traced_values_pass_and_stay_as_they_are():
         return 2 * x
 
     assert jnp.isnan(jax.jit(through)(jnp.asarray(jnp.nan)))
+
+
+def test_numbers_outside_a_range_are_refused_and_none_passes():
+    for value in (1, 4, None):
+        require.between("terms", value, 1, 4)
+    for value in (-1, 0, 5):
+        with pytest.raises(ValueError, match=f"terms must be between 1 and 4, got {value}"):
+            require.between("terms", value, 1, 4)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
+from jaxprt import require
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.files.arrays import Layout
 from jaxprt.linalg import clustering, eigen
@@ -81,8 +82,7 @@ class ClusteredTransport(eqx.Module):
         most = (self.index.shape[1], *self.core.shape[1:])
         asked = {"count": count, "modes": modes, "vectors": vectors, "terms": terms}
         for (name, value), limit in zip(asked.items(), most, strict=True):
-            if value is not None and not 1 <= value <= limit:
-                raise ValueError(f"{name} must be between 1 and {limit}, got {value}")
+            require.between(name, value, 1, limit)
         index, mode = self.index[:, :count], self.mode[:, :count, :modes]
         core, weight = self.core[:, :modes, :vectors, :terms], self.weight[:, :, :vectors]
         rms = _rms(index, mode, core, weight, size=self.rms.shape[0])

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, UInt
 
+from jaxprt import require
 from jaxprt.transport import sparse
 from jaxprt.transport.sparse import SparseTransport
 
@@ -34,8 +35,8 @@ class QuantizedTransport(eqx.Module):
 
     def keep(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
         """The first `count` coefficients, largest before rounding, of the first `terms` terms (all of them if None)."""
-        if not 1 <= count <= self.index.shape[0]:
-            raise ValueError(f"count must be between 1 and {self.index.shape[0]}, got {count}")
+        require.between("count", count, 1, self.index.shape[0])
+        require.between("terms", terms, 1, self.terms)
         index, level, quantum = self.index[:count, :, :terms], self.level[:count, :, :terms], self.quantum[:, :terms]
         kept = QuantizedTransport(index, level, quantum, self.position, self.frame, self.rms)
         rms = sparse.rms(index, dequantize(kept).value, self.rms.shape[0])

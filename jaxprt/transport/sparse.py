@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt
 
+from jaxprt import require
 from jaxprt.staging import linear
 
 _CHUNKS = 4  # of each number on average: longer ones are padded more, shorter ones leave more sums to scatter
@@ -48,8 +49,8 @@ class SparseTransport(eqx.Module):
 
     def keep(self, count: int, *, terms: int | None = None) -> "SparseTransport":
         """The `count` largest coefficients of the first `terms` terms (all of them if None)."""
-        if not 1 <= count <= self.index.shape[0]:
-            raise ValueError(f"count must be between 1 and {self.index.shape[0]}, got {count}")
+        require.between("count", count, 1, self.index.shape[0])
+        require.between("terms", terms, 1, self.terms)
         index, value = self.index[:count, :, :terms], self.value[:count, :, :terms]
         return SparseTransport(index, value, self.position, self.frame, rms(index, value, self.rms.shape[0]))
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxprt.transport import SparseTransport, sparse
+from jaxprt.transport.quantized import quantize
 
 
 @pytest.fixture
@@ -101,6 +102,15 @@ def test_kept_prefixes_are_what_the_smaller_number_would_have_kept(random):
 def test_keeping_more_than_there_are_is_refused(random, count):
     with pytest.raises(ValueError, match=f"count must be between 1 and 20, got {count}"):
         make(random.normal(size=(2, 24, 1, 1)), 20).keep(count)
+
+
+@pytest.mark.parametrize("terms", [-1, 0, 5])
+def test_keeping_an_impossible_number_of_terms_is_refused(random, terms):
+    """Four terms in color; whole numbers keep them alike."""
+    transport = make(random.normal(size=(2, 24, 4, 3)), 20)
+    for each in (transport, quantize(transport)):
+        with pytest.raises(ValueError, match=f"terms must be between 1 and 4, got {terms}"):
+            each.keep(6, terms=terms)
 
 
 @pytest.mark.parametrize("colors", [1, 3])
