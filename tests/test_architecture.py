@@ -37,6 +37,8 @@ SIDEWAYS = {
     ("inverse", "fit", "numbers"),
     ("inverse", "fit", "pictures"),
     ("inverse", "fit", "solve"),
+    ("inverse", "pictures", "numbers"),
+    ("inverse", "solve", "numbers"),
     ("linalg", "tucker", "eigen"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),

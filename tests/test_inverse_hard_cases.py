@@ -1,6 +1,7 @@
 """What pictures do not tell, tell wrongly, or tell of nothing at all."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -322,11 +323,115 @@ def test_broken_pixels_are_refused_where_they_count(mesh, view, image, value):
             r"mask of picture 0 must be \[h, w\]",
         ),
         (lambda i, v: [Picture(i, v, exposure=np.ones(3))], TypeError, "exposure must be one number, got an array"),
+        (
+            lambda i, v: [Picture(i, v, saturation=np.nan)],
+            ValueError,
+            "saturation of picture 0 must be a positive number",
+        ),
+        (lambda i, v: [Picture(i, "view")], TypeError, "camera of picture 0 must be a Camera, got str"),
+        (lambda i, v: [Picture(i, v, mask=np.full((EDGE, EDGE), "x"))], TypeError, "a mask must be of booleans, or"),
+        (
+            lambda i, v: [Picture(i, v, mask=np.full((EDGE, EDGE), 128, np.uint8))],
+            ValueError,
+            "numbers 0 and 1 or 0 and 255, got 1024 others of 1024, the first is 128: compare with a threshold",
+        ),
+        (lambda i, v: [Picture(i, v, mask=np.full((EDGE, EDGE), np.nan))], ValueError, "got 1024 others of 1024"),
     ],
 )
 def test_pictures_that_cannot_be_used_are_refused(mesh, view, image, pictures, error, message):
     with pytest.raises(error, match=message):
         inverse.observe(mesh, pictures(image, view))
+
+
+def test_masks_of_image_files_count_where_they_are_white(mesh, view, image):
+    mask = np.zeros((EDGE, EDGE), bool)
+    mask[:, EDGE // 2 :] = True
+    value = inverse.observe(mesh, [Picture(image, view, mask=mask)]).value
+    for each in (mask.astype(np.uint8), 255 * mask.astype(np.uint8), mask.astype(np.float32)):
+        np.testing.assert_array_equal(inverse.observe(mesh, [Picture(image, view, mask=each)]).value, value)
+
+
+@pytest.fixture(scope="module")
+def shaded(mesh, view):
+    """Radiance of two weights that are .8 and .1, and a picture of it with noise."""
+    up, side = mesh.normal[:, 1:2], mesh.normal @ jnp.array([0.6, 0.6, 0.5])
+    basis = [jnp.tile(each, (1, 3)) for each in (0.6 + 0.4 * up, jnp.maximum(side, 0)[:, None] ** 4)]
+
+    def radiance(weight, eye):
+        return weight["a"] * basis[0] + weight["b"] * basis[1]
+
+    image = render(mesh, radiance({"a": 0.8, "b": 0.1}, view.eye), view)
+    return radiance, inverse.observe(mesh, [Picture(noisy(np.asarray(image), 0.02), view)])
+
+
+START = {"a": 0.3, "b": 0.5}
+
+
+@pytest.mark.parametrize("fit", [inverse.light, inverse.material])
+def test_numbers_at_their_bounds_have_no_deviation_and_others_have(shaded, fit):
+    radiance, pixels = shaded
+    for low, high, at in ((0.0, 0.7, "a"), (0.2, 1.0, "b")):
+        found = fit(radiance, START, pixels, lower=low, upper=high)
+        other = "b" if at == "a" else "a"
+        assert float(found.value[at]) == pytest.approx(high if at == "a" else low, abs=1e-4)
+        assert np.isinf(found.deviation[at])
+        assert 0 < float(found.deviation[other]) < 0.02
+
+
+@pytest.mark.parametrize("fit", [inverse.light, inverse.material])
+def test_bounds_that_do_not_bind_change_nothing(shaded, fit):
+    """Descent stopped on the far side of the minimum, where momentum had taken it."""
+    radiance, pixels = shaded
+    free = fit(radiance, START, pixels)
+    for bound in ({"lower": 0.0}, {"lower": {"a": None, "b": -1.0}}, {"lower": None, "upper": {"a": 2.0, "b": None}}):
+        found = fit(radiance, START, pixels, **bound)
+        for name in START:
+            assert float(found.value[name]) == pytest.approx(float(free.value[name]), abs=2e-3)
+            assert np.isfinite(found.deviation[name])
+        assert np.all(np.diff(found.residual) < 1e-6)
+
+
+def test_fits_inside_transformations_are_refused_by_name(shaded):
+    radiance, pixels = shaded
+    for fit in (inverse.light, inverse.material):
+        for inside in (
+            lambda a, fit=fit: fit(radiance, {"a": a, "b": 0.5}, pixels).residual[-1],
+            lambda a, fit=fit: fit(lambda w, eye: a * radiance(w, eye), START, pixels).residual[-1],
+        ):
+            for transform in (jax.jit, jax.grad):
+                with pytest.raises(TypeError, match=r"outside of jax.jit, jax.vmap and jax.grad, got traced"):
+                    transform(inside)(0.5)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"steps": 2.5}, TypeError, "steps must be a whole number, got 2.5"),
+        ({"steps": None}, TypeError, "steps must be a whole number, got None"),
+        ({"steps": 0}, ValueError, "steps must be at least 1, got 0"),
+        ({"error": None}, ValueError, "the error must be a positive number, got None"),
+        ({"prior": 0.1}, TypeError, "the prior must be a function, got float"),
+        ({"prior": lambda x: x["a"] * jnp.ones(2)}, ValueError, r"the prior must be one number .* got .*shape=\(2,\)"),
+        ({"prior": lambda x: None}, ValueError, "the prior must be one number of floating point, got None"),
+        ({"prior": inverse.smoothness}, ValueError, r"of texels, \[6, n, n, c\], got dict: of an Environment"),
+        ({"lower": {"a": 0.0}}, ValueError, "one number, or made like the start"),
+        ({"lower": {"a": "red", "b": 0.0}}, ValueError, r"a bound must be a number, None, or .* \[\], got <U3"),
+        ({"lower": [0.0, 0.0]}, ValueError, "one number, or made like the start"),
+        ({"upper": {"a": np.ones(3), "b": 1.0}}, ValueError, r"like what it bounds, \[\], got float64\[3\]"),
+        ({"pixels": [1.0]}, TypeError, "pixels must be from jaxprt.inverse.observe, got list"),
+        ({"radiance": None}, TypeError, "the radiance must be a function, got NoneType"),
+    ],
+)
+def test_lights_that_cannot_be_fitted_are_refused(shaded, options, error, message):
+    given = {"radiance": shaded[0], "start": START, "pixels": shaded[1], **options}
+    with pytest.raises(error, match=message):
+        inverse.light(**given)
+    if "prior" not in options and "error" not in options:
+        with pytest.raises(error, match=message):
+            inverse.material(**given)
+    with pytest.raises(TypeError, match="the start must be a light and a material, a pair, got dict"):
+        inverse.jointly(*shaded[:1], START, shaded[1])
 
 
 @pytest.mark.parametrize(
@@ -336,10 +441,10 @@ def test_pictures_that_cannot_be_used_are_refused(mesh, view, image, pictures, e
         ({"a": 0.5}, {"lower": 0.5, "upper": 0.5}, ValueError, "lower bounds must be less"),
         ({"a": 0.5}, {"lower": {"b": 0.1}}, ValueError, "one number, or made like the start"),
         ({"a": 0.5, "b": "red"}, {}, TypeError, "arrays and numbers, in a pytree, got a str"),
-        ({"a": np.nan}, {}, ValueError, "finite numbers"),
+        ({"a": np.nan}, {}, ValueError, "the start, its numbers in a row, must be finite, got 1 of 1"),
         ({"a": np.ones(600)}, {}, ValueError, "at most 512 numbers can be fitted so, got 600"),
         ({"a": 0.5}, {"steps": 0}, ValueError, "steps must be at least 1, got 0"),
-        ({}, {}, ValueError, "at least one, got 0"),
+        ({}, {}, ValueError, "at least one, got none"),
     ],
 )
 def test_materials_that_cannot_be_fitted_are_refused(mesh, view, image, start, options, error, message):

@@ -5,39 +5,63 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from jaxprt import require
+
 _INSIDE = 0.01  # of a range: how far from a bound a start is moved
+_AT = 1e-4  # of a range: how close to a bound a number is at it
 _LOG = 100.0  # ratio of bounds above which a number is fitted in its logarithm
 
 
 def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
     """The start's numbers in a row, and how they are put back."""
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
+        raise TypeError(f"steps must be a whole number, got {steps!r}")
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
+    outside(start)
     for each in jax.tree.leaves(start):
         if not isinstance(each, jax.Array | np.ndarray | np.generic | float | int) or isinstance(each, bool):
             raise TypeError(f"the start must be arrays and numbers, in a pytree, got a {type(each).__name__}")
     start = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), start)
     first, unravel = ravel_pytree(start)
-    if not first.size or not np.isfinite(first).all():
-        raise ValueError(f"the start must be finite numbers, at least one, got {first.size}")
+    if not first.size:
+        raise ValueError("the start must be finite numbers, at least one, got none")
+    require.finite("the start, its numbers in a row,", first)
     return first, unravel
 
 
+def outside(*values: PyTree) -> None:
+    """Refuses to fit inside `jax.jit` and other transformations, where values are not known."""
+    traced = any(isinstance(each, Tracer) for each in jax.tree.leaves(values))
+    if traced or isinstance(jnp.zeros(()) + 0, Tracer):
+        raise TypeError(
+            "fits need values that are known, so call them outside of jax.jit, jax.vmap and jax.grad, got traced arrays"
+        )
+
+
 def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
-    """A bound of each number, from one for all, a pytree like the start, or None."""
-    if bound is None:
-        bound = none
-    whole = jax.tree.structure(start)
-    if jax.tree.structure(bound) == whole or not jax.tree_util.all_leaves([bound]):
-        if jax.tree.structure(bound) != whole:
-            raise ValueError(f"bounds must be one number, or made like the start, {whole}")
-        rows = zip(jax.tree.leaves(bound), jax.tree.leaves(start), strict=True)
-        parts = [np.broadcast_to(np.asarray(b, float), np.shape(x)).ravel() for b, x in rows]
-        return np.concatenate(parts)
-    return np.full(sum(np.size(x) for x in jax.tree.leaves(start)), float(bound))
+    """A bound of each number, from one for all, a pytree like the start, or None, also in places of it."""
+    outside(bound)
+    (bounds, made), (values, whole) = (jax.tree.flatten(each, is_leaf=lambda x: x is None) for each in (bound, start))
+    if made != whole:
+        if not jax.tree_util.treedef_is_leaf(made):
+            raise ValueError(f"bounds must be one number, or made like the start, {whole}, got {made}")
+        bounds = bounds * len(values)
+    parts = []
+    for each, value in zip(bounds, values, strict=True):
+        shape = np.shape(value) if value is not None else (0,)
+        number = np.asarray(none if each is None else each)
+        if number.dtype.kind not in "iuf" or (number.shape != shape and number.ndim):
+            raise ValueError(
+                f"a bound must be a number, None, or an array like what it bounds, {list(shape)}, got "
+                f"{number.dtype}{list(number.shape)}"
+            )
+        parts.append(np.broadcast_to(number.astype(float), shape).ravel())
+    return np.concatenate(parts)
 
 
 def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
@@ -56,8 +80,8 @@ def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
         )
 
 
-def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Callable]:
-    """Numbers without bounds that stand for those with, and the way back.
+def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Callable, Callable]:
+    """Numbers without bounds that stand for those with, the way back, and which of them are at a bound.
 
     Between two bounds x is a sine, beyond one a hyperbola, which a long step cannot leave for good, as it can logits.
 
@@ -80,4 +104,9 @@ def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Calla
         beyond = edge + sign * size * (jnp.sqrt(u**2 + 1) - 1)
         return jnp.where(both, between, jnp.where(one, beyond, u * size)).astype(first.dtype)
 
-    return jnp.asarray(free, first.dtype), bounded
+    def pinned(u: Array) -> np.ndarray:
+        u = np.asarray(u, float)
+        away = np.where(both, (1 - np.abs(np.sin(u))) / 2, np.sqrt(u**2 + 1) - 1)
+        return (both | one) & (away < _AT)
+
+    return jnp.asarray(free, first.dtype), bounded, pinned

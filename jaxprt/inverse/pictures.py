@@ -6,9 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt.image import raster
+from jaxprt.inverse import numbers
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap
@@ -17,7 +19,20 @@ _BENT = 0.25  # between corners' normals: about 14 degrees
 
 
 def _mask(value) -> Array | None:
-    return None if value is None else jnp.asarray(value, bool)
+    """Booleans, or numbers as image files have them: 0, and one other value that is 1 or 255."""
+    if value is None or isinstance(value, Tracer):
+        return value
+    known = np.asarray(value)
+    if known.dtype.kind not in "biuf":
+        raise TypeError(f"a mask must be of booleans, or of numbers 0 and 1 or 0 and 255, got {known.dtype}")
+    most = 255 if (known == 255).any() else 1
+    wrong = known[(known != 0) & (known != most)] if known.dtype.kind != "b" else known[:0]
+    if wrong.size:
+        raise ValueError(
+            f"a mask must be of booleans, or of numbers 0 and 1 or 0 and 255, got {wrong.size} others of {known.size}, "
+            f"the first is {wrong.flat[0]}: compare with a threshold, mask > 127"
+        )
+    return jnp.asarray(known != 0)
 
 
 def _exposure(value) -> float:
@@ -32,7 +47,7 @@ class Picture(eqx.Module):
     Attributes:
         image: Its pixels, linear: radiance times the exposure.
         camera: From where, with the image's size.
-        mask: Pixels that count; all if None.
+        mask: Pixels that count: booleans, or 0 where a pixel does not count and 1 or 255 where it does. All if None.
         exposure: What radiance was multiplied by.
         saturation: Value at which pixels are clipped, in any color; those do not count. None if none are.
     """
@@ -69,15 +84,17 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     what lies between them. Of a picture that has more of such pixels than others the less bent half counts.
 
     Raises:
-        TypeError: What is no `Picture`.
+        TypeError: What is no `Mesh`, `Picture` or `Camera`; or a call inside `jax.jit`, `jax.vmap` or `jax.grad`.
         ValueError: No pictures; an image that is not of floating point, gray or in three colors; an image or mask of
             another size than the camera's; images that differ in colors;
-            pixels that count and are negative or not finite; exposures that are not positive; pictures that are black;
-            or no pixel that counts.
+            pixels that count and are negative or not finite; exposures or saturations that are not positive numbers;
+            pictures that are black; or no pixel that counts.
     """
-    if isinstance(pictures, Picture):
-        raise TypeError("pictures must be a sequence of them, got one Picture")
-    pictures = list(pictures)
+    if isinstance(pictures, Picture) or not isinstance(pictures, Sequence):
+        raise TypeError(f"pictures must be a sequence of them, got one {type(pictures).__name__}")
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"the mesh must be a Mesh, got {type(mesh).__name__}")
+    numbers.outside(mesh, list(pictures))
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
     parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]
@@ -98,6 +115,8 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
     if not isinstance(picture, Picture):
         raise TypeError(f"picture {number} must be a Picture, got {type(picture).__name__}")
     image, camera = np.asarray(picture.image), picture.camera
+    if not isinstance(camera, Camera):
+        raise TypeError(f"the camera of picture {number} must be a Camera, got {type(camera).__name__}")
     size = (camera.height, camera.width)
     if image.ndim != 3 or image.shape[2] not in (1, 3) or not np.issubdtype(image.dtype, np.floating):
         raise ValueError(
@@ -114,6 +133,8 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
             )
     if not (np.isfinite(picture.exposure) and picture.exposure > 0):
         raise ValueError(f"the exposure of picture {number} must be positive, got {picture.exposure}")
+    if picture.saturation is not None and not (np.ndim(picture.saturation) == 0 and picture.saturation > 0):
+        raise ValueError(f"the saturation of picture {number} must be a positive number, got {picture.saturation}")
     fragments = raster.rasterize(mesh, camera)
     seen = np.asarray(fragments.triangle)
     counts = _inside(seen >= 0) & np.asarray(raster.front(fragments, mesh, camera))
@@ -167,6 +188,9 @@ def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Ar
 
 def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:
     """Mean square of differences between neighboring texels, across the edges of faces too: a prior of light."""
+    if np.ndim(radiance) != 4 or np.shape(radiance)[0] != 6:
+        got = list(radiance.shape) if hasattr(radiance, "shape") else type(radiance).__name__
+        raise ValueError(f"the radiance must be that of texels, [6, n, n, c], got {got}: of an Environment `.radiance`")
     wide = cubemap.pad(radiance)
     down, right = wide[:, 1:, 1:-1] - wide[:, :-1, 1:-1], wide[:, 1:-1, 1:] - wide[:, 1:-1, :-1]
     return jnp.mean(down**2) + jnp.mean(right**2)

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.inverse import numbers
+
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
     import jaxopt
@@ -39,8 +41,10 @@ class Fit(NamedTuple):
         value: The light or material, as the start is made; where pictures do not tell, the start's.
         residual: Difference from the pictures relative to them, in L2: at the start and after each step.
         deviation: Standard deviation of each number, as far as parts of the pictures disagree about it; infinite for
-            what the pictures do not tell. What all parts have in common, as a material that no number can be, is not in
-            it. Of many numbers (over 512) a lower bound, since others may make up for each.
+            what the pictures do not tell, and for numbers at their bounds: the pictures may want them farther out, and
+            do not tell how far. Those of the others hold while these stay. What all parts have in common, as a material
+            that no number can be, is not in it. Of many numbers (over 512) a lower bound, since others may make up for
+            each.
         told: Orthonormal combinations of the numbers that the pictures tell, in a row as `ravel_pytree` has them; of a
             material those of its free numbers. None of many numbers.
     """
@@ -105,6 +109,7 @@ def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
 
 
 def _finite(*arrays: Array) -> None:
+    numbers.outside(arrays)
     if not all(np.isfinite(each).all() for each in arrays):
         raise ValueError(
             "the radiance at the start (or prior), and its derivatives, must be finite, got NaN or infinities"
@@ -144,7 +149,14 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
 
 
 def marquardt(
-    function: Callable, free: Array, bounded: Callable, unravel: Callable, steps: int, *, held: int = 0
+    function: Callable,
+    free: Array,
+    bounded: Callable,
+    pinned: Callable,
+    unravel: Callable,
+    steps: int,
+    *,
+    held: int = 0,
 ) -> Fit:
     """By steps of Levenberg and Marquardt in free numbers, which others follow from; the last residuals are held."""
     # Not compiled as a whole, jaxopt asks for the same place two or three times: what was made last is kept.
@@ -180,6 +192,7 @@ def marquardt(
         if still == _PATIENT or refused == _REFUSED or history[-1] < _EXACT:
             break
     rows, left = np.asarray(state.jac, np.float64).T, np.asarray(state.residual, np.float64)
+    rows = np.where(pinned(free)[:, None], 0, rows)
     axis, value = _told(rows)
     deviation = _deviation(axis, _scores(axis, value, rows, left))
     told = axis if not held else _told(rows[:, :-held])[0]
@@ -190,7 +203,12 @@ def marquardt(
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
-    """By first derivatives, each number in units of what it changes."""
+    """By first derivatives, each number in units of what it changes.
+
+    Momentum is dropped where the objective rises.
+
+    Reference: O'Donoghue and Candes 2015, "Adaptive restart for accelerated gradient schemes".
+    """
 
     def pull(x, back):
         return jax.vjp(function, x)[1](back)[0]
@@ -198,6 +216,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
     count = len(jax.eval_shape(function, first))
     probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), first.dtype)
     square = jax.jit(lambda x: jnp.mean(jax.lax.map(lambda each: pull(x, each) ** 2, probe), 0))(first)
+    numbers.outside(square)
     whole = float(jnp.max(square))
     size = 1 / jnp.sqrt(square + _LEAST * (whole if whole > 0 else 1.0))
 
@@ -230,13 +249,16 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         if not np.isfinite(moved).all():
             _finite(*([] if step else [moved]))  # The prior's derivatives: the others are checked.
             break
-        y = moved
-        norm, now = map(float, far(y))
-        history.append(norm)
+        norm, now = map(float, far(moved))
         still = still + 1 if last - now <= _SETTLED * abs(last) else 0
-        last = now
+        if bounded and now > last:  # Momentum went too far: it starts anew from the place before.
+            state = solver.init_state(y, limit)
+            norm, now, moved = history[-1], last, y
+        y, last = moved, now
+        history.append(norm)
         if still == _PATIENT:
             break
     noise = history[-1] ** 2 / max(1, count)
-    deviation = jnp.where(square > _KNOWN**2 * whole, jnp.sqrt(noise / jnp.where(square > 0, square, 1)), jnp.inf)
+    known = (square > _KNOWN**2 * whole) & (limit[0] < y) & (y < limit[1])
+    deviation = jnp.where(known, jnp.sqrt(noise / jnp.where(square > 0, square, 1)), jnp.inf)
     return Fit(unravel(size * y), np.array(history), unravel(deviation), None)
