@@ -26,10 +26,13 @@ from jaxprt.sphere import harmonics, hemisphere
 
 _RINGS, _SECTORS = 32, 64  # of a quadrature of what is bilinear on a map times a few harmonics
 _SMOOTH = 5  # degree of harmonics of what is sent; with 4 more is lost of light from the horizon, with 6 of all
+_FUNCTIONS = 4  # that stand for a set if it has as many BRDFs
 _NOTHING = 1e-3  # of the largest singular value: a color that is a multiple of another
 
 
-def factor(brdfs: Sequence[Callable], *, functions: int = 4, terms: int = 32, resolution: int = 32) -> DynamicBrdf:
+def factor(
+    brdfs: Sequence[Callable], *, functions: int | None = None, terms: int = 32, resolution: int = 32
+) -> DynamicBrdf:
     """A set of BRDFs for light paths, decomposed whole: principal components of the set, and factors of the light.
 
     Least squares of what the BRDFs reflect of light of natural spectrum into directions, smoothed over these to degree
@@ -37,7 +40,7 @@ def factor(brdfs: Sequence[Callable], *, functions: int = 4, terms: int = 32, re
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
-        functions: How many stand for the set.
+        functions: How many stand for the set. If None, four, or as many as the set has BRDFs times colors.
         terms: Light factors that they share. Precomputed bounces cost in proportion.
         resolution: Edge of the square maps in texels.
 
@@ -53,6 +56,7 @@ def factor(brdfs: Sequence[Callable], *, functions: int = 4, terms: int = 32, re
     found = dynamic.reflect(brdfs, None, resolution=resolution)
     count, _, views, harmonic = found.tensor.shape
     kinds = (_SMOOTH + 1) ** 2
+    functions = min(_FUNCTIONS, count * colors) if functions is None else functions
     dynamic.check_ranks((functions, 1, terms), (count * colors, kinds, harmonic))
     flat = found.tensor.reshape(count * colors, views, harmonic)
     seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]

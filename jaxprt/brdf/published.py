@@ -156,7 +156,8 @@ def mirror_lobes(
     A lobe of k degrees is a Gaussian of which three standard deviations cover k degrees, and 0 degrees the perfect
     mirror, for which a lobe of an eighth of a degree stands. EM finds their weights for each view and color, against a
     uniform density above the horizon that stands for what remains; that is not in the table. The samples are those of
-    `lobe.tabulate`, dense around the mirror direction.
+    `lobe.tabulate`, dense around the mirror direction, and above the horizon alone: EM compares the parts of the lobes
+    that are there. The weights in the table are those of whole lobes, as for all tables.
 
     Args:
         brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr.
@@ -173,20 +174,23 @@ def mirror_lobes(
     """
     if not angles or min(angles) < 0:
         raise ValueError(f"angles must be at least one, none below 0, got {angles}")
-    wo, (sample, mass, _, _) = lobe.sampled(brdf, resolution=resolution)
+    wo, (sample, mass, _, extent) = lobe.sampled(brdf, resolution=resolution)
     nodes, mean = wo.shape[:-1], lobe_em.mirror(wo.reshape(-1, 3))
     width = np.radians(np.asarray(angles, np.float64)) / 3
     concentration = jnp.asarray(1 / np.maximum(width**2, 1 / lobe_em.FINEST), mean.dtype)
 
     def one(argument):
-        sample, mass, mean = argument
+        sample, mass, extent, mean = argument
         every = jnp.broadcast_to(mean, (len(angles), 3))
         rest = jnp.full((len(sample), 1), -np.log(2 * np.pi), sample.dtype)
-        density = jnp.concatenate([mixture.log_density(sample, every, concentration), rest], 1)
+        density = mixture.log_density(sample, every, concentration)
+        above = 4 * np.pi * extent @ jnp.exp(density)  # Part of each lobe; half at least, as means are not below.
+        density = jnp.concatenate([density - jnp.log(above), rest], 1)
         start = jnp.ones(len(angles) + 1, sample.dtype)
-        return jax.vmap(lambda m: mixture.weigh(density, m, start, steps=200)[0], in_axes=1)(mass)[:, :-1]
+        found = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=200)[0], in_axes=1)(mass)
+        return found[:, :-1] / above
 
-    weight = jnp.moveaxis(jax.lax.map(one, (sample, mass, mean)), 0, -1)
+    weight = jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, mean)), 0, -1)
     table = jnp.broadcast_to(mean.T[:, None], (3, len(angles), len(mean))).reshape(3, -1, *nodes)
     scale = jnp.broadcast_to(jnp.log(concentration)[:, None], (len(angles), len(mean))).reshape(-1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)

@@ -78,7 +78,7 @@ def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
     if texel.shape[-1] == 1:  # Gradients by the place would take ten times as long with a trailing axis of 1.
         return _looked_up(texel[..., 0], coordinates, polar=polar)[..., None]
     *batch, axes = coordinates.shape
-    if math.prod(batch) <= _BLOCK:
+    if math.prod(batch) <= _BLOCK or not texel.size:  # Blocks of nothing have no number.
         return lookup(texel, coordinates)
     each = jax.checkpoint(lambda place: lookup(texel, place))
     return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])

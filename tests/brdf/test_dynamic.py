@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, dynamic, lobe, published
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, dynamic, lobe, published, separable
 from jaxprt.sphere import hemisphere
 
 ROUGH = [0.25, 0.4, 0.6]
@@ -162,6 +162,13 @@ def test_published_lobes_leave_what_a_tensor_can_carry():
     with_lobes = dynamic.factor(SET, lobes, ranks=(3, 16, 16), resolution=RESOLUTION)
     without = dynamic.factor(SET, None, ranks=(3, 16, 16), resolution=RESOLUTION)
     assert with_lobes.error < without.error
+
+
+def test_lobes_alone_take_more_directions_than_a_block_has(lobes, pairs, monkeypatch):
+    member = dynamic.factor(SET, lobes).at(jnp.array([0.2, 0.3, 0.5]))
+    whole = member(*pairs)
+    monkeypatch.setattr(separable, "_BLOCK", 8)  # Of 2,048 directions otherwise.
+    np.testing.assert_allclose(member(*pairs[:, :37]), whole[:37], rtol=1e-5, atol=1e-7)
 
 
 def test_shares_of_either_sign_are_finite(lobes, pairs):

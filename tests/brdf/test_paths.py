@@ -66,6 +66,14 @@ def test_what_a_set_does_not_have_is_refused(options, reason):
         paths.factor(MEMBERS, **{"functions": 2, "terms": 4, "resolution": 8, **options})
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_sets_of_fewer_than_four_brdfs_have_as_many_functions(count):
+    table = paths.factor(MEMBERS[:count], resolution=8)
+    assert table.factor.shape == (count, 1, count)
+    assert paths.basis(table).view_map.shape[-1] == count + 1
+    assert table.error < 0.01
+
+
 def test_functions_of_a_set_make_its_brdfs():
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
     table = paths.factor(members, functions=2, terms=8, resolution=12)
