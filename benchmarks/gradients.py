@@ -273,7 +273,7 @@ def _bounces(vertices: int, factor: jax.Array) -> TransferTensor:
     )
     row, wrong = jnp.arange(vertices), jnp.zeros(clusters)
     twice = SecondBounce(jnp.asarray(again), second, wrong)
-    known = (row, jnp.zeros_like(row), jnp.arange(functions), (factor,), twice, wrong, jnp.ones(2))
+    known = (row, jnp.zeros_like(row), jnp.ones(vertices), jnp.arange(functions), (factor,), twice, wrong, jnp.ones(2))
     return TransferTensor(jnp.asarray(weight), first, jnp.asarray(mode), *known)
 
 

@@ -23,12 +23,35 @@ def finite(name: str, value: Any) -> None:
     if isinstance(value, Tracer):
         return
     known = np.asarray(value)
-    if known.dtype.kind != "f" or np.isfinite(known).all():
+    if known.dtype.kind == "f":
+        _require(name, "finite", known, np.asarray(np.isfinite(known)))
+
+
+def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None:
+    """Refuses NaN, infinity and values below a bound.
+
+    Args:
+        name: What the value is, for the message: "the albedo".
+        value: A number or an array.
+        least: The bound.
+        slack: By how much rounding may miss it.
+
+    Raises:
+        ValueError: Some values are not finite, or below the bound; says how many, and where the first one is.
+    """
+    finite(name, value)
+    if not isinstance(value, Tracer):
+        known = np.asarray(value)
+        _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
+
+
+def _require(name: str, what: str, known: np.ndarray, right: np.ndarray) -> None:
+    if right.all():
         return
-    wrong = np.argwhere(~np.isfinite(known))
+    wrong = np.argwhere(~right)
     where = f", first at {tuple(map(int, wrong[0]))}" if known.ndim else ""
     raise ValueError(
-        f"{name} must be finite, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
+        f"{name} must be {what}, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
     )
 
 

@@ -75,6 +75,7 @@ HOST = {
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
     "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
+    "require": "checks values",
     "brdf.measured.require": "checks values",
     "brdf.measured.load_merl": "reads a file",
     "brdf.measured.load_npf": "reads a file",
@@ -107,6 +108,7 @@ HOST = {
     "brdf.published.factor_tensor": "checks values",
     "transport.dynamic.precompute": "traces rays",
     "transport.dynamic.compress": "runs workers and writes files",
+    "relight.dynamic.check_material": "checks values",
     "relight.dynamic.light_side": "gives indices; relight.dynamic.radiance has them all",
     "relight.dynamic.view_side": "the same",
     "relight.dynamic.combine": "takes indices; the same",
@@ -266,6 +268,11 @@ class Draw:
         terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
         return transport.DynamicTransport((transport.dynamic.RegionTransport(terms, small, row),), row)
 
+    def material(self, vertices=3):
+        """What ``regions`` is made of; the color of its lobes is a texture."""
+        share = self.uniform(2)
+        return relight.dynamic.Material(share / share.sum(), self.uniform(3), self.uniform(vertices, 3))
+
     def transfer(self, vertices):
         """Bounces of ``changing``, with what is stored in half precision in the one under test."""
         row, both = jnp.arange(vertices), transport.transfer.SecondBounce
@@ -276,6 +283,7 @@ class Draw:
             self.normal(1, 24, 3),
             row,
             0 * row,
+            self.uniform(vertices),
             jnp.arange(3),
             (self.normal(2, 1, 2),),
             second,
@@ -590,7 +598,7 @@ EXAMPLES = {
         lambda draw: call(
             each := draw.regions(),
             (draw.changing(),),
-            (relight.dynamic.Material(draw.uniform(2), draw.uniform(3), draw.uniform(3, 3)),),
+            (draw.material(),),
             draw.light(8),
             eye=draw.above(each.region[0].terms),
         ),
@@ -604,7 +612,7 @@ EXAMPLES = {
             each := draw.regions(),
             draw.transfer(len(each.place)),
             (draw.changing(),),
-            (relight.dynamic.Material(draw.uniform(2), draw.uniform(3), draw.uniform(3, 3)),),
+            (draw.material(),),
             draw.light(8),
             eye=draw.above(each.region[0].terms),
         ),
@@ -738,6 +746,29 @@ def test_every_example_and_every_exception_is_of_something_public():
     assert not EXAMPLES.keys() - set(PURE)
     modules = {name.rsplit(".", count)[0] for name in PUBLIC for count in (1, 2)}
     assert not HOST.keys() - modules - PUBLIC.keys()
+
+
+def _entering(name: str) -> set[str]:
+    """Lights, eyes and weights among the arguments of an example."""
+    given = inspect.signature(PUBLIC[name]).bind_partial(*(arrays := build(name)).position, **arrays.name).arguments
+    return {key for key in given if key in ("eye", "weight", "excess") or isinstance(given[key], scene.Environment)}
+
+
+# The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked when made.
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        for name in PURE
+        if name.startswith("relight.") and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
+    ],
+)
+def test_lights_eyes_and_weights_that_are_not_finite_are_refused_by_name(name):
+    given = dict(inspect.signature(PUBLIC[name]).bind_partial(*(a := build(name)).position, **a.name).arguments)
+    for key in _entering(name):
+        broken = jax.tree.map(lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan), given[key])
+        with pytest.raises(ValueError, match=f"the {key}s? must be finite, got 1 of"):
+            PUBLIC[name](**given | {key: broken}, **EXAMPLES[name].options)
 
 
 @pytest.mark.parametrize("name", PUBLIC)

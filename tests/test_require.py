@@ -22,9 +22,21 @@ def test_the_message_counts_and_names_the_first_value_that_is_not_finite():
         require.finite("the weight", float("nan"))
 
 
+def test_values_below_a_bound_are_refused_by_name():
+    require.at_least("the albedo", [0, 0.5], 0.0)
+    require.at_least("the share", -1e-7, 0.0, slack=1e-6)
+    with pytest.raises(
+        ValueError, match=r"the albedo must be at least 0, got 1 of 2 values that are not, first at \(1,\): -1"
+    ):
+        require.at_least("the albedo", jnp.array([0, -1]), 0.0)
+    with pytest.raises(ValueError, match="the albedo must be finite, got 1 of 1 values that are not: nan"):
+        require.at_least("the albedo", np.nan, 0.0)
+
+
 def test_traced_values_pass_and_stay_as_they_are():
     def through(x):
         require.finite("x", x)
+        require.at_least("x", x, 0.0)
         return 2 * x
 
     assert jnp.isnan(jax.jit(through)(jnp.asarray(jnp.nan)))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxprt import require
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
 
@@ -68,7 +69,6 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
     return texel, excess, Environment(rest)
 
 
-@jax.jit
 def radiance(
     transport: Visibility,
     brdf: Callable,
@@ -91,8 +91,19 @@ def radiance(
         horizon.
         Differentiable in the BRDF's parameters, the excess and the eye.
 
+    Raises:
+        ValueError: The excess or the eye is not finite. Inside `jax.jit` that is not known, and NaN reaches the
+            vertices.
+
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
+    require.finite("the excess", excess)
+    require.finite("the eye", eye)
+    return _radiance(transport, brdf, texel, excess, eye)
+
+
+@jax.jit
+def _radiance(transport: Visibility, brdf: Callable, texel: Array, excess: Array, eye: Array) -> Array:
     size = transport.size
     frame = jnp.moveaxis(transport.frame, 0, 2)
     wo = directions.view(transport.frame, transport.position, eye).T

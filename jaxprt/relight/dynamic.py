@@ -11,8 +11,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from jaxprt import require
 from jaxprt.brdf.dynamic import DynamicBrdf, Mixed
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.relight import direct, lobe, separable
@@ -21,6 +24,8 @@ from jaxprt.scene.environment import Environment
 from jaxprt.staging import apart
 from jaxprt.transport.dynamic import DynamicTransport, RegionTransport
 
+_ROUNDED = 1e-4  # By which a sum of shares is off where they are in single precision.
+
 
 def _floating(value: ArrayLike) -> Array:
     return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
@@ -28,6 +33,10 @@ def _floating(value: ArrayLike) -> Array:
 
 class Material(eqx.Module):
     """What a region is made of at present. Numbers, lists and NumPy arrays become arrays.
+
+    Relighting refuses shares that are negative or do not sum to one, negative weights, and values that are not finite.
+    Inside `jax.jit`, `jax.grad` and the like values are not known, and a material is used as it is: radiance is linear
+    in shares and weights, and a NaN in one region reaches all vertices to which that region sends light.
 
     Attributes:
         share: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
@@ -114,8 +123,9 @@ def radiance(
     Raises:
         TypeError: The light is no Environment, or a material no Material.
         ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
-            be, shares of another number of BRDFs, weights of two or more than three colors, an eye that is not one
-            position, or a light of another size.
+            be, shares of another number of BRDFs, weights of two or more than three colors, values that `Material`
+            refuses, an eye that is not one position, a light of another size, or an eye or a light that is not finite.
+            Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
 
     Reference: Sun et al. 2007, equation 3 with direct lighting, and section 4.1.
     """
@@ -133,6 +143,7 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
         raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
     if light.radiance.shape[:-1] != (6, size, size):
         raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
+    require.finite("the light", light.radiance)
     texel, excess, rest = direct.split(light, count=texels)
     met = tuple(each.terms.apply(separable.project(rest)) for each in transport.region)
     blurred = None
@@ -157,6 +168,7 @@ def view_side(
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
     if eye.shape != (3,):
         raise ValueError(f"the eye must be one position, [3], got an array of shape {list(eye.shape)}")
+    require.finite("the eye", eye)
     count = len(transport.region)
     if len(brdfs) != count or len(materials) != count:
         raise ValueError(
@@ -243,13 +255,33 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
         raise ValueError(f"the BRDF of region {number} must be the one that its transport was made for")
     if changes != (material is not None):
         raise ValueError(f"region {number} {'needs a material' if changes else 'has one BRDF for good: give None'}")
-    if material is None:
-        return
+    if material is not None:
+        check_material(number, material, brdf.size, vertices)
+
+
+def check_material(number: int, material: Material, brdfs: int, vertices: int) -> None:
+    """Refuses a material that does not fit its region, or has values that no material has.
+
+    Args:
+        number: Of the region, for the message.
+        material: What the region is made of. Inside `jax.jit` only its shapes are checked.
+        brdfs: How many the region's set has.
+        vertices: Of the mesh.
+
+    Raises:
+        TypeError: It is no Material.
+        ValueError: As `Material` and `radiance` have it.
+    """
     if not isinstance(material, Material):
         raise TypeError(f"the material of region {number} must be a Material, got {type(material).__name__}")
-    if material.share.shape != (brdf.size,):
+    if material.share.shape != (brdfs,):
         shape = list(material.share.shape)
-        raise ValueError(f"the shares of region {number} must be one for each of its {brdf.size} BRDFs, got {shape}")
+        raise ValueError(f"the shares of region {number} must be one for each of its {brdfs} BRDFs, got {shape}")
+    require.at_least(f"the shares of region {number}", material.share, 0.0, slack=_ROUNDED)
+    if not isinstance(material.share, Tracer):
+        total = float(np.sum(np.asarray(material.share, np.float64)))
+        if abs(total - 1) > _ROUNDED:
+            raise ValueError(f"the shares of region {number} must sum to 1, got {material.share}, whose sum is {total}")
     for name in ("diffuse", "specular"):
         shape = getattr(material, name).shape
         if len(shape) > 2 or (len(shape) == 2 and shape[0] != vertices) or shape[-1] not in (1, 3):
@@ -257,3 +289,4 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
                 f"{name} of region {number} must be gray [1], a color [3] or one of either for each of {vertices} "
                 f"vertices, got {list(shape)}"
             )
+        require.at_least(f"{name} of region {number}", getattr(material, name), 0.0)

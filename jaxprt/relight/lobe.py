@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from jaxprt import require
 from jaxprt.brdf.lobe import LobeBrdf, Lobes
 from jaxprt.linalg import mixture
 from jaxprt.scene.environment import Environment
@@ -86,7 +87,8 @@ def radiance(
         Differentiable in the light, the eye and the table.
 
     Raises:
-        ValueError: The light has another size than the transport, or the table has parameters.
+        ValueError: The light has another size than the transport, the table has parameters, or the light or the eye is
+            not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
 
     Reference: Sun et al. 2007, section 4.1, with free lobes and the second term.
     """
@@ -100,8 +102,9 @@ def prefilter(light: Environment) -> LobeLight:
         light: One environment.
 
     Raises:
-        ValueError: A batch of lights, or faces of less than 8 texels.
+        ValueError: A batch of lights, faces of less than 8 texels, or a light that is not finite.
     """
+    require.finite("the light", light.radiance)
     if light.radiance.ndim != 4 or light.radiance.shape[1] < 8:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
@@ -114,6 +117,7 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) ->
 
     Arguments as of `radiance`.
     """
+    require.finite("the eye", eye)
     lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye)
     place, share = _taps(
         face, s, t, spread, lobe.concentration, transport.share(face, s, t, spread), size=transport.size

@@ -8,6 +8,7 @@ import numpy as np
 import tqdm
 from jaxtyping import Array, Float, UInt8
 
+from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
@@ -43,8 +44,11 @@ def radiance(
         Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
 
     Raises:
-        ValueError: No such vertices, or the BRDF's values have no axis for colors.
+        ValueError: No such vertices, the BRDF's values have no axis for colors, or the light or the eye is not finite.
+            Inside `jax.jit` values are not known: NaN then reaches the vertices.
     """
+    require.finite("the light", light.radiance)
+    require.finite("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     start = visibility.start_points(mesh, rays)
     vertex = visibility.chosen(mesh, vertex)

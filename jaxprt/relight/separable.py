@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
@@ -184,8 +185,9 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
         The light-modulated tuple of every vertex, in the mesh's order.
 
     Raises:
-        ValueError: The light is a batch, or its cubemap is not six faces of the transport's size.
+        ValueError: The light is a batch, its cubemap is not six faces of the transport's size, or it is not finite.
     """
+    require.finite("the light", light.radiance)
     size = haar.face_edge(transport.rms.shape[0])
     if light.radiance.shape[:-1] != (6, size, size):
         raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
@@ -195,7 +197,6 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
     return transport.apply(coefficient)
 
 
-@jax.jit
 def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
     """The view side: view maps looked up at each vertex's direction to the eye.
 
@@ -207,12 +208,20 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
     Returns:
         The view-modulated tuple of every vertex, in the mesh's order.
 
+    Raises:
+        ValueError: The eye is not finite. Inside `jax.jit` that is not known, and all vertices get NaN.
+
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
+    require.finite("the eye", eye)
+    return _view_tuple(transport, brdf, eye)
+
+
+@jax.jit
+def _view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Array) -> Array:
     return brdf.view(directions.view(transport.frame, transport.position, eye))
 
 
-@partial(jax.jit, static_argnames=("terms",))
 def modulate(
     view: Float[Array, "v r d"], weight: Float[Array, "v n w"], *, terms: tuple[int, ...]
 ) -> Float[Array, "v r e"]:
@@ -231,7 +240,8 @@ def modulate(
         The view tuple for `combine`, in the colors of the BRDF or of the weights, whichever are more.
 
     Raises:
-        ValueError: The weights' n or the tuple's r do not fit the terms.
+        ValueError: The weights' n or the tuple's r do not fit the terms, or weights are not finite. Inside `jax.jit`
+            values are not known, and NaN reaches the vertices that have it.
 
     Reference: Wang, Tran, Luebke 2004, section 3.1.
     """
@@ -240,6 +250,12 @@ def modulate(
             f"terms must be one number for each of {weight.shape[1]} weights that add up to the tuple's "
             f"{view.shape[1]}, got {terms}"
         )
+    require.finite("the weights", weight)
+    return _modulated(view, weight, terms=terms)
+
+
+@partial(jax.jit, static_argnames=("terms",))
+def _modulated(view: Array, weight: Array, *, terms: tuple[int, ...]) -> Array:
     return view * weight[:, np.repeat(np.arange(len(terms)), terms)]
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf import paths
 from jaxprt.brdf.dynamic import DynamicBrdf
 from jaxprt.brdf.separable import SeparableBrdf
@@ -85,7 +86,7 @@ def radiance(
         transport: Precomputed transport of direct light.
         tensor: Precomputed bounces, of the same mesh.
         brdfs: This and more as `jaxprt.relight.dynamic.radiance` has it.
-        materials: Light that a textured region sends to others has the texture's mean.
+        materials: Light that a textured region sends to others has the texture's mean over the region's area.
         light: Directly by its texels, reflected by coarser ones.
         eye: Position of the viewer in world units.
         texels: How many light the vertices one by one.
@@ -95,8 +96,8 @@ def radiance(
 
     Raises:
         TypeError: As of `jaxprt.relight.dynamic.radiance`.
-        ValueError: Likewise; or the tensor has another number of vertices than the transport, or its sets of BRDFs.
-            That it is of the same mesh is not known and not checked.
+        ValueError: As `jaxprt.relight.dynamic.radiance` has it; or the tensor is of another mesh than the transport, or
+            of another number of BRDFs.
 
     Reference: Sun et al. 2007, equations 3 and 4.
     """
@@ -111,12 +112,13 @@ def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
 
     Raises:
         TypeError: The light is no Environment.
-        ValueError: It is a batch, or its faces are no multiple of those of the tensor's light.
+        ValueError: It is a batch, not finite, or its faces are no multiple of those of the tensor's light.
     """
     if not isinstance(light, Environment):
         raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
     if light.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
+    require.finite("the light", light.radiance)
     return _lit(tensor, light.radiance)
 
 
@@ -131,6 +133,10 @@ def arriving(
     if len(tensor.place) != len(transport.place):
         raise ValueError(
             f"the tensor must be of the transport's {len(transport.place)} vertices, got {len(tensor.place)}"
+        )
+    if tensor.mesh and transport.mesh and tensor.mesh != transport.mesh:
+        raise ValueError(
+            "the tensor must be of the transport's mesh and regions, got one of others with as many vertices"
         )
     whole = collect(tensor, light, weight)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
@@ -151,12 +157,9 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
         if material is None:
             rows.append(factor)
             continue
-        if material.share.shape != factor.shape[:1]:
-            raise ValueError(
-                f"the shares of region {number} must be one for each of the tensor's {len(factor)} BRDFs, got "
-                f"{list(material.share.shape)}"
-            )
-        diffuse, specular = (_mean(each, tensor.region == number) for each in (material.diffuse, material.specular))
+        dynamic.check_material(number, material, len(factor), len(tensor.place))
+        area = jnp.where(tensor.region == number, tensor.area, 0)
+        diffuse, specular = (_mean(each, area) for each in (material.diffuse, material.specular))
         rows.append(paths.weights(factor, material.share, diffuse, specular))
     colors = max(each.shape[1] for each in rows)
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
@@ -299,9 +302,9 @@ def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) ->
     return jnp.einsum("sk,qke->seq", paths.project(brdf, degree=DEGREE), view)
 
 
-def _mean(value: Array, inside: Array) -> Array:
-    """Mean of a texture over a region's vertices."""
+def _mean(value: Array, area: Array) -> Array:
+    """Mean of a texture over a region, of whose surface each vertex has some."""
     if value.ndim == 1:
         return value
-    share = inside.astype(value.dtype)
-    return share @ value / jnp.maximum(jnp.sum(share), 1)
+    whole = jnp.sum(area)
+    return area @ value / jnp.where(whole > 0, whole, 1)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.scene.mesh import Mesh, bounds
 
 
@@ -15,7 +16,7 @@ def _floating(value) -> Array:
 
 
 class Camera(eqx.Module):
-    """A pinhole camera. Lists and NumPy arrays become arrays.
+    """A pinhole camera. Lists and NumPy arrays become arrays. NaN and infinity raise ValueError outside `jax.jit`.
 
     Attributes:
         eye: Position in world units.
@@ -32,6 +33,11 @@ class Camera(eqx.Module):
     field_of_view: Float[Array, ""] = eqx.field(converter=_floating)
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        """Refuses places, directions and angles that are not finite."""
+        for name in ("eye", "target", "up", "field_of_view"):
+            require.finite(f"the camera's {name}", getattr(self, name))
 
 
 def orbit(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
+from jaxprt import require
 from jaxprt.files import images
 from jaxprt.sphere import cubemap
 
@@ -32,11 +33,18 @@ LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 class Environment(eqx.Module):
     """Distant light: mean linear radiance of each cubemap texel.
 
+    Radiance must be finite; a light with NaN or infinity in it raises ValueError. Inside `jax.jit` values are not
+    known: there a NaN reaches every vertex that the texel lights.
+
     Attributes:
         radiance: Mean radiance over each texel, linear Rec. 709; leading axes, if any, are a batch of lights.
     """
 
     radiance: Float[Array, "*l 6 n n c"]
+
+    def __check_init__(self):
+        """Refuses radiance that is not finite."""
+        require.finite("the light's radiance", self.radiance)
 
 
 def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | None = None) -> Environment:

@@ -12,6 +12,7 @@ import tqdm
 from threadpoolctl import threadpool_limits
 
 from jaxprt.files.arrays import BlockStore, Layout
+from jaxprt.scene.mesh import Mesh
 
 
 class Job(abc.ABC):
@@ -91,6 +92,15 @@ def fingerprint(*array: Any) -> str:
         each = np.ascontiguousarray(np.asarray(each))
         digest.update(f"{each.shape}{each.dtype}".encode() + each.tobytes())
     return digest.hexdigest()
+
+
+def scene_key(mesh: Mesh) -> str:
+    """Fingerprint of a mesh's surfaces and regions, by which results for it know each other.
+
+    Tangents do not count, and neither do the types in which arrays are held.
+    """
+    single = [np.asarray(each, np.float32) for each in (mesh.position, mesh.normal)]
+    return fingerprint(*single, *(np.asarray(each, np.int32) for each in (mesh.face, mesh.region)))
 
 
 def _run(job, todo, store, executor, result, bar) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Int
 from jaxprt.brdf.dynamic import DynamicBrdf
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.mesh import Mesh
-from jaxprt.transport import clustered, direct
+from jaxprt.transport import blocks, clustered, direct
 from jaxprt.transport import lobe as pyramids
 from jaxprt.transport.clustered import ClusteredTransport
 from jaxprt.transport.direct import DirectTransport
@@ -54,10 +54,12 @@ class DynamicTransport(eqx.Module):
     Attributes:
         region: Transport of each region, in the order of their numbers.
         place: Of each vertex of the mesh, its number among the vertices of all regions one after another.
+        mesh: Fingerprint of the mesh, by which bounces of another one are refused; empty if made by hand.
     """
 
     region: tuple[RegionTransport, ...]
     place: Int[Array, " v"]
+    mesh: str = eqx.field(static=True, default="")
 
     @property
     def size(self) -> int:
@@ -137,7 +139,7 @@ def precompute(
         each = compress(visible, brdf, vectors, modes, keep, path=at, executor=executor, progress=progress)
         regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex, jnp.int32)))
     place = np.argsort(np.concatenate([each.vertex for each in regions]))
-    return DynamicTransport(tuple(regions), jnp.asarray(place, jnp.int32))
+    return DynamicTransport(tuple(regions), jnp.asarray(place, jnp.int32), blocks.scene_key(mesh))
 
 
 def compress(

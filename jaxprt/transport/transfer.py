@@ -69,6 +69,7 @@ class TransferTensor(eqx.Module):
         mode: Modes of the light of each cluster, on its texels.
         place: Row of each vertex.
         region: Number of the region of each vertex.
+        area: Surface that each vertex stands for, a third of the triangles around it.
         function: Numbers of the functions that are kept among those of all regions.
         factor: What makes the weights of each region's functions: those of the BRDFs of a set, or of one BRDF.
         second: Two bounces, if asked for and not left out.
@@ -76,6 +77,7 @@ class TransferTensor(eqx.Module):
             weights they can have; a difference of squares: less than 5e-4 is rounding.
         worth: What each bounce brings to white surfaces under constant light, root mean square of irradiance over that
             of an open surface. Regions with one BRDF count as they are.
+        mesh: Fingerprint of the mesh, by which transport of another one is refused; empty if made by hand.
     """
 
     weight: Float[Array, "g m n"]
@@ -83,11 +85,13 @@ class TransferTensor(eqx.Module):
     mode: Float[Array, "g l e"]
     place: Int[Array, " v"]
     region: Int[Array, " v"]
+    area: Float[Array, " v"]
     function: Int[Array, " q"]
     factor: tuple[Float[Array, "..."], ...]
     second: SecondBounce | None
     error: Float[Array, " g"]
     worth: Float[Array, " _"]
+    mesh: str = eqx.field(static=True, default="")
 
     @property
     def nbytes(self) -> int:
@@ -110,8 +114,9 @@ class TransferTensor(eqx.Module):
         kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
         second = self.second and self.second.keep(_twice(components), scale=scales(self.factor)[self.function])
-        same = (self.place, self.region, self.function, self.factor, second)
-        return TransferTensor(weight, core, self.mode[..., :modes], *same, jnp.where(whole > 0, error, 0), self.worth)
+        same = (self.place, self.region, self.area, self.function, self.factor, second)
+        error = jnp.where(whole > 0, error, 0)
+        return TransferTensor(weight, core, self.mode[..., :modes], *same, error, self.worth, self.mesh)
 
     def shorten(self, *, error: float | None = None, nbytes: int | None = None) -> "TransferTensor":
         """The smallest tensor whose root mean square error is no larger, or that of least error that is no larger.
@@ -259,9 +264,18 @@ def precompute(
             second = SecondBounce(*map(jnp.asarray, parts))
     if progress:
         _tell(share, function, worth, second, bounces)
-    arrays = (weight, core, found["mode"], clustered.places(member), job.region.astype(np.int32), function)
-    arrays = [jnp.asarray(each) for each in arrays]
-    return TransferTensor(*arrays, factor, second, jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype))
+    rows = (clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
+    arrays = [jnp.asarray(each) for each in (weight, core, found["mode"], *rows, function)]
+    told = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
+    return TransferTensor(*arrays, factor, second, *told, blocks.scene_key(mesh))
+
+
+def _areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
+    """A third of the area of the triangles around each vertex: weights by which means over vertices are over area."""
+    face = np.asarray(mesh.face)
+    corner = np.asarray(mesh.position, np.float64)[face]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
+    return np.bincount(face.ravel(), np.repeat(area / 3, 3), len(mesh.position))
 
 
 @jax.jit

@@ -211,6 +211,41 @@ def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, cha
         dynamic.radiance(*change(transport, [family, fixed], [material(line, 0.3), None]), light, eye=EYE)
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (([3, 3], 0.5, 1), r"shares of region 4 must sum to 1, got \[3. 3.\], whose sum is 6.0"),
+        (([0.3, 0.6], 0.5, 1), "shares of region 4 must sum to 1, got "),
+        (
+            ([2, -1], 0.5, 1),
+            r"shares of region 4 must be at least 0, got 1 of 2 values that are not, first at \(1,\): -1",
+        ),
+        (([np.nan, 1], 0.5, 1), "shares of region 4 must be finite, got 1 of 2 values"),
+        (([1, 0], -1, 1), "diffuse of region 4 must be at least 0, got 1 of 1 values"),
+        (([1, 0], [0.1, np.inf, 0.2], 1), "diffuse of region 4 must be finite, got 1 of 3 values"),
+        (([1, 0], 0.5, -np.ones((3, 1))), "specular of region 4 must be at least 0, got 3 of 3 values"),
+        (([1, 0], 0.5, np.nan), "specular of region 4 must be finite, got 1 of 1 values"),
+    ],
+)
+def test_values_that_no_material_has_are_refused_with_the_region_and_the_field(values, message, unchecked):
+    with pytest.raises(ValueError, match=message):
+        dynamic.check_material(4, dynamic.Material(*values), 2, 3)
+
+
+def test_shares_of_a_navigation_and_traced_materials_pass(unchecked):
+    dynamic.check_material(0, dynamic.Material([1 / 3 - 2e-6, 2 / 3 + 3e-6, -1e-6], 0, [0.2, 2, 0]), 3, 3)
+    plane = navigation.triangulate(np.random.default_rng(0).uniform(size=(5, 2)))
+    for spot in np.random.default_rng(1).uniform(-0.5, 1.5, (8, 2)).astype(np.float32):
+        dynamic.check_material(0, dynamic.Material(plane.share(spot), 0.5, 0.5), 5, 3)
+
+    def slope(value):
+        matter = dynamic.Material(jnp.stack([value, -value]), value, -value)
+        dynamic.check_material(0, matter, 2, 3)
+        return matter.share[0]
+
+    assert jax.grad(slope)(3.0) == 1
+
+
 def test_a_light_of_another_size_is_refused(transport):
     with pytest.raises(ValueError, match=r"one environment \[6, 16, 16, c\]"):
         dynamic.light_side(transport, builtin.daylight(size=8))

@@ -207,6 +207,14 @@ def test_the_gradient_in_parameters_of_a_brdf_equals_finite_differences(mesh, ra
     assert abs(slope - float(total(20.5) - total(19.5))) < GRADIENT * abs(slope)
 
 
+def test_an_eye_and_a_light_that_are_not_finite_are_refused(mesh, random):
+    light = some_light(random)
+    with pytest.raises(ValueError, match="the eye must be finite, got 1 of 3"):
+        reference.radiance(mesh, GLOSSY, light, eye=EYE.at[1].set(jnp.nan))
+    with pytest.raises(ValueError, match="the light must be finite, got 1152 of 1152"):
+        reference.radiance(mesh, GLOSSY, jax.tree.map(lambda x: x * jnp.nan, light), eye=EYE)
+
+
 def test_lights_whose_faces_are_no_power_of_two_are_refused(mesh):
     with pytest.raises(ValueError, match="power of two"):
         reference.radiance(mesh, Lambert(0.5), Environment(jnp.ones((6, 6, 6, 3))), eye=EYE)

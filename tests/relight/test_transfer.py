@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from jaxprt.brdf import CookTorrance, Lambert, dynamic, paths, separable
 from jaxprt.relight import dynamic as direct
@@ -152,10 +153,13 @@ def test_reflected_light_has_the_color_of_what_it_met(transport, tensor, brdfs):
     np.testing.assert_allclose(color[0][1], color[1][1], rtol=0.05)  # They differ by the other colors' rounding alone.
 
 
-def test_a_texture_sends_its_mean_to_others(transport, tensor, brdfs, mesh):
-    region = np.asarray(mesh.region) == 0
-    texture = np.where(np.arange(len(region)) % 2, 0.8, 0.2)[:, None].astype(np.float32)
-    mean = texture[region].mean(0)
+def test_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, mesh):
+    """Bright poles, where the ball has many vertices and little surface; the mean is that of trimesh's triangles."""
+    texture = np.asarray(mesh.position[:, 1:2] ** 2)
+    face = np.asarray(mesh.face)[np.asarray(mesh.region)[mesh.face[:, 0]] == 0]
+    area = trimesh.Trimesh(np.asarray(mesh.position), face, process=False).area_faces
+    mean = np.atleast_1d(area @ texture[face].mean((1, 2)) / area.sum()).astype(np.float32)
+    assert texture[np.asarray(mesh.region) == 0].mean() > 1.1 * mean
     lit = relight.light_side(tensor, light())
     found, plain = (
         relight.arriving(transport, tensor, lit, [material(each), None])[1].local for each in (texture, mean)
@@ -191,10 +195,14 @@ def test_what_does_not_fit_is_refused(transport, tensor, brdfs, unchecked):
         relight.weights(tensor, [None, None])
     with pytest.raises(ValueError, match="region 1 has one BRDF for good"):
         relight.weights(tensor, [material(), material()])
-    with pytest.raises(ValueError, match=r"one for each of the tensor's 2 BRDFs, got \[3\]"):
+    with pytest.raises(ValueError, match=r"one for each of its 2 BRDFs, got \[3\]"):
         relight.weights(tensor, [Material(jnp.array([0.2, 0.3, 0.5]), 0.4, 0.6), None])
     with pytest.raises(TypeError, match="must be an Environment, got int"):
         relight.light_side(tensor, 3)
+    with pytest.raises(ValueError, match=r"diffuse of region 0 must be gray .* each of 136 vertices"):
+        relight.weights(tensor, [material(np.ones((135, 1))), None])
+    with pytest.raises(ValueError, match="shares of region 0 must sum to 1"):
+        relight.weights(tensor, [Material(jnp.array([3.0, 3.0]), 0.4, 0.6), None])
     with pytest.raises(ValueError, match="must be one environment"):
         relight.light_side(tensor, Environment(lamp.radiance[None]))
     with pytest.raises(ValueError, match="must divide the light's 18, got 4"):
@@ -202,3 +210,6 @@ def test_what_does_not_fit_is_refused(transport, tensor, brdfs, unchecked):
     other = eqx.tree_at(lambda x: x.place, tensor, tensor.place[:-1])
     with pytest.raises(ValueError, match="of the transport's 136 vertices, got 135"):
         relight.arriving(transport, other, relight.light_side(tensor, lamp), now)
+    moved = transports.DynamicTransport(transport.region, transport.place, "another mesh")
+    with pytest.raises(ValueError, match="of the transport's mesh and regions, got one of others"):
+        relight.arriving(moved, tensor, relight.light_side(tensor, lamp), now)

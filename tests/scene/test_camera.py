@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -89,6 +90,17 @@ def test_a_camera_may_be_made_of_lists_and_whole_numbers(kind):
 
 def test_a_camera_keeps_double_precision(x64):
     assert Camera(np.array([0.1, 0, 4]), np.zeros(3), [0, 1, 0], 1, 8, 6).eye.dtype == jnp.float64
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_places_and_angles_that_are_not_finite_are_refused_by_name_unless_they_are_traced(place):
+    value = [[1.0, 2, 3], [0.0, 0, 0], [0.0, 1, 0], 0.6]
+    value[place] = np.nan * np.asarray(value[place])
+    with pytest.raises(
+        ValueError, match=f"the camera's {['eye', 'target', 'up', 'field_of_view'][place]} must be finite"
+    ):
+        Camera(*value, 8, 6)
+    assert jax.eval_shape(lambda each: Camera(*each, 8, 6), value).width == 8
 
 
 @pytest.mark.parametrize(

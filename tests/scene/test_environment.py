@@ -246,6 +246,18 @@ def test_negative_values_are_set_to_zero_with_one_warning():
     np.testing.assert_array_equal(light.radiance, clamped.radiance)
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_lights_made_by_hand_are_refused_where_they_are_not_finite_and_known(wrong):
+    radiance = jnp.ones((6, 2, 2, 3)).at[3, 1, 0, 2].set(wrong)
+    message = (
+        r"the light's radiance must be finite, got 1 of 72 values that are not, first at \(3, 1, 0, 2\): (nan|inf)"
+    )
+    with pytest.raises(ValueError, match=message):
+        Environment(radiance)
+    assert jax.eval_shape(Environment, radiance).radiance.shape == (6, 2, 2, 3)
+    assert jax.jit(Environment)(radiance).radiance[3, 1, 0, 2] != 1
+
+
 def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible(tmp_path):
     image = np.ones((10, 17, 3), np.float32)
     with pytest.raises(ValueError, match=r"one of latlong, openexr-latlong, .* got 'angular'"):
