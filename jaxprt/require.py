@@ -45,6 +45,21 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
         _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
 
 
+def position(name: str, value: Any) -> None:
+    """Refuses what is not one finite position. Shapes are known inside `jax.jit` too.
+
+    Args:
+        name: What the value is, for the message: "the eye".
+        value: An array or a list.
+
+    Raises:
+        ValueError: It has not three values in one row, or some are not finite.
+    """
+    if np.shape(value) != (3,):
+        raise ValueError(f"{name} must be one position, [3], got an array of shape {list(np.shape(value))}")
+    finite(name, value)
+
+
 def _require(name: str, what: str, known: np.ndarray, right: np.ndarray) -> None:
     if right.all():
         return

@@ -1,5 +1,7 @@
 """Checks of values where they enter."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +33,15 @@ def test_values_below_a_bound_are_refused_by_name():
         require.at_least("the albedo", jnp.array([0, -1]), 0.0)
     with pytest.raises(ValueError, match="the albedo must be finite, got 1 of 1 values that are not: nan"):
         require.at_least("the albedo", np.nan, 0.0)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (3, 1), (2, 3)])
+def test_a_position_has_three_values_also_where_they_are_traced(shape):
+    require.position("the eye", [1, 2, 3])
+    with pytest.raises(
+        ValueError, match=rf"the eye must be one position, \[3\], got an array of shape {re.escape(str(list(shape)))}"
+    ):
+        jax.eval_shape(lambda x: require.position("the eye", x), jnp.ones(shape))
 
 
 def test_traced_values_pass_and_stay_as_they_are():

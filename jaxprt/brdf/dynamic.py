@@ -91,7 +91,12 @@ class DynamicBrdf(eqx.Module):
 
         Shares sum to one. Terms are mixed; lobes move, from the place and width they have in one BRDF to those they
         have in the next, unless they are where all have them, as the published ones. Differentiable in the shares.
+
+        Raises:
+            ValueError: The shares are not one for each BRDF of the set.
         """
+        if share.shape != (self.size,):
+            raise ValueError(f"shares must be one for each of {self.size} BRDFs, got {list(share.shape)}")
         view = jnp.einsum("m,mch,hoi,oyx->iyxc", share, self.factor, self.core, self.view_map)
         terms = SeparableBrdf(self.light_map[..., None], view, self.error, self.coordinates)
         lobe = None if self.lobe is None else mean(self.lobe, share)

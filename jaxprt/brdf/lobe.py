@@ -148,7 +148,12 @@ def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
         w = sum_h s_h w_h,    (m, log k) = sum_h s_h w_h (m_h, log k_h) / w
 
     with shares s that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
+
+    Raises:
+        ValueError: The shares are not one for each BRDF along the parameter.
     """
+    if share.shape != table.scale.shape[1:2]:
+        raise ValueError(f"shares must be one for each of {table.scale.shape[1]} BRDFs, got {list(share.shape)}")
     share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
     part = jnp.maximum(share * jnp.sum(table.weight, 0), 0) + _TINY
     part = part / jnp.sum(part, 1, keepdims=True)

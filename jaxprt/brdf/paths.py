@@ -134,7 +134,12 @@ def weights(
 
     Returns:
         The weights, the diffuse part's last. Differentiable in all but the set.
+
+    Raises:
+        ValueError: The shares are not one for each BRDF of the set.
     """
+    if share.shape != factor.shape[:1]:
+        raise ValueError(f"shares must be one for each of {len(factor)} BRDFs, got {list(share.shape)}")
     sharp = jnp.einsum("m,mch->hc", share, factor) * specular
     colors = max(sharp.shape[1], len(diffuse))
     rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]

@@ -92,13 +92,13 @@ def radiance(
         Differentiable in the BRDF's parameters, the excess and the eye.
 
     Raises:
-        ValueError: The excess or the eye is not finite. Inside `jax.jit` that is not known, and NaN reaches the
-            vertices.
+        ValueError: The eye is not one position, or it or the excess is not finite. Inside `jax.jit` values are not
+            known, and NaN reaches the vertices.
 
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     require.finite("the excess", excess)
-    require.finite("the eye", eye)
+    require.position("the eye", eye)
     return _radiance(transport, brdf, texel, excess, eye)
 
 

@@ -166,9 +166,7 @@ def view_side(
     Arguments and errors as of `radiance`.
     """
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
-    if eye.shape != (3,):
-        raise ValueError(f"the eye must be one position, [3], got an array of shape {list(eye.shape)}")
-    require.finite("the eye", eye)
+    require.position("the eye", eye)
     count = len(transport.region)
     if len(brdfs) != count or len(materials) != count:
         raise ValueError(

@@ -117,7 +117,7 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) ->
 
     Arguments as of `radiance`.
     """
-    require.finite("the eye", eye)
+    require.position("the eye", eye)
     lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye)
     place, share = _taps(
         face, s, t, spread, lobe.concentration, transport.share(face, s, t, spread), size=transport.size

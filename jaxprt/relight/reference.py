@@ -48,7 +48,7 @@ def radiance(
             Inside `jax.jit` values are not known: NaN then reaches the vertices.
     """
     require.finite("the light", light.radiance)
-    require.finite("the eye", eye)
+    require.position("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     start = visibility.start_points(mesh, rays)
     vertex = visibility.chosen(mesh, vertex)

@@ -209,11 +209,12 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
         The view-modulated tuple of every vertex, in the mesh's order.
 
     Raises:
-        ValueError: The eye is not finite. Inside `jax.jit` that is not known, and all vertices get NaN.
+        ValueError: The eye is not one position, or not finite. Inside `jax.jit` its values are not known, and all
+            vertices get NaN.
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
-    require.finite("the eye", eye)
+    require.position("the eye", eye)
     return _view_tuple(transport, brdf, eye)
 
 

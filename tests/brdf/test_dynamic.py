@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, dynamic, lobe, published, separable
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, dynamic, lobe, paths, published, separable
 from jaxprt.sphere import hemisphere
 
 ROUGH = [0.25, 0.4, 0.6]
@@ -169,6 +169,17 @@ def test_lobes_alone_take_more_directions_than_a_block_has(lobes, pairs, monkeyp
     whole = member(*pairs)
     monkeypatch.setattr(separable, "_BLOCK", 8)  # Of 2,048 directions otherwise.
     np.testing.assert_allclose(member(*pairs[:, :37]), whole[:37], rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_shares_of_another_number_of_brdfs_are_refused(lobes, count, unchecked):
+    """One share would else count for all."""
+    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+        dynamic.factor(SET, lobes).at(jnp.ones(count))
+    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+        lobe.mean(lobes, jnp.ones(count))
+    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+        paths.weights(jnp.ones((3, 1, 2)), jnp.ones(count), jnp.ones(1), jnp.ones(1))
 
 
 def test_shares_of_either_sign_are_finite(lobes, pairs):
