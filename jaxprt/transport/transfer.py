@@ -266,8 +266,8 @@ def precompute(
         _tell(share, function, worth, second, bounces)
     rows = (clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
     arrays = [jnp.asarray(each) for each in (weight, core, found["mode"], *rows, function)]
-    error, brings = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
-    return TransferTensor(*arrays, factor, second, error, brings, mesh=blocks.scene_key(mesh))
+    told = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
+    return TransferTensor(*arrays, factor=factor, second=second, **told, mesh=blocks.scene_key(mesh))
 
 
 def _areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
