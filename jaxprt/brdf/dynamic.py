@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf import grid, lobe_em
 from jaxprt.brdf.lobe import LobeBrdf, is_isotropic, mean, tabulate
 from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.files import objects
 from jaxprt.linalg import tucker
 from jaxprt.sphere import harmonics, hemisphere
 
@@ -74,6 +75,10 @@ class DynamicBrdf(eqx.Module):
     brdf: Callable | None
     error: Float[Array, ""]
     coordinates: Callable = eqx.field(static=True, default=hemisphere.parabolic_coordinates)
+
+    def __reduce__(self):
+        """Pickles the function of coordinates by its name: pickle cannot take jitted functions."""
+        return objects.reduced(self)
 
     @property
     def size(self) -> int:

@@ -1,6 +1,5 @@
 """BRDFs as sums of products of a light map and a view map: f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
 
-import importlib
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.files import objects
 from jaxprt.linalg import eigen
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.staging import apart
@@ -43,9 +43,8 @@ class SeparableBrdf(eqx.Module):
         return self.light_map.shape[0]
 
     def __reduce__(self):
-        """Pickles the map by name, since jitted functions cannot be pickled; workers get their BRDF so."""
-        name = (self.coordinates.__module__, self.coordinates.__qualname__)
-        return _unpickle, (self.light_map, self.view_map, self.error, *name)
+        """Pickles the function of coordinates by its name: pickle cannot take jitted functions."""
+        return objects.reduced(self)
 
     def keep(self, terms: int) -> "SeparableBrdf":
         """The first `terms` terms; their error is no longer known and reads NaN where terms were dropped."""
@@ -82,11 +81,6 @@ def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
         return lookup(texel, coordinates)
     each = jax.checkpoint(lambda place: lookup(texel, place))
     return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
-
-
-def _unpickle(light_map, view_map, error, module: str, name: str) -> SeparableBrdf:
-    coordinates = getattr(importlib.import_module(module), name)
-    return SeparableBrdf(jnp.asarray(light_map), jnp.asarray(view_map), jnp.asarray(error), coordinates)
 
 
 def factor(

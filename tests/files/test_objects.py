@@ -1,0 +1,293 @@
+"""Objects that are saved, loaded and pickled: every class of the package, without loss, and what is refused."""
+
+import dataclasses
+import importlib
+import inspect
+import itertools
+import json
+import pickle
+import pkgutil
+import types
+import typing
+import zlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zarr
+
+import jaxprt as prt
+from jaxprt.brdf import navigation
+from jaxprt.relight import separable
+from jaxprt.sphere import hemisphere
+from jaxprt.transport import quantized, sparse
+
+# Host records of the command line and of reports; they hold functions and file names.
+UNSAVED = {"jaxprt.report", "jaxprt.animation", "jaxprt.__main__"}
+
+
+def classes():
+    """All public classes of the package that hold data."""
+    for info in pkgutil.walk_packages(prt.__path__, "jaxprt."):
+        if info.name in UNSAVED:
+            continue
+        for name, kind in inspect.getmembers(importlib.import_module(info.name), inspect.isclass):
+            data = issubclass(kind, eqx.Module) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+            if data and kind.__module__ == info.name and not name.startswith("_"):
+                yield kind
+
+
+def filled(kind, random):
+    """An instance, each field of which holds something of its type; nothing is converted or checked."""
+    hint = typing.get_type_hints(kind)
+    if not issubclass(kind, eqx.Module):
+        return kind(*(value(hint[name], random) for name in kind._fields))
+    result = object.__new__(kind)
+    for field in dataclasses.fields(kind):
+        object.__setattr__(result, field.name, value(hint[field.name], random, field.name))
+    return result
+
+
+def value(hint, random, name=""):
+    """Something of a type."""
+    arguments = typing.get_args(hint)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return value(arguments[0], random, name)
+    if typing.get_origin(hint) is tuple:
+        each = arguments[:1] * 2 if arguments[-1] is ... else arguments
+        return tuple(value(one, random) for one in each)
+    if hasattr(hint, "dtypes"):
+        dtype = jnp.dtype(
+            next(one for one in hint.dtypes if one not in ("float8_e4m3b11fnuz", "bfloat16", "int2", "uint2"))
+        )
+        array = random.integers(0, 2, (2, 3)).astype(dtype)
+        return array if hint.array_type is np.ndarray else jnp.asarray(array)
+    plain = {int: 3, float: 0.1, str: "name", np.ndarray: np.arange(3), typing.Any: {"a": [1.5, None, (True,)]}}
+    if hint in plain:
+        return plain[hint]
+    if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
+        return filled(hint, random)
+    return {"coordinates": hemisphere.polar_coordinates, "chart": navigation._log_roughness}.get(
+        name, prt.brdf.Lambert()
+    )
+
+
+def same(one, other):
+    """Asserts equal structure, types and bits."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    assert type(one) is type(other)
+    for first, second in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert type(first) is type(second)
+        assert np.asarray(first).dtype == np.asarray(second).dtype
+        assert np.asarray(first).shape == np.asarray(second).shape
+        assert np.asarray(first).tobytes() == np.asarray(second).tobytes()
+
+
+def test_every_class_of_the_package_is_the_same_after_saving_and_after_pickling(tmp_path):
+    random = np.random.default_rng(0)
+    every = {f"{kind.__module__}.{kind.__name__}": filled(kind, random) for kind in classes()}
+    for name in ("SeparableBrdf", "DynamicBrdf", "TransferTensor", "RegionTransport", "Plan", "Environment", "Camera"):
+        assert [key for key in every if key.endswith(f".{name}")], name
+    prt.files.save(tmp_path / "all.prt", every)
+    again = prt.files.load(tmp_path / "all.prt")
+    assert list(again) == list(every)
+    for name, one in every.items():
+        same(again[name], one)
+        same(pickle.loads(pickle.dumps(one)), one)
+
+
+def test_numbers_of_every_type_and_shape_keep_their_bits(tmp_path):
+    types = ["bool", "int8", "uint8", "uint16", "int32", "uint32", "float16", "bfloat16", "float32", "complex64"]
+    random = np.random.default_rng(0)
+    arrays = {name: jnp.asarray(random.normal(size=(3, 2)) > 0).astype(name) for name in types}
+    arrays["half"] = jnp.asarray(random.normal(size=(2, 5)), jnp.bfloat16)
+    arrays["special"] = jnp.array([jnp.nan, -0.0, jnp.inf, 1e-45])
+    arrays |= {"empty": jnp.zeros((0, 4)), "none": jnp.zeros((3, 0), jnp.float16), "number": jnp.float32(2)}
+    host = {"wide": random.normal(size=4), "turned": random.normal(size=(3, 4)).T, "scalar": np.float64(0.1)}
+    plain = {"float": 0.1, "nan": float("nan"), "large": 1 << 80, "text": "ä", "none": None, "both": (True, [1])}
+    everything = {"arrays": arrays, "host": host, "plain": plain}
+    prt.files.save(tmp_path / "deep" / "a.prt", everything)
+    again = prt.files.load(tmp_path / "deep" / "a.prt")
+    same((again["arrays"], again["host"]), (arrays, host))
+    assert repr(again["plain"]) == repr(plain)
+    assert not [file for file in tmp_path.rglob("*") if file.suffix in (".pkl", ".pickle", ".new")]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A factored BRDF, transport made by hand, and a light."""
+    brdf = prt.brdf.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
+    random = np.random.default_rng(0)
+    index = jnp.asarray(random.integers(0, 96, (5, 7, 2)), jnp.uint16)
+    frame, _ = np.linalg.qr(random.normal(size=(7, 3, 3)))
+    frame, amount = jnp.asarray(frame, jnp.float32), jnp.asarray(random.normal(size=(5, 7, 2, 1)), jnp.float32)
+    transport = prt.transport.SparseTransport(index, amount, 0 * frame[:, 0], frame, sparse.rms(index, amount, 96))
+    light = prt.scene.Environment(jnp.asarray(random.uniform(size=(6, 4, 4, 3)), jnp.float32))
+    return transport, brdf, light
+
+
+def test_what_is_loaded_or_unpickled_relights_to_the_same_bits_with_the_same_programs(scene, tmp_path):
+    transport, brdf, light = scene
+    relit = jax.jit(
+        lambda transport, brdf, light: separable.radiance(transport, brdf, light, eye=jnp.array([0, 0, 9.0]))
+    )
+    for number, each in enumerate((transport, quantized.quantize(transport))):
+        expected = np.asarray(relit(each, brdf, light))
+        prt.files.save(tmp_path / str(number), (each, brdf, light))
+        for again in (prt.files.load(tmp_path / str(number)), pickle.loads(pickle.dumps((each, brdf, light)))):
+            np.testing.assert_array_equal(relit(*again), expected)
+    assert relit._cache_size() == 2
+
+
+def test_arrays_that_two_fields_share_are_saved_once_and_shared_again(tmp_path):
+    whole = jnp.arange(4.0)
+    prt.files.save(tmp_path / "a.prt", {"one": whole, "other": (whole, np.arange(3))})
+    again = prt.files.load(tmp_path / "a.prt")
+    assert again["one"] is again["other"][0]
+    assert len(list(zarr.open_group(tmp_path / "a.prt", mode="r").array_keys())) == 2
+
+
+LINE, DIFFUSE = navigation.Line(jnp.arange(2.0)), jnp.zeros((1, 3))
+
+
+class Foreign(eqx.Module):
+    """A BRDF of somebody else."""
+
+    albedo: float = 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (
+            navigation.Family((lambda wi, wo: wi,), LINE, ("a",), DIFFUSE, DIFFUSE),
+            r"Family\.brdf\[0\].*got the function",
+        ),
+        ({"a": (1, Foreign())}, r"dict\['a'\]\[1\] must be an object of jaxprt.*got a Foreign"),
+        (eqx.filter_jit(lambda x: x), "must be an object of jaxprt"),
+        (np.array(["text"]), "must be an array of numbers"),
+        (jax.random.key(0), "must be an array of numbers"),
+        ({1: 2}, "must be an object of jaxprt.*got a dict"),
+    ],
+)
+def test_what_is_no_data_of_the_package_is_refused_by_its_place_and_leaves_no_file(wrong, told, tmp_path, unchecked):
+    with pytest.raises(TypeError, match=told):
+        prt.files.save(tmp_path / "a.prt", wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_that_are_being_traced_are_refused(tmp_path):
+    with pytest.raises(TypeError, match="got one that JAX is tracing"):
+        jax.jit(lambda x: prt.files.save(tmp_path / "a.prt", x))(jnp.zeros(3))
+
+
+def test_nothing_is_replaced_and_a_save_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "a.prt"
+    prt.files.save(path, 1)
+    with pytest.raises(FileExistsError, match=r"a\.prt exists; remove it or name another path"):
+        prt.files.save(path, 2)
+    assert prt.files.load(path) == 1
+    other = tmp_path / "b.prt"
+
+    def full(*_, **__):
+        assert not other.exists()
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(zarr.Group, "create_array", full)
+    with pytest.raises(OSError, match="no space"):
+        prt.files.save(other, jnp.zeros(3))
+    assert [file.name for file in tmp_path.iterdir()] == ["a.prt"]
+
+
+def rewritten(path, **change):
+    """Changes what the header says, its checksum made to fit."""
+    group = zarr.open_group(path, mode="r+")
+    content = json.loads(str(group.attrs["content"]))
+    for place, new in change.items():
+        content[place] = new
+    text = json.dumps(content)
+    group.attrs.update({"content": text, "checksum": zlib.crc32(text.encode())})
+
+
+def test_damage_is_found_and_told(tmp_path, scene):
+    number = itertools.count()
+
+    def saved():
+        path = tmp_path / f"{next(number)}.prt"
+        prt.files.save(path, scene[1])
+        return path
+
+    path = saved()
+    file = next(file for file in path.rglob("c/*") if file.is_file() or (file / "0").exists())
+    file = next(each for each in (file, *file.rglob("*")) if each.is_file())
+    content = file.read_bytes()
+    for damaged in (content[:9], content[:-1] + bytes([content[-1] ^ 1])):
+        file.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"0\.prt is damaged: array 0 of float32"):
+            prt.files.load(path)
+    file.unlink()
+    with pytest.raises(ValueError, match="is damaged"):
+        prt.files.load(path)
+    path = saved()
+    zarr.open_group(path, mode="r+").attrs["content"] = "{}"
+    with pytest.raises(ValueError, match="is damaged: its description"):
+        prt.files.load(path)
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(ValueError, match="wrote, got one that cannot be read"):
+        prt.files.load(path)
+    with pytest.raises(FileNotFoundError, match="there is no such folder"):
+        prt.files.load(tmp_path / "missing")
+    zarr.create_group(tmp_path / "other")
+    with pytest.raises(ValueError, match="got another kind of folder"):
+        prt.files.load(tmp_path / "other")
+
+
+def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_path, scene, monkeypatch):
+    path = tmp_path / "a.prt"
+    prt.files.save(path, scene[0])
+    monkeypatch.setattr(sparse, "ALGORITHM", 77, raising=False)
+    with pytest.raises(ValueError, match=r"algorithm in jaxprt.transport.sparse, this jaxprt has version 77"):
+        prt.files.load(path)
+    monkeypatch.undo()
+    group = zarr.open_group(path, mode="r+")
+    for version, cure in ((99, "update jaxprt"), (0, "load it with the version of jaxprt that saved it")):
+        group.attrs["version"] = version
+        with pytest.raises(ValueError, match=f"must have format version 1, got {version}: {cure}"):
+            prt.files.load(path)
+    group.attrs["version"] = 1
+    rewritten(path, tree={"class": "jaxprt.scene.environment:Environment", "field": {"light": {"value": 1}}})
+    with pytest.raises(ValueError, match="with the fields light, this jaxprt's has radiance"):
+        prt.files.load(path)
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"class": "os:system", "field": {}},
+        {"class": "jaxprt.files.objects:Path", "field": {}},
+        {"class": "jaxprt.files.objects:os", "field": {}},
+        {"class": "jaxprt.__main__:main", "field": {}},
+        {"class": "jaxprt.nothing:Mesh", "field": {}},
+        {"class": "jaxprt.transport.visibility:Occluder", "field": {}},
+        {"class": "jaxprt.brdf:Lambert", "field": {}},
+        {"function": "os:system"},
+        {"function": "jaxprt.sphere.hemisphere:arcs"},
+    ],
+)
+def test_a_file_can_name_no_class_or_function_but_those_that_hold_data_of_the_package(tmp_path, tree):
+    path = tmp_path / "a.prt"
+    prt.files.save(path, 1)
+    rewritten(path, tree=tree)
+    with pytest.raises(ValueError, match=r"a\.prt names the (class|module|function)"):
+        prt.files.load(path)
+
+
+def test_numbers_of_64_bits_are_loaded_with_x64_and_refused_without(tmp_path):
+    with jax.enable_x64(True):
+        light = prt.scene.Environment(jnp.full((6, 2, 2, 3), 0.1, jnp.float64))
+        prt.files.save(tmp_path / "a.prt", light)
+        same(prt.files.load(tmp_path / "a.prt"), light)
+    with pytest.raises(ValueError, match="holds arrays of float64, which JAX has only with jax_enable_x64"):
+        prt.files.load(tmp_path / "a.prt")
