@@ -39,6 +39,7 @@ SIDEWAYS = {
     ("inverse", "fit", "solve"),
     ("inverse", "pictures", "numbers"),
     ("inverse", "solve", "numbers"),
+    ("linalg", "clustering", "eigen"),
     ("linalg", "tucker", "eigen"),
     ("scene", "builtin", "environment"),
     ("scene", "builtin", "mesh"),

@@ -268,7 +268,7 @@ def decompose(
     check_ranks(ranks, (count * colors, len(inside), tensor.shape[3]))
     flat = tensor.reshape(count * colors, *tensor.shape[2:])
     met = flat[:, inside] * weight[inside, None]
-    found = tucker.truncated(met, ranks=ranks)
+    found = tucker.oriented(tucker.truncated(met, ranks=ranks))
     core, (along, _, across) = found.core, found.factor
     seen = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, view, k]
     unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)

@@ -61,7 +61,7 @@ def factor(
     flat = found.tensor.reshape(count * colors, views, harmonic)
     seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
     smooth = tucker.multiply(flat, seen, mode=1)
-    least = tucker.truncated(smooth, ranks=(functions, min(kinds, views), terms))
+    least = tucker.oriented(tucker.truncated(smooth, ranks=(functions, min(kinds, views), terms)))
     along, _, across = least.factor
     view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, k]
     # Light maps carry the size, so that view factors have a mean square of about one.
@@ -157,4 +157,5 @@ def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
     size = jnp.sqrt(jnp.mean(brdf.light_map**2, (1, 2, 3), keepdims=True))
     rows = np.asarray(brdf.view_map * size, np.float64)
     _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
+    axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)  # Signs are otherwise as rounding has them.
     return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)

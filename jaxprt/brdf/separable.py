@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt.files import objects
@@ -18,7 +19,13 @@ from jaxprt.staging import apart
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
 _MOST_TERMS = 256
 _BLOCK = 2048  # directions that are looked up at once, and again for gradients, so that what was read is not kept
+_NEAR = 1e-3  # of the norm: more than the rounding of another processor
+_MORE = 4  # terms beyond those asked for, whose values may equal that of the last one
 _NULL = 4  # rounding errors of the largest value: less is none
+
+# Places on square maps, inside the disk and away from its symmetries, at which light factors are compared.
+_RADIUS, _TURN = 0.45 * np.sqrt((np.arange(16) + 0.5) / 16), 2.4 * np.arange(16) + 0.3
+_MARKS = 0.5 + _RADIUS * np.stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 class SeparableBrdf(eqx.Module):
@@ -83,6 +90,38 @@ def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
     return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
 
 
+def marked(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray, "r m"]:
+    """Values of light factors at a few texels: by these transport knows the BRDF that it was made for."""
+    edge = light_map.shape[1]
+    row, column = (_MARKS * edge).astype(int)
+    return np.asarray(light_map)[:, row, column].reshape(len(light_map), -1)
+
+
+def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF") -> None:
+    """Refuses light factors that are not those which transport was made of, up to the rounding of other processors.
+
+    Values that are being traced, and transport that does not know its BRDF, pass.
+
+    Args:
+        known: `marked` of the transport's light factors, or None.
+        light_map: Of the BRDF: those of all of the transport's terms, or of the first ones.
+        name: What errors call the BRDF.
+
+    Raises:
+        ValueError: They differ.
+    """
+    if known is None or isinstance(known, Tracer) or isinstance(light_map, Tracer) or len(light_map) > len(known):
+        return
+    expected, found = np.asarray(known)[: len(light_map)], marked(light_map)
+    same_colors = expected.shape == found.shape
+    distance, norm = float(np.linalg.norm(found - expected)) if same_colors else math.inf, np.linalg.norm(expected)
+    if not distance <= _NEAR * norm:
+        raise ValueError(
+            f"{name} must be the one that the transport was made for, got another: its light factors differ from the "
+            f"transport's by {distance / (norm or 1):.2g} of their norm"
+        )
+
+
 def factor(
     brdf: Callable, *, terms: int | None = None, error: float | None = None, resolution: int = 48
 ) -> SeparableBrdf:
@@ -132,9 +171,8 @@ def factor(
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
     covariance = light_covariance(direction[inside], degree=_DEGREE)
-    value, vector, remainder = _leading(matrix, covariance, terms, error)
-    terms = value.size
-    project = vector.reshape(color, -1, terms) * jnp.sqrt(solid_angle)[:, None]
+    value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
+    project = vector.reshape(color, -1, value.size) * jnp.sqrt(solid_angle)[:, None]
     light_map = jnp.einsum("cor,coi->ri", project, table)
     # M C M^T u = value u continues the view map to texels of no weight, which bilinear lookup needs at the rim.
     response = covariance @ (matrix.T @ vector)
@@ -142,6 +180,9 @@ def factor(
     known = value > _NULL * jnp.finfo(value.dtype).eps * jnp.max(value)
     inverse = jnp.where(known, 1 / jnp.where(known, value, 1), 0)
     view_map = jnp.einsum("coi,ir->roc", flux, response * inverse)
+    # Transport that another machine made serves the same factors here.
+    turn = jnp.asarray(eigen.orientation(np.asarray(value), np.asarray(vector)), value.dtype)[:, :terms]
+    light_map, view_map = turn.T @ light_map, jnp.einsum("rs,roc->soc", turn, view_map)
     shape = (terms, resolution, resolution)
     light_map, view_map = light_map.reshape(*shape, 1), view_map.reshape(*shape, color)
     return SeparableBrdf(light_map, view_map, remainder[terms - 1], hemisphere.parabolic_coordinates)
@@ -264,21 +305,26 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
     return total
 
 
-def _leading(matrix: Array, covariance: Array, terms: int | None, error: float | None) -> tuple[Array, Array, Array]:
-    """Squared singular values, vectors and remaining errors of `terms` terms, or of as many as the error needs."""
+def _leading(
+    matrix: Array, covariance: Array, terms: int | None, error: float | None
+) -> tuple[Array, Array, Array, int]:
+    """Squared singular values, vectors and remaining errors of `terms` terms, or of as many as the error needs.
+
+    A few more follow, since terms of equal values are told apart together. The last is the number of terms.
+    """
     total = jnp.sum((matrix @ covariance) * matrix)
     most = min(_MOST_TERMS, matrix.shape[1])
-    count = min(4, most) if terms is None else terms
+    count = min(4, most) if terms is None else min(terms + _MORE, *matrix.shape)
     while True:
         value, vector, _ = eigen.left_singular(matrix, metric=covariance, terms=count)
         lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)
         remainder = jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF is met exactly
-        if error is None:
-            return value, vector, remainder
+        if terms is not None:
+            return value, vector, remainder, terms
+        assert error is not None
         reached = np.flatnonzero(np.asarray(remainder) <= error)
         if reached.size:
-            enough = int(reached[0]) + 1
-            return value[:enough], vector[:, :enough], remainder
+            return value, vector, remainder, int(reached[0]) + 1
         if count == most:
             raise ValueError(f"error must be at least {remainder[-1]:.3g}, which {count} terms reach; got {error}")
         count = min(4 * count, most)

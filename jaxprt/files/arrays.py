@@ -17,8 +17,12 @@ import filelock
 import numpy as np
 import zarr
 
-VERSION = 2
+VERSION = 3
+_NEAR = 1e-3  # of the norm: more than rounding on another processor changes, less than another material does
 _FORMAT = "jaxprt blocks"
+_SUMS = 32
+_PART = 1 << 20  # values that are summed at a time
+_STRIDE = 7919  # by which signs move from one part to the next
 
 
 class Layout(NamedTuple):
@@ -37,19 +41,30 @@ class BlockStore:
         header: What the arrays were made from, JSON values; must equal what an existing store says.
         layout: Per array, its blocks.
         blocks: Number of blocks.
+        near: Sketches, by `sketch`, of computed arrays that the store's were made from. They must equal those of an
+            existing store up to rounding, which differs between kinds of processors.
 
     Raises:
-        ValueError: The path holds something else, another format version, or arrays made from something else.
+        ValueError: The path holds something else, another version of the format or of the algorithm, or arrays made
+            from something else.
     """
 
-    def __init__(self, path: str | os.PathLike, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        header: Mapping[str, Any],
+        layout: Mapping[str, Layout],
+        blocks: int,
+        near: Mapping[str, list[float]] | None = None,
+    ):
         self.path = Path(path)
         self._layout = dict(layout)
         shapes = {name: [*at.shape, at.dtype] for name, at in layout.items()}
         header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, "shapes": shapes, **header}
+        near = dict(near or {})
         if not self.path.exists():
-            _create(self.path, header, self._layout, blocks)
-        self._group = _open(self.path, header)
+            _create(self.path, {**header, "near": near}, self._layout, blocks)
+        self._group = _open(self.path, header, near)
         lost = [name for name in (*self._layout, "checksum") if name not in self._group]
         if lost:
             raise ValueError(f"{self.path} lacks the array {lost[0]}: it is damaged; delete it to start anew")
@@ -97,6 +112,23 @@ class BlockStore:
         return np.asarray(self._array(name)[place]).reshape(shape)
 
 
+def sketch(array: Any) -> list[float]:
+    """The norm of an array, and sums of its values with random signs.
+
+    The distance between the sketches of two arrays of one shape is about that between the arrays.
+    """
+    flat = np.asarray(array).reshape(-1)
+    sign = np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
+    total, square = np.zeros(_SUMS), 0.0
+    for number, first in enumerate(range(0, len(flat), _PART)):
+        part = flat[first : first + _PART].astype(np.float64)
+        start = _STRIDE * number % _PART
+        signed = part * sign[start : start + len(part)]
+        total += np.pad(signed, (0, -len(part) % _SUMS)).reshape(-1, _SUMS).sum(0)
+        square += float(part @ part)
+    return [float(np.sqrt(square)), *total.tolist()]
+
+
 def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:
     """Makes an empty store aside and moves it into place, so that a half-made one is never met."""
     aside = path.with_name(f"{path.name}.{os.getpid()}.new")
@@ -112,7 +144,7 @@ def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout],
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _open(path: Path, header: Mapping[str, Any]) -> zarr.Group:
+def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> zarr.Group:
     try:
         group = zarr.open_group(path, mode="r+")
         found = dict(group.attrs)
@@ -122,11 +154,32 @@ def _open(path: Path, header: Mapping[str, Any]) -> zarr.Group:
         raise ValueError(f"{path} exists but is no store of this package; name another path")
     if found.get("version") != VERSION:
         raise ValueError(f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it")
+    if "system" in header and found.get("system") == header["system"] and found.get("algorithm") != header["algorithm"]:
+        raise ValueError(
+            f"{path} was made by version {found.get('algorithm')} of the algorithm, this package has version "
+            f"{header['algorithm']}, which gives other results; delete it or name another path"
+        )
     differ = [key for key in header if found.get(key) != header[key]]
     if differ:
         told = "; ".join(f"{key}: there {found.get(key)}, now {header[key]}" for key in differ)
         raise ValueError(f"{path} holds arrays made from something else ({told}); name another path or delete it")
+    _check_near(path, found.get("near", {}), near)
     return group
+
+
+def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
+    """Refuses a store whose arrays were made from others than these by more than rounding."""
+    if sorted(found) != sorted(near):
+        raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {sorted(found)}; delete it")
+    for name, now in near.items():
+        norm = max(now[0], found[name][0])
+        distance = float(np.linalg.norm(np.subtract(now, found[name])))
+        if not distance <= _NEAR * norm:
+            raise ValueError(
+                f"{path} holds arrays made from something else ({name}: there and now differ by "
+                f"{distance / (norm or 1):.2g} of the norm); name another path or delete it. Where it was factored or "
+                "traced again on another machine, save it there by jaxprt.files.save and load it here"
+            )
 
 
 def _place(layout: Layout, block: int) -> tuple[slice, ...]:

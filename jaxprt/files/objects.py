@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import zarr
+from jax.core import Tracer
 
 VERSION = 1
 _FORMAT = "jaxprt object"
@@ -173,9 +174,9 @@ def _describe(value: Any, place: str, arrays: list, modules: set[str]) -> dict[s
 
 
 def _describe_array(value: Any, place: str, arrays: list) -> dict[str, Any]:
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         raise TypeError(f"{place} must have values to be saved, got one that JAX is tracing")
-    if isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.extended):
         raise TypeError(f"{place} must be an array of numbers to be saved, got {value.dtype}")
     kind = "jax" if isinstance(value, jax.Array) else "numpy" if isinstance(value, np.ndarray) else "scalar"
     for number, (known, _) in enumerate(arrays):

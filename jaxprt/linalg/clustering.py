@@ -3,6 +3,10 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxprt.linalg import eigen
+
+_TIE = 1e-6  # of the width, below which points are side by side
+
 
 def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray, "p m"]:
     """Cuts points into clusters of equal size, halving across the widest direction until there are enough.
@@ -31,8 +35,11 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
             done.append(np.pad(member, (0, size - len(member)), "edge"))
             continue
         offset = point[member] - point[member].mean(0)
-        _, axis = np.linalg.eigh(offset.T @ offset)
-        order = member[np.argsort(offset @ axis[:, -1], kind="stable")]
+        value, axis = np.linalg.eigh(offset.T @ offset)
+        axis = axis[:, ::-1] @ eigen.orientation(value[::-1], axis[:, ::-1])
+        # Symmetric meshes have points side by side that rounding alone would order, otherwise on other processors.
+        along = offset @ axis[:, 0]
+        order = member[np.argsort(np.round(along / (_TIE * (np.ptp(along) or 1))), kind="stable")]
         # Whole clusters' worth of points on either side, so that in the end all sizes differ by at most one.
         first = parts // 2
         cut = len(member) // parts * first + min(len(member) % parts, first)

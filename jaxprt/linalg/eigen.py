@@ -11,10 +11,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 _OVERSAMPLE = 8
 _DEPTH = 5  # Blocks in the span, at most; one block alone needs five times as many products on BRDF matrices.
+_EQUAL = 1e-3  # difference of neighboring eigenvalues, as a share of the larger, below which they count as equal
 _WIDTH = 512  # Vectors in the span, about at most: its own eigenvectors must not cost more than the products.
 
 
@@ -184,3 +186,28 @@ def power(
     items = (jnp.arange(terms), jax.random.split(jax.random.key(0), terms))
     (values, vectors), residual = jax.lax.scan(term, empty, items)
     return values, vectors, residual
+
+
+def orientation(value: Float[np.ndarray, " r"], vector: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "r r"]:
+    """The rotation after which eigenvectors are the same on every kind of processor, up to rounding.
+
+    Rounding decides the signs of eigenvectors, and which basis stands for equal eigenvalues. Here each vector, and each
+    set of vectors whose eigenvalues are nearly equal, is turned so that its products with fixed random vectors are
+    triangular with a positive diagonal. Values on both sides of a cut may be equal too: then only more vectors help.
+
+    Args:
+        value: Eigenvalues, falling.
+        vector: Orthonormal eigenvectors as columns.
+
+    Returns:
+        An orthogonal matrix that mixes only vectors of nearly equal eigenvalues: multiply the columns by it.
+    """
+    value, vector = np.abs(np.asarray(value, np.float64)), np.asarray(vector, np.float64)
+    probe = np.random.default_rng(0).normal(size=vector.shape)
+    falls = value[:-1] - value[1:] > _EQUAL * value[:-1]
+    first = np.flatnonzero(np.concatenate([[True], falls]))
+    result = np.zeros((len(value), len(value)))
+    for start, end in zip(first, [*first[1:], len(value)], strict=True):
+        turn, triangle = np.linalg.qr(vector[:, start:end].T @ probe[:, : end - start])
+        result[start:end, start:end] = turn * np.where(np.diag(triangle) < 0, -1, 1)
+    return result

@@ -241,3 +241,18 @@ def _dominant_jvp(rank, primal, tangent):
 def _check(tensor: Array, ranks: tuple[int, ...]) -> None:
     if len(ranks) != tensor.ndim or any(not 1 <= r <= n for r, n in zip(ranks, tensor.shape, strict=False)):
         raise ValueError(f"ranks must be one for each mode, from 1 to its size in {list(tensor.shape)}, got {ranks}")
+
+
+def oriented(decomposition: Tucker) -> Tucker:
+    """The same decomposition with factors that are the same on every kind of processor, up to rounding.
+
+    Each mode is turned by `jaxprt.linalg.eigen.orientation`, and the core against it. What the decomposition stands for
+    does not change.
+    """
+    core, factor = decomposition.core, []
+    for mode, each in enumerate(decomposition.factor):
+        strength = jnp.diagonal(gram(core, mode=mode))
+        turn = jnp.asarray(eigen.orientation(np.asarray(strength), np.asarray(each)), core.dtype)
+        core = multiply(core, turn, mode=mode)
+        factor.append(each @ turn)
+    return Tucker(core, tuple(factor))

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxprt import require
 from jaxprt.brdf.dynamic import DynamicBrdf, Mixed
-from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.brdf.separable import SeparableBrdf, check_mark
 from jaxprt.relight import direct, lobe, separable
 from jaxprt.relight.lobe import LobeLight, LobeView
 from jaxprt.scene.environment import Environment
@@ -251,6 +251,8 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
     terms = brdf.light_map.shape[0] + changes
     if terms != own.terms.terms or (changes and brdf.lobe is not None) != _has_pyramid(own):
         raise ValueError(f"the BRDF of region {number} must be the one that its transport was made for")
+    light = brdf.light_map[..., None] if changes else brdf.light_map
+    check_mark(own.terms.mark, light, name=f"the BRDF of region {number}")
     if changes != (material is not None):
         raise ValueError(f"region {number} {'needs a material' if changes else 'has one BRDF for good: give None'}")
     if material is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.brdf.separable import SeparableBrdf
+from jaxprt.brdf.separable import SeparableBrdf, check_mark
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
 from jaxprt.staging import apart, linear
@@ -28,11 +28,13 @@ class Transport(Protocol):
         position: Vertex positions in world units, in the mesh's order.
         frame: Rows are tangent, bitangent, normal.
         rms: Root mean square over vertices and terms of each coefficient.
+        mark: Some values of the light factors that it was made of, `jaxprt.brdf.separable.marked`; None if unknown.
     """
 
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     rms: Float[Array, " b"]
+    mark: Float[Array, "r m"] | None
 
     @property
     def terms(self) -> int:
@@ -209,12 +211,14 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
         The view-modulated tuple of every vertex, in the mesh's order.
 
     Raises:
-        ValueError: The eye is not one position, or not finite. Inside `jax.jit` its values are not known, and all
-            vertices get NaN.
+        ValueError: The eye is not one position, or not finite: inside `jax.jit` its values are not known, and all
+            vertices get NaN. Or the transport was made for another BRDF: values that JAX is tracing are not compared,
+            nor is transport that does not know its BRDF.
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
     require.position("the eye", eye)
+    check_mark(transport.mark, brdf.light_map)
     return _view_tuple(transport, brdf, eye)
 
 
@@ -299,8 +303,8 @@ def radiance(
         Linear radiance per vertex, in the light's units.
 
     Raises:
-        ValueError: The BRDF has another number of terms than the transport, or as in `light_tuple`. That the
-            transport was made for this BRDF is not known and not checked.
+        ValueError: The BRDF has another number of terms than the transport, the transport was made for another BRDF,
+            or as in `light_tuple`.
 
     Reference: Wang, Tran, Luebke 2004, equation 6.
     """

@@ -3,6 +3,7 @@
 import abc
 import hashlib
 import os
+import uuid
 from collections.abc import Mapping
 from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor, as_completed
 from typing import Any
@@ -21,7 +22,15 @@ class Job(abc.ABC):
     @property
     @abc.abstractmethod
     def header(self) -> Mapping[str, Any]:
-        """What the result depends on, as JSON values; equal headers mean equal results."""
+        """What the result depends on, as JSON values; equal headers mean equal results, up to what `near` tells.
+
+        With the name of a `system` belongs the version of its `algorithm`, which a release raises when results change.
+        """
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches, by `jaxprt.files.arrays.sketch`, of what the result depends on and rounding may change."""
+        return {}
 
     @property
     @abc.abstractmethod
@@ -70,7 +79,7 @@ def compute(
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
     blocks = -(-job.vertices // job.step)
-    store = None if path is None else BlockStore(path, job.header, job.layout, blocks)
+    store = None if path is None else BlockStore(path, job.header, job.layout, blocks, job.near)
     result = {name: np.zeros(_whole(at, blocks), at.dtype) for name, at in job.layout.items()}
     with tqdm.tqdm(total=job.vertices, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
         todo = [block for block in range(blocks) if not _load(store, block, result, job)]
@@ -104,7 +113,7 @@ def scene_key(mesh: Mesh) -> str:
 
 
 def _run(job, todo, store, executor, result, bar) -> None:
-    key = fingerprint(np.frombuffer(repr(sorted(job.header.items())).encode(), np.uint8))
+    key = uuid.uuid4().hex
     _jobs[key] = job
     own = None if executor is not None else ThreadPoolExecutor(os.cpu_count())
     pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]

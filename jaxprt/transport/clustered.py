@@ -20,15 +20,17 @@ import numpy as np
 from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
 from jaxprt import require
-from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.files.arrays import Layout
+from jaxprt.brdf.separable import SeparableBrdf, marked
+from jaxprt.files.arrays import Layout, sketch
 from jaxprt.linalg import clustering, eigen
 from jaxprt.sphere import haar
 from jaxprt.staging import linear
-from jaxprt.transport import blocks, separable
+from jaxprt.transport import blocks, separable, visibility
 from jaxprt.transport.direct import DirectTransport
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
+_PART = 16  # texels, of which one is compared with those of a store
 _SAMPLE = 24  # vertices of a cluster that choose its coefficients
 
 
@@ -48,6 +50,7 @@ class ClusteredTransport(eqx.Module):
         vertex: Vertex of each row.
         place: Row of each vertex.
         rms: Root mean square over rows and terms of each coefficient as kept.
+        mark: Some values of the light factors that it was made of, by which other BRDFs are refused; None if unknown.
     """
 
     index: UInt[Array, "p k"]
@@ -59,6 +62,7 @@ class ClusteredTransport(eqx.Module):
     vertex: Int[Array, " q"]
     place: Int[Array, " v"]
     rms: Float[Array, " b"]
+    mark: Float[Array, "r z"] | None = None
 
     @property
     def terms(self) -> int:
@@ -86,7 +90,9 @@ class ClusteredTransport(eqx.Module):
         index, mode = self.index[:, :count], self.mode[:, :count, :modes]
         core, weight = self.core[:, :modes, :vectors, :terms], self.weight[:, :, :vectors]
         rms = _rms(index, mode, core, weight, size=self.rms.shape[0])
-        return ClusteredTransport(index, mode, core, weight, self.position, self.frame, self.vertex, self.place, rms)
+        same = (self.position, self.frame, self.vertex, self.place)
+        mark = None if self.mark is None else self.mark[:terms]
+        return ClusteredTransport(index, mode, core, weight, *same, rms, mark)
 
     @jax.jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
@@ -225,6 +231,7 @@ def precompute(
         jnp.asarray(row, jnp.int32),
         jnp.asarray(place),
         rms,
+        jnp.asarray(marked(brdf.light_map)),
     )
 
 
@@ -356,9 +363,21 @@ class _Job(ClusterJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        brdf = f"{self.brdf.coordinates.__name__} {blocks.fingerprint(self.brdf.light_map)}"
-        direct = blocks.fingerprint(self.direct.level, self.direct.frame, self.member)
-        return {"system": "clustered", "direct": direct, "brdf": brdf, **self._shape}
+        given = self.direct.level if self.direct.key is None else self.direct.key
+        return {
+            "system": "clustered",
+            "algorithm": {"visibility": visibility.ALGORITHM, "clustered": ALGORITHM},
+            "direct": blocks.fingerprint(given),
+            "member": blocks.fingerprint(np.asarray(self.member, np.int64)),
+            "maps": self.brdf.coordinates.__name__,
+            **self._shape,
+        }
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        # The level itself is known by its key: a part of it shows whether it is still what the key says.
+        parts = {"direct": self.direct.level[::_PART], "frame": self.direct.frame, "brdf": self.brdf.light_map}
+        return {name: sketch(each) for name, each in parts.items()}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

@@ -14,13 +14,14 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8, UInt32
 
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.transport import blocks, visibility
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 _HALF = visibility.BLOCK // 2
 _MIDDLE = 8  # sixteen of the seventeen levels fit four bits: 9 becomes 8
 
@@ -33,11 +34,14 @@ class DirectTransport(eqx.Module):
             Texels first, so that one texel's are contiguous.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
+        key: Fingerprint of the meshes, vertices and size that were given, by which stores of what is made of the
+            visibility are known; None if unknown.
     """
 
     level: UInt8[Array, "d w"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
+    key: UInt32[Array, "8"] | None = None
 
     @property
     def size(self) -> int:
@@ -99,7 +103,10 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = mesh.position[visibility.chosen(mesh, vertex)]
-    return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame))
+    key = np.frombuffer(
+        bytes.fromhex(blocks.fingerprint(np.frombuffer(repr(job.header).encode(), np.uint8))), np.uint32
+    )
+    return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame), jnp.asarray(key))
 
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:
@@ -116,7 +123,7 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"system": "direct", "mesh": self.mesh_key, "size": self.size}
+        return self.made_by("direct", ALGORITHM)
 
     @property
     def layout(self) -> Mapping[str, Layout]:

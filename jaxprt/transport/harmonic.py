@@ -23,6 +23,8 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.transport import blocks, visibility
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
+
 
 class TransferMatrix(eqx.Module):
     """Light that arrives at each vertex, as a linear map of the distant light.
@@ -204,7 +206,7 @@ class _MatrixJob(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"system": "harmonic", "mesh": self.mesh_key, "degree": self.degree, "size": self.size}
+        return self.made_by("harmonic", ALGORITHM, degree=self.degree)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -225,7 +227,7 @@ class _VectorJob(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"system": "harmonic diffuse", "mesh": self.mesh_key, "degree": self.degree, "size": self.size}
+        return self.made_by("harmonic diffuse", ALGORITHM, degree=self.degree)
 
     @property
     def layout(self) -> Mapping[str, Layout]:

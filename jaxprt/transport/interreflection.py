@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxprt.brdf.harmonic import HarmonicBrdf
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.transport import blocks, bounce, visibility
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector, check
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 _RAYS = 1 << 12  # hits that are shaded at once
 
 
@@ -115,7 +116,7 @@ def interreflect_diffuse(
     )
     for number in range(bounces):
         rows = np.ascontiguousarray((last * albedo[np.asarray(mesh.region)].T).transpose(2, 1, 0))
-        job = _DiffuseBounceJob.make(mesh, None, None, size, rows=rows)
+        job = _DiffuseBounceJob.make(mesh, None, None, size, rows=rows, albedo=albedo)
         label = f"bounce {number + 1}"
         store = None if path is None else os.path.join(path, f"bounce_{number + 1}")
         last = blocks.compute(job, path=store, executor=executor, progress=progress, label=label)["vector"]
@@ -175,9 +176,12 @@ class _BounceJob(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        tables = blocks.fingerprint(*(each.table for each in self.brdf), self.occluder.region)
-        rows = blocks.fingerprint(self.rows)
-        return {"system": "bounce", "mesh": self.mesh_key, "size": self.size, "brdf": tables, "rows": rows}
+        return self.made_by("bounce", ALGORITHM, region=blocks.fingerprint(np.asarray(self.occluder.region, np.int64)))
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        tables = {f"brdf {number}": sketch(each.table) for number, each in enumerate(self.brdf)}
+        return {"rows": sketch(self.rows), **tables}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -204,11 +208,16 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
     """Blocks of what one bounce adds to transfer vectors."""
 
     rows: np.ndarray  # [v, l, i] albedo times the bounce before
+    albedo: np.ndarray  # of each region
 
     @property
     def header(self) -> Mapping[str, Any]:
-        rows = blocks.fingerprint(self.rows)
-        return {"system": "diffuse bounce", "mesh": self.mesh_key, "size": self.size, "rows": rows}
+        region = blocks.fingerprint(np.asarray(self.occluder.region, np.int64))
+        return self.made_by("diffuse bounce", ALGORITHM, region=region, albedo=self.albedo.tolist())
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        return {"rows": sketch(self.rows)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

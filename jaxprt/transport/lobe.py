@@ -24,6 +24,7 @@ from jaxprt.staging import apart
 from jaxprt.transport import blocks, harmonic, visibility
 from jaxprt.transport.direct import DirectTransport
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 DEGREE = 6  # of the harmonics that the diffuse part is lit by
 _BITS = 2  # finest scales, which are read from bits
 _BLOCK = 1024
@@ -277,7 +278,7 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return {"system": "lobe", "mesh": self.mesh_key, "size": self.size, "degree": DEGREE}
+        return self.made_by("lobe", ALGORITHM, degree=DEGREE)
 
     @property
     def layout(self) -> Mapping[str, Layout]:

@@ -24,6 +24,7 @@ class QuantizedTransport(eqx.Module):
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
         rms: Root mean square over vertices and terms of each coefficient as kept.
+        mark: As `jaxprt.transport.sparse.SparseTransport` has it.
     """
 
     index: UInt[Array, "k v r"]
@@ -32,6 +33,7 @@ class QuantizedTransport(eqx.Module):
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     rms: Float[Array, " b"]
+    mark: Float[Array, "r m"] | None = None
 
     def keep(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
         """The first `count` coefficients, largest before rounding, of the first `terms` terms (all of them if None)."""
@@ -40,7 +42,8 @@ class QuantizedTransport(eqx.Module):
         index, level, quantum = self.index[:count, :, :terms], self.level[:count, :, :terms], self.quantum[:, :terms]
         kept = QuantizedTransport(index, level, quantum, self.position, self.frame, self.rms)
         rms = sparse.rms(index, dequantize(kept).value, self.rms.shape[0])
-        return QuantizedTransport(index, level, quantum, self.position, self.frame, rms)
+        mark = None if self.mark is None else self.mark[:terms]
+        return QuantizedTransport(index, level, quantum, self.position, self.frame, rms, mark)
 
     @jax.jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
@@ -110,7 +113,8 @@ def quantize(transport: SparseTransport) -> QuantizedTransport:
     level = jnp.round(transport.value / jnp.where(quantum > 0, quantum, 1))
     level = jnp.clip(level, -last, last).astype(jnp.int32)
     index = jnp.where(jnp.any(level != 0, -1), transport.index, 0)
-    return QuantizedTransport(index, _pack(level), quantum, transport.position, transport.frame, transport.rms)
+    same = (transport.position, transport.frame, transport.rms, transport.mark)
+    return QuantizedTransport(index, _pack(level), quantum, *same)
 
 
 @jax.jit
@@ -118,7 +122,8 @@ def dequantize(transport: QuantizedTransport) -> SparseTransport:
     """The transport in floating point again, rounded as it is."""
     level = _unpack(transport.level.reshape(-1)).reshape(*transport.level.shape, -1)
     value = level.astype(transport.quantum.dtype) * transport.quantum
-    return SparseTransport(transport.index, value, transport.position, transport.frame, transport.rms)
+    same = (transport.position, transport.frame, transport.rms)
+    return SparseTransport(transport.index, value, *same, mark=transport.mark)
 
 
 def _pack(level: Array) -> Array:

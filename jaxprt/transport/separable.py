@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped, UInt8
 
-from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.files.arrays import Layout
+from jaxprt.brdf.separable import SeparableBrdf, marked
+from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport import blocks, sparse, visibility
 from jaxprt.transport.sparse import SparseTransport
+
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 
 
 def precompute(
@@ -69,7 +71,8 @@ def precompute(
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
     rms = sparse.rms(result["index"], result["value"], 6 * size * size)
     index, value = jnp.asarray(result["index"]), jnp.asarray(result["value"])
-    return SparseTransport(index, value, mesh.position[visibility.chosen(mesh, vertex)], jnp.asarray(job.frame), rms)
+    position, frame = mesh.position[visibility.chosen(mesh, vertex)], jnp.asarray(job.frame)
+    return SparseTransport(index, value, position, frame, rms, mark=jnp.asarray(marked(brdf.light_map)))
 
 
 @jax.jit
@@ -133,8 +136,11 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        brdf = f"{self.brdf.coordinates.__name__} {blocks.fingerprint(self.brdf.light_map)}"
-        return {"system": "separable", "mesh": self.mesh_key, "brdf": brdf, "keep": self.keep, "size": self.size}
+        return self.made_by("separable", ALGORITHM, maps=self.brdf.coordinates.__name__, keep=self.keep)
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        return {"brdf": sketch(self.brdf.light_map)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

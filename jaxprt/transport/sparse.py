@@ -38,6 +38,7 @@ class SparseTransport(eqx.Module):
         frame: Rows are tangent, bitangent, normal.
         rms: Root mean square over vertices and terms of each coefficient as kept.
         transpose: The same by number, for gradients by the light; from `with_transpose`.
+        mark: Some values of the light factors that it was made of, by which other BRDFs are refused; None if unknown.
     """
 
     index: UInt[Array, "k v r"]
@@ -46,13 +47,16 @@ class SparseTransport(eqx.Module):
     frame: Float[Array, "v 3 3"]
     rms: Float[Array, " b"]
     transpose: Transpose | None = None
+    mark: Float[Array, "r m"] | None = None
 
     def keep(self, count: int, *, terms: int | None = None) -> "SparseTransport":
         """The `count` largest coefficients of the first `terms` terms (all of them if None)."""
         require.between("count", count, 1, self.index.shape[0])
         require.between("terms", terms, 1, self.terms)
         index, value = self.index[:count, :, :terms], self.value[:count, :, :terms]
-        return SparseTransport(index, value, self.position, self.frame, rms(index, value, self.rms.shape[0]))
+        mark = None if self.mark is None else self.mark[:terms]
+        size = rms(index, value, self.rms.shape[0])
+        return SparseTransport(index, value, self.position, self.frame, size, mark=mark)
 
     def with_transpose(self) -> "SparseTransport":
         """The same, whose gradient by the light takes about as long as the light itself: without, five times as long.

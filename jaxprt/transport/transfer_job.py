@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float, Float16
 
 from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Layout, sketch
 from jaxprt.linalg import eigen, tucker
 from jaxprt.sphere import cubemap, haar, harmonics
 from jaxprt.transport import blocks, bounce, clustered, visibility
 
+ALGORITHM = 1  # version of the results; a release that changes them raises it
 DEGREE = 3  # of the harmonics that arrive
 _AGAIN = 2  # edge of the light's faces for two bounces
 
@@ -31,13 +32,12 @@ class ResponseJob(visibility.VisibilityJob):
     @property
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
-        return {
-            "system": "response",
-            "mesh": self.mesh_key,
-            "size": self.size,
-            "edge": self.edge,
-            "brdf": _key(self.basis),
-        }
+        return self.made_by("response", ALGORITHM, edge=self.edge, maps=self.basis.coordinates.__name__)
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of the light factors."""
+        return {"brdf": sketch(self.basis.light_map)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -72,15 +72,25 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
     region: np.ndarray
     member: np.ndarray
     components: int
+    system: ClassVar[str] = "transfer"
 
     @property
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
-        key = " ".join(_key(basis) for basis in self.bases)
-        made = blocks.fingerprint(self.region, self.member, self.white, self.scale)
+        maps = [basis.coordinates.__name__ for basis in self.bases]
+        made = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
         kinds = self.response[0].shape[1]
-        same = {"system": "transfer", "mesh": self.mesh_key, "size": self.size, "kinds": kinds, "brdfs": key}
-        return {**same, "made": made, "components": self.components}
+        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components}
+        return self.made_by(self.system, ALGORITHM, **own)
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of the BRDFs' functions, and of what their light factors make of direct light."""
+        parts = {"white": self.white, "scale": self.scale}
+        for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
+            parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
+            parts |= {f"response {number}": response}
+        return {name: sketch(each) for name, each in parts.items()}
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
         """Harmonics of what arrives at some vertices, before it is decomposed."""
@@ -187,11 +197,12 @@ class AgainJob(_PathJob):
     """Tensors of two bounces."""
 
     function: np.ndarray
+    system: ClassVar[str] = "transfer 2"
 
     @property
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
-        return {**super().header, "system": "transfer 2", "first": blocks.fingerprint(*self.response)}
+        return {**super().header, "function": self.function.tolist()}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -279,7 +290,3 @@ def _expand(weight: Array, core: Array, coarse: Array) -> Array:
     """What arrives at the vertices of a cluster from each coarse texel and function, [s l q, m] as harmonics first."""
     met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
     return jnp.einsum("mn,nslq->slqm", weight, met).reshape(core.shape[2], -1, len(weight))
-
-
-def _key(basis: SeparableBrdf) -> str:
-    return f"{basis.coordinates.__name__} {blocks.fingerprint(basis.light_map, basis.view_map)}"

@@ -18,6 +18,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions
 from jaxprt.transport import blocks
 
+ALGORITHM = 1  # version of what is traced; a release that traces differently raises it
 BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
 LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
 _SIDE = 4
@@ -177,7 +178,7 @@ class VisibilityJob(blocks.Job):
         frame: Rows are tangent, bitangent, normal.
         occluder: What casts shadows, in NumPy arrays.
         size: Edge of the cubemap's faces in texels.
-        mesh_key: Fingerprint of all that the visibility depends on.
+        mesh_key: Fingerprint of all that is given and the visibility depends on.
     """
 
     start: np.ndarray
@@ -193,8 +194,16 @@ class VisibilityJob(blocks.Job):
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
         frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
-        key = blocks.fingerprint(start, frame, shadowing.position, shadowing.face)
+        # By what is given, and not by what is computed of it, which another kind of processor rounds otherwise.
+        given = (mesh.position, mesh.normal, mesh.tangent, shadowing.position)
+        numbers = (np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face))
+        key = blocks.fingerprint(*given, *numbers)
         return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, **more)
+
+    def made_by(self, system: str, algorithm: int, **more: Any) -> dict[str, Any]:
+        """The header of a system's job: what is traced, and by which versions of the algorithms."""
+        versions = {"visibility": ALGORITHM, system: algorithm}
+        return {"system": system, "algorithm": versions, "mesh": self.mesh_key, "size": self.size, **more}
 
     @cached_property
     def rays(self) -> Occluder:

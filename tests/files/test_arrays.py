@@ -159,7 +159,7 @@ def test_stores_with_another_number_of_blocks_are_refused(path):
 
 def test_stores_of_another_version_are_refused(path, monkeypatch):
     monkeypatch.setattr(arrays, "VERSION", arrays.VERSION + 1)
-    with pytest.raises(ValueError, match=r"a\.prt has format version 2, this package writes 3; delete it"):
+    with pytest.raises(ValueError, match=r"a\.prt has format version 3, this package writes 4; delete it"):
         open_store(path)
 
 
