@@ -154,10 +154,11 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
         raise ValueError(f"{path} exists but is no store of this package; name another path")
     if found.get("version") != VERSION:
         raise ValueError(f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it")
-    if "system" in header and found.get("system") == header["system"] and found.get("algorithm") != header["algorithm"]:
+    before, now = found.get("algorithm"), header.get("algorithm")
+    if before != now and found.get("system") == header.get("system"):
         raise ValueError(
-            f"{path} was made by version {found.get('algorithm')} of the algorithm, this package has version "
-            f"{header['algorithm']}, which gives other results; delete it or name another path"
+            f"{path} was made by version {before} of the algorithm, this package has version {now}, which gives other "
+            "results; delete it or name another path"
         )
     differ = [key for key in header if found.get(key) != header[key]]
     if differ:

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, Lambert, separable
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, separable
 from jaxprt.sphere import hemisphere
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
@@ -139,3 +139,16 @@ def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
     assert separable.sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
     with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
         separable.sample_error(WANG, WANG, samples=0)
+
+
+def test_factoring_again_with_other_rounding_finds_the_same_factors_in_the_same_order_and_signs():
+    # Isotropic, so that singular values come in equal pairs, one of which the last term cuts.
+    brdf = CookTorrance(diffuse=0.3, roughness=0.3)
+    first = separable.factor(brdf, terms=5, resolution=12)
+    again = separable.factor(
+        lambda wi, wo: brdf(wi, wo) * (1 + 1e-6 * jnp.sin(1e4 * wi[..., :1])), terms=5, resolution=12
+    )
+    assert jnp.linalg.norm(again.light_map - first.light_map) < 1e-3 * jnp.linalg.norm(first.light_map)
+    separable.check_mark(jnp.asarray(separable.marked(first.light_map)), again.light_map)
+    with pytest.raises(ValueError, match="the ball must be the one that the transport was made for, got another"):
+        separable.check_mark(jnp.asarray(separable.marked(first.light_map)), 1.01 * again.light_map, name="the ball")

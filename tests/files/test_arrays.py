@@ -230,3 +230,34 @@ def test_finished_stores_can_be_read_where_nothing_can_be_written(path):
     finally:
         for each in [path, *path.rglob("*")]:
             pathlib.Path(each).chmod(0o700 if each.is_dir() else 0o600)
+
+
+def test_sketches_are_as_far_apart_as_the_arrays_and_tell_where_values_are(monkeypatch):
+    monkeypatch.setattr(arrays, "_PART", 64)
+    random = np.random.default_rng(0)
+    value = random.normal(size=(30, 50))
+    first = arrays.sketch(value)
+    np.testing.assert_allclose(first[0], np.linalg.norm(value))
+    for share in (1e-3, 1.0):
+        change = share * random.normal(size=value.shape)
+        distance = np.linalg.norm(np.subtract(arrays.sketch(value + change)[1:], first[1:]))
+        assert 0.6 < distance / np.linalg.norm(change) < 1.5
+    for other in (value[::-1], value.T, -value, np.roll(value, 64)):
+        assert np.linalg.norm(np.subtract(arrays.sketch(other), first)) > 0.5 * first[0]
+    assert arrays.sketch(np.zeros((0, 3)))[0] == 0
+
+
+def test_stores_compare_sketches_up_to_rounding_and_headers_by_the_version_of_their_algorithm(tmp_path):
+    header, value = {"algorithm": {"test": 1}}, np.linspace(0, 1, 99, dtype=np.float32)
+    path, near = tmp_path / "a.prt", {"brdf": arrays.sketch(value)}
+    open_store(path, header=header, near=near)
+    open_store(path, header=header, near={"brdf": arrays.sketch(np.nextafter(value, 2))})
+    for wrong in (1.01 * value, np.full(99, np.nan, np.float32)):
+        with pytest.raises(ValueError, match=r"made from something else \(brdf: there and now differ by"):
+            open_store(path, header=header, near={"brdf": arrays.sketch(wrong)})
+    with pytest.raises(ValueError, match=r"must have sketches of \[\], got \['brdf'\]"):
+        open_store(path, header=header)
+    with pytest.raises(
+        ValueError, match=r"was made by version {'test': 1} of the algorithm, this package has version {'test': 2}"
+    ):
+        open_store(path, header={"algorithm": {"test": 2}}, near=near)

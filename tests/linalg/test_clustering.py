@@ -106,3 +106,10 @@ def test_points_that_are_not_finite_are_refused(value):
     point[[1, 3], [0, 2]] = value
     with pytest.raises(ValueError, match="points must be finite, got 2 that are not"):
         bisect(point, clusters=2)
+
+
+def test_rounding_does_not_decide_the_clusters_of_a_symmetric_grid(random):
+    grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
+    expected = bisect(grid, clusters=8)
+    for _ in range(3):
+        np.testing.assert_array_equal(bisect(grid * (1 + 1e-14 * random.normal(size=grid.shape)), clusters=8), expected)

@@ -124,3 +124,16 @@ def test_more_terms_than_rows_are_refused(terms, solve):
 def test_identity_inside_a_jitted_function_gives_ones():
     value, _, _ = jax.jit(lambda m: eigen.symmetric(m, terms=2))(jnp.eye(20))
     np.testing.assert_allclose(value, 1, rtol=1e-5)
+
+
+def test_orientation_makes_one_basis_of_all_that_rounding_may_choose_and_keeps_different_values_apart():
+    random = np.random.default_rng(1)
+    basis = np.linalg.qr(random.normal(size=(50, 6)))[0]
+    value = np.array([9.0, 5.0, 5.0 - 1e-6, 5.0 - 2e-6, -2.0, 1.0])
+    expected = basis @ eigen.orientation(value, basis)
+    for _ in range(4):
+        turn = np.diag(random.choice([-1.0, 1.0], 6))
+        turn[1:4, 1:4] = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        again = basis @ turn
+        np.testing.assert_allclose(again @ eigen.orientation(value, again), expected, atol=1e-12)
+    np.testing.assert_allclose(np.abs(expected.T @ basis)[[0, 4, 5]], np.eye(6)[[0, 4, 5]], atol=1e-12)

@@ -158,3 +158,14 @@ def test_impossible_errors_and_sweeps_are_refused():
         tucker.ranks_for(jnp.ones((3, 4)).at[0, 0].set(jnp.nan), error=0.1)
     with pytest.raises(ValueError, match="sweeps must not be negative, got -1"):
         tucker.hooi(jnp.ones((3, 4)), ranks=(1, 1), sweeps=-1)
+
+
+def test_oriented_factors_do_not_depend_on_signs_and_stand_for_the_same_tensor():
+    found = tucker.truncated(jnp.asarray(decaying((5, 6, 7)), jnp.float32), ranks=(3, 3, 3))
+    first = tucker.oriented(found)
+    turned = tucker.Tucker(
+        found.core * jnp.array([1, -1, 1.0]), (*found.factor[:2], found.factor[2] * jnp.array([1, -1, 1.0]))
+    )
+    for one, other in zip(first.factor, tucker.oriented(turned).factor, strict=True):
+        np.testing.assert_allclose(one, other, atol=EXACT)
+    np.testing.assert_allclose(first.full(), found.full(), atol=EXACT * float(jnp.linalg.norm(found.full())))

@@ -8,13 +8,13 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.brdf.separable import SeparableBrdf, factor, join
+from jaxprt.brdf.separable import SeparableBrdf, factor, join, marked
 from jaxprt.relight import reference, separable
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import directions, haar
 from jaxprt.transport import SparseTransport, sparse
-from jaxprt.transport.quantized import quantize
+from jaxprt.transport.quantized import dequantize, quantize
 from jaxprt.transport.separable import compress, precompute
 
 SIZE = 8
@@ -392,3 +392,28 @@ def test_a_quarter_turn_of_everything_changes_nothing(brdf, random, close):
         tuple(each @ turn.T for each in (mesh.position, mesh.normal, mesh.tangent)),
     )
     close(of(turned, rotate(light, turn), turn @ EYE), of(mesh, light, EYE), tolerance=TURNED)
+
+
+def test_transport_refuses_factors_that_it_was_not_made_of_wherever_values_are_known(transport, factored, random):
+    known = eqx.tree_at(
+        lambda t: t.mark, transport, jnp.asarray(marked(factored.light_map)), is_leaf=lambda x: x is None
+    )
+    light = some_light(random)
+    expected = relight(transport, factored, light)
+    rounded = eqx.tree_at(lambda b: b.light_map, factored, jnp.nextafter(factored.light_map, jnp.inf))
+    turned = eqx.tree_at(lambda b: b.light_map, factored, factored.light_map.at[1].multiply(-1))
+    wrong = [turned, factor(Lambert(0.5), terms=3, resolution=12), join([factored.keep(1), factored.keep(2)])]
+    for each in (known, dequantize(quantize(known)), quantize(known), known.with_transpose(), known.keep(40)):
+        assert each.mark is not None
+        for right in (factored, rounded):
+            np.testing.assert_allclose(relight(each, right, light), expected, rtol=0.1, atol=0.1)
+        for other in wrong:
+            with pytest.raises(ValueError, match=r"the BRDF must be the one that .* differ from the transport's by \d"):
+                relight(each, other, light)
+            with pytest.raises(ValueError, match="the BRDF must be the one that"):
+                separable.view_tuple(each, other, EYE)
+    np.testing.assert_array_equal(relight(known.keep(40, terms=2), factored.keep(2), light).shape, expected.shape)
+    traced = jax.jit(lambda brdf: relight(known, brdf, light))(turned)
+    np.testing.assert_array_equal(traced.shape, expected.shape)
+    slope = jax.grad(lambda value: jnp.sum(relight(eqx.tree_at(lambda t: t.value, known, value), factored, light)))
+    assert np.isfinite(slope(known.value)).all()

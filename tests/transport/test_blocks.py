@@ -1,5 +1,6 @@
 """The block loop: the same bits from every executor, after every accident."""
 
+import json
 import os
 import signal
 import subprocess
@@ -11,12 +12,15 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxprt as prt
 from jaxprt.files.arrays import BlockStore, Layout
-from jaxprt.transport import blocks
+from jaxprt.transport import blocks, direct, harmonic, interreflection, lobe, transfer_job, visibility
+from jaxprt.transport import separable as transports
 from jaxprt.transport.separable import precompute
 
 SIZE = 4  # Vertices to a block.
@@ -347,6 +351,70 @@ def test_precomputation_refuses_the_store_of_anything_else(sphere, tmp_path):
     with pytest.raises(ValueError, match="file exists but is not a readable store"):
         relit(sphere, path=tmp_path / "file")
     assert not [file for file in path.rglob("*") if file.suffix in (".pkl", ".pickle")]
+
+
+def rounded(tree):
+    """The same up to the last bit of every number, as another kind of processor computes it."""
+
+    def last_bit(leaf):
+        leaf = np.asarray(leaf)
+        return np.nextafter(leaf, np.inf, dtype=leaf.dtype) if leaf.dtype.kind == "f" else leaf
+
+    return jax.tree.map(last_bit, tree)
+
+
+def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_with_other_parameters(
+    sphere, expected, tmp_path, monkeypatch
+):
+    mesh, brdf = sphere
+    path = tmp_path / "a.prt"
+    relit(sphere, path=path)
+    starts, frame = visibility.start_points, visibility.directions.frame
+    monkeypatch.setattr(visibility, "start_points", lambda *each: rounded(starts(*each)))
+    monkeypatch.setattr(visibility.directions, "frame", lambda *each: rounded(frame(*each)))
+    monkeypatch.setattr(transports, "compress", None)  # Nothing is computed again.
+    other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
+    same(relit((mesh, other), path=path)[:2], expected[:2])
+    again = prt.brdf.separable.factor(prt.brdf.AshikhminShirley(nu=10.5), terms=2, resolution=8)
+    with pytest.raises(ValueError, match=r"\(brdf: there and now differ by .* of the norm\).* jaxprt\.files\.save"):
+        relit((mesh, again), path=path)
+    monkeypatch.setattr(transports, "ALGORITHM", 2)
+    with pytest.raises(
+        ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
+    ):
+        relit(sphere, path=path)
+
+
+def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(sphere, monkeypatch):
+    mesh, brdf = sphere
+    rows, white = np.ones((156, 1, 4, 4), np.float32), np.ones(1, np.float32)
+    more = {"region": np.zeros(156, int), "member": np.arange(156)[None], "white": white, "scale": white}
+    more |= {"bases": (brdf,), "response": (np.ones((156, 6, 2), np.float32),), "components": 1}
+    kinds = [
+        (transports._Job, {"brdf": brdf, "keep": 3}),
+        (direct._Job, {}),
+        (lobe._Job, {}),
+        (harmonic._MatrixJob, {"degree": 1}),
+        (harmonic._VectorJob, {"degree": 1}),
+        (interreflection._BounceJob, {"brdf": (), "rows": rows}),
+        (interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": white[None]}),
+        (transfer_job.ResponseJob, {"basis": brdf, "edge": 1}),
+        (transfer_job.TransferJob, more | {"modes": 1}),
+        (transfer_job.AgainJob, more | {"function": np.arange(1)}),
+    ]
+    before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
+    starts = visibility.start_points
+    monkeypatch.setattr(visibility, "start_points", lambda *each: rounded(starts(*each)))
+    moved = eqx.tree_at(lambda m: m.tangent, mesh, -mesh.tangent)
+    for job, (kind, fields) in zip(before, kinds, strict=True):
+        again = kind.make(mesh, None, None, 8, **rounded(fields))
+        assert json.dumps(again.header) == json.dumps(job.header)
+        system = job.header["system"]
+        assert job.header["algorithm"] == {"visibility": 1, system: 1}
+        assert kind.make(moved, None, None, 8, **fields).header["mesh"] != job.header["mesh"]
+        for name, told in again.near.items():
+            assert np.linalg.norm(np.subtract(told, job.near[name])) < 1e-4 * told[0]
+    assert len({json.dumps(job.header) for job in before}) == len(before)
 
 
 def test_the_view_maps_and_the_error_of_the_brdf_do_not_matter_to_the_store(sphere, expected, tmp_path):

@@ -393,3 +393,39 @@ def test_tuples_are_combined_color_by_color(random, close, colors):
     light, view = (random.normal(size=(7, TERMS, each)) for each in colors)
     found = separable.combine(*(jnp.asarray(each, jnp.float32) for each in (light, view)))
     close(found, np.sum(light * view, 1))
+
+
+def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_refuse_others(
+    seen, brdf, tmp_path, monkeypatch
+):
+    path, options = tmp_path / "a.prt", {"progress": False, **SMALL}
+    first = precompute(seen, brdf, path=path, **options)
+    monkeypatch.setattr(clustered, "compress", None)  # Nothing is computed again.
+    rounded = eqx.tree_at(lambda x: x.frame, seen, jnp.nextafter(seen.frame, jnp.inf))
+    factors = eqx.tree_at(lambda x: x.light_map, brdf, jnp.nextafter(brdf.light_map, jnp.inf))
+    again = precompute(rounded, factors, path=path, **options)
+    np.testing.assert_array_equal(again.core, first.core)
+    darker = eqx.tree_at(lambda x: x.light_map, brdf, 0.99 * brdf.light_map)
+    turned = eqx.tree_at(lambda x: x.light_map, brdf, brdf.light_map.at[-1].multiply(-1))
+    dimmed = eqx.tree_at(lambda x: x.level, seen, seen.level & 7)
+    elsewhere = eqx.tree_at(lambda x: x.key, seen, seen.key + 1)
+    unknown = eqx.tree_at(lambda x: (x.key, x.level), seen, (None, seen.level.at[5, 5].add(1)))
+    for what, name in (
+        ((seen, darker), "brdf"),
+        ((seen, turned), "brdf"),
+        ((dimmed, brdf), "direct"),
+        ((elsewhere, brdf), "direct"),
+        ((unknown, brdf), "direct"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.prt holds arrays made from something else \({name}: there"):
+            precompute(*what, path=path, **options)
+
+
+def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
+    light = builtin.daylight(size=SIZE)
+    other = factor(Lambert(0.5), terms=TERMS, resolution=12)
+    fewer = small.keep(terms=2)
+    assert np.isfinite(separable.radiance(fewer, brdf.keep(2), light, eye=EYE)).all()
+    for transport, wrong in ((small, other), (fewer, other.keep(2))):
+        with pytest.raises(ValueError, match="must be the one that the transport was made for, got another"):
+            separable.radiance(transport, wrong, light, eye=EYE)
