@@ -78,6 +78,7 @@ SIDEWAYS = {
     ("transport", "lobe", "direct"),
     ("transport", "lobe", "harmonic"),
     ("transport", "quantized", "sparse"),
+    ("transport", "sparse", "visibility"),
     ("transport", "visibility", "blocks"),
     ("transport", "interreflection", "blocks"),
     ("transport", "interreflection", "harmonic"),

@@ -271,8 +271,8 @@ def _fields(kind: Any) -> list[str]:
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else list(kind._fields)
 
 
-def _algorithm(module: str) -> int:
-    """Version of what computes the objects of a module."""
+def _algorithm(module: str) -> Any:
+    """Versions of what computes the objects of a module."""
     return getattr(sys.modules[module], "ALGORITHM", 1)
 
 

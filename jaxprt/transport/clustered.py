@@ -28,7 +28,8 @@ from jaxprt.staging import linear
 from jaxprt.transport import blocks, separable, visibility
 from jaxprt.transport.direct import DirectTransport
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "clustered": 1}
 SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
 _PART = 16  # texels, of which one is compared with those of a store
 _SAMPLE = 24  # vertices of a cluster that choose its coefficients
@@ -366,7 +367,7 @@ class _Job(ClusterJob):
         given = self.direct.level if self.direct.key is None else self.direct.key
         return {
             "system": "clustered",
-            "algorithm": {"visibility": visibility.ALGORITHM, "clustered": ALGORITHM},
+            "algorithm": ALGORITHM,
             "direct": blocks.fingerprint(given),
             "member": blocks.fingerprint(np.asarray(self.member, np.int64)),
             "maps": self.brdf.coordinates.__name__,

@@ -21,7 +21,8 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.transport import blocks, visibility
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "direct": 1}
 _HALF = visibility.BLOCK // 2
 _MIDDLE = 8  # sixteen of the seventeen levels fit four bits: 9 becomes 8
 

@@ -23,7 +23,8 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.transport import blocks, visibility
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "harmonic": 1}
 
 
 class TransferMatrix(eqx.Module):

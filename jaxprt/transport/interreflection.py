@@ -23,7 +23,8 @@ from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.transport import blocks, bounce, visibility
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector, check
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "bounce": 1}
 _RAYS = 1 << 12  # hits that are shaded at once
 
 

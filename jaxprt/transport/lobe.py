@@ -24,7 +24,8 @@ from jaxprt.staging import apart
 from jaxprt.transport import blocks, harmonic, visibility
 from jaxprt.transport.direct import DirectTransport
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "lobe": 1}
 DEGREE = 6  # of the harmonics that the diffuse part is lit by
 _BITS = 2  # finest scales, which are read from bits
 _BLOCK = 1024

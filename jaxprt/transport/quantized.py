@@ -10,6 +10,7 @@ from jaxprt import require
 from jaxprt.transport import sparse
 from jaxprt.transport.sparse import SparseTransport
 
+ALGORITHM = sparse.ALGORITHM
 _GRAY = (16,)
 _COLOR = (11, 11, 10)  # red in the highest bits
 

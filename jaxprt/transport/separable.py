@@ -19,8 +19,6 @@ from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.transport import blocks, sparse, visibility
 from jaxprt.transport.sparse import SparseTransport
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
-
 
 def precompute(
     mesh: Mesh,
@@ -136,7 +134,7 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return self.made_by("separable", ALGORITHM, maps=self.brdf.coordinates.__name__, keep=self.keep)
+        return self.made_by("separable", sparse.ALGORITHM, maps=self.brdf.coordinates.__name__, keep=self.keep)
 
     @property
     def near(self) -> Mapping[str, list[float]]:

@@ -10,7 +10,10 @@ from jaxtyping import Array, Float, Int, Shaped, UInt
 
 from jaxprt import require
 from jaxprt.staging import linear
+from jaxprt.transport import visibility
 
+# Versions of what makes the results of `transport.separable`; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "separable": 1}
 _CHUNKS = 4  # of each number on average: longer ones are padded more, shorter ones leave more sums to scatter
 
 

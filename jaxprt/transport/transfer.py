@@ -30,6 +30,7 @@ from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.scene.mesh import Mesh
 from jaxprt.transport import blocks, clustered, transfer_job
 
+ALGORITHM = transfer_job.ALGORITHM
 _MEMBERS = 230  # vertices of a cluster
 _SEEN = 4  # visibility has faces so many times as large as the light's
 _FEWER = 2  # as many times fewer components have two bounces

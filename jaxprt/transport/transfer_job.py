@@ -17,7 +17,8 @@ from jaxprt.linalg import eigen, tucker
 from jaxprt.sphere import cubemap, haar, harmonics
 from jaxprt.transport import blocks, bounce, clustered, visibility
 
-ALGORITHM = 1  # version of the results; a release that changes them raises it
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.ALGORITHM, "transfer": 1}
 DEGREE = 3  # of the harmonics that arrive
 _AGAIN = 2  # edge of the light's faces for two bounces
 

@@ -4,6 +4,7 @@ Everything here is NumPy on the host; what comes out is an array, so the rest of
 visibility made by hand.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -200,10 +201,9 @@ class VisibilityJob(blocks.Job):
         key = blocks.fingerprint(*given, *numbers)
         return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, **more)
 
-    def made_by(self, system: str, algorithm: int, **more: Any) -> dict[str, Any]:
+    def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
         """The header of a system's job: what is traced, and by which versions of the algorithms."""
-        versions = {"visibility": ALGORITHM, system: algorithm}
-        return {"system": system, "algorithm": versions, "mesh": self.mesh_key, "size": self.size, **more}
+        return {"system": system, "algorithm": dict(algorithm), "mesh": self.mesh_key, "size": self.size, **more}
 
     @cached_property
     def rays(self) -> Occluder:
