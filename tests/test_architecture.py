@@ -72,6 +72,7 @@ SIDEWAYS = {
     ("transport", "clustered", "blocks"),
     ("transport", "clustered", "direct"),
     ("transport", "clustered", "separable"),
+    ("transport", "clustered", "visibility"),
     ("transport", "direct", "blocks"),
     ("transport", "direct", "visibility"),
     ("transport", "dynamic", "direct"),

@@ -94,7 +94,8 @@ def marked(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray,
     """Values of light factors at a few texels: by these transport knows the BRDF that it was made for."""
     edge = light_map.shape[1]
     row, column = (_MARKS * edge).astype(int)
-    return np.asarray(light_map)[:, row, column].reshape(len(light_map), -1)
+    value = np.asarray(light_map)[:, row, column]
+    return value.reshape(len(value), value.shape[1] * value.shape[2])
 
 
 def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF") -> None:

@@ -196,6 +196,10 @@ def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light,
         (lambda t, b, m: (t, b, [m[0], m[0]]), "region 1 has one BRDF for good"),
         (lambda t, b, m: (t, [b[1], b[0]], [None, m[0]]), "must be the one that its transport was made for"),
         (
+            lambda t, b, m: (t, [b[0], eqx.tree_at(lambda x: x.light_map, b[1], 2 * b[1].light_map)], m),
+            "BRDF of region 1 must be the one that the transport was made for, got another",
+        ),
+        (
             lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.share, m[0], jnp.ones(2)), None]),
             r"of its 3 BRDFs, got \[2\]",
         ),
