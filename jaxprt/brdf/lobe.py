@@ -9,6 +9,7 @@ fixed widths around the mirror direction, is `jaxprt.brdf.published.mirror_lobes
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -251,7 +252,7 @@ def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> 
     wo = _nodes(resolution, isotropic)
     result = lobe_em.samples(brdf, wo.reshape(-1, 3))
     _check(result[0], result[1], wo.reshape(-1, 3), point)
-    return wo, result
+    return jnp.asarray(wo), result
 
 
 def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
@@ -260,9 +261,10 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
     colors = max(len(table[2]) for table in tables)
 
     def stack(index: int, lead: int) -> Array:
-        every = [jnp.broadcast_to(t[index], (colors, *t[index].shape[1:])) if index > 1 else t[index] for t in tables]
-        whole = jnp.stack(every, lead)
-        return whole.reshape(*whole.shape[:lead], *size, *nodes)
+        every = [np.asarray(table[index]) for table in tables]
+        every = [np.broadcast_to(each, (colors, *each.shape[1:])) if index > 1 else each for each in every]
+        whole = np.stack(every, lead)
+        return jnp.asarray(whole.reshape(*whole.shape[:lead], *size, *nodes))
 
     dtype = tables[0][0].dtype
     knot = tuple(jnp.asarray(each, dtype) for each in knots)
@@ -271,41 +273,57 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
 
 def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
     """Mean, logarithm of the concentration, weight and diffuse albedo of one BRDF on the nodes `wo` [*q 3]."""
-    nodes, wo = wo.shape[:-1], wo.reshape(-1, 3)
-    sample, mass, fixed, extent = samples
-    gray = jnp.sum(mass, -1)
-    lobe, least = lobe_em.start(wo, sample, gray, lobes=lobes)
-    weight = jnp.sum(gray, 1, keepdims=True) / 2
+    nodes = wo.shape[:-1]
+    wo, sample, mass, fixed, extent = np.asarray(wo).reshape(-1, 3), *samples
+    gray, lobe, least, weight = _begin(wo, sample, mass, lobes=lobes)
     for times, share in _ROUNDS:
         for _ in range(times):
             lobe, weight = lobe_em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
         if share:
             lobe = lobe_em.blend(wo, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
-    weight = lobe_em.weigh(sample, mass, extent, lobe, fixed, weight)
+    return _end(lobe, lobe_em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
+
+
+@partial(jax.jit, static_argnames=("lobes",))
+def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array, mixture.Mixture, Array, Array]:
+    """The mass of all colors, lobes and their least concentrations from which EM starts, and the diffuse part's."""
+    gray = jnp.sum(mass, -1)
+    lobe, least = lobe_em.start(wo, sample, gray, lobes=lobes)
+    return gray, lobe, least, jnp.sum(gray, 1, keepdims=True) / 2
+
+
+@partial(jax.jit, static_argnames=("nodes",))
+def _end(lobe: mixture.Mixture, weight: Array, *, nodes: tuple[int, ...]) -> tuple[Array, Array, Array, Array]:
+    """The parts of a table of one BRDF: lobes that EM has found, on the nodes of the view."""
     mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
     return mean, jnp.log(lobe.concentration).T.reshape(-1, *nodes), weight[:, :-1], weight[:, -1]
 
 
-def _nodes(resolution: int, isotropic: bool) -> Float[Array, "*q 3"]:
+def _nodes(resolution: int, isotropic: bool) -> Float[np.ndarray, "*q 3"]:
     """View directions of the nodes; the last ones are drawn in from the horizon, where a BRDF has no value."""
     if not isotropic:
-        return hemisphere.parabolic_texel_direction(resolution=resolution // 2)
+        return np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution // 2))
     radius = np.minimum(np.linspace(0, 1, resolution), 1 - 0.25 / resolution)
     wo = np.stack([2 * radius, 0 * radius, 1 - radius**2], -1) / (1 + radius**2)[:, None]
-    return jnp.asarray(wo, jnp.result_type(float))
+    return wo.astype(jnp.result_type(float))
 
 
 def is_isotropic(brdf: Callable) -> bool:
     """Whether turning both directions about the normal changes nothing, at a few hundred random pairs."""
     height, angle, turn = np.split(np.random.default_rng(0).uniform(size=(5, 256)), [2, 4])
     height, angle = 0.05 + 0.95 * height, 2 * np.pi * angle
-    value = []
-    for shift in (0, 2 * np.pi * turn):
-        radius = np.sqrt(1 - height**2)
-        wi, wo = np.stack([radius * np.cos(angle + shift), radius * np.sin(angle + shift), height], -1)
-        value.append(brdf(*(jnp.asarray(each, jnp.result_type(float)) for each in (wi, wo))))
-    return bool(jnp.linalg.norm(value[0] - value[1]) <= 1e-2 * jnp.linalg.norm(value[0]))
+    angle = np.concatenate([angle, angle + 2 * np.pi * turn], 1)
+    radius, height = np.sqrt(1 - height**2), np.tile(height, 2)
+    wi, wo = np.stack([np.tile(radius, 2) * np.cos(angle), np.tile(radius, 2) * np.sin(angle), height], -1)
+    dtype = jnp.result_type(float)
+    value = np.split(np.asarray(_values(brdf, wi.astype(dtype), wo.astype(dtype))), 2)
+    return bool(np.linalg.norm(value[0] - value[1]) <= 1e-2 * np.linalg.norm(value[0]))
+
+
+@eqx.filter_jit
+def _values(brdf: Callable, wi: Array, wo: Array) -> Array:
+    return brdf(wi, wo)
 
 
 @jax.jit
@@ -328,13 +346,14 @@ def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
     return jnp.sqrt(jnp.sum(wrong) / jnp.maximum(jnp.sum(whole), _TINY))
 
 
-def _check(direction: Array, mass: Array, wo: Array, point: tuple) -> None:
+def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
     """Refuses values that are no BRDF's, and says where the first one is."""
-    wrong = np.argwhere(~np.asarray(jnp.isfinite(mass) & (mass >= 0)))
+    value = np.asarray(mass)
+    wrong = np.argwhere(~(np.isfinite(value) & (value >= 0)))
     if wrong.size:
         view, sample, _ = wrong[0]
         at = f" at parameters {tuple(map(float, point))}" if point else ""
         raise ValueError(
             f"the BRDF must be finite and not negative{at}, and is not for {len(wrong)} pairs of directions, first for "
-            f"wi = {np.asarray(direction)[view, sample]}, wo = {np.asarray(wo)[view]}"
+            f"wi = {np.asarray(direction)[view, sample]}, wo = {wo[view]}"
         )

@@ -163,16 +163,35 @@ def factor(
     if error is not None and not error > 0:
         raise ValueError(f"error must be positive, got {error}")
     _check_resolution(resolution)
-    direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
-    solid_angle = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
+    direction = np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3)
+    solid_angle = np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel()
     inside = np.flatnonzero(solid_angle)
     _check_terms(1 if terms is None else terms, inside.size)
-    table = tabulate(brdf, direction)
-    color = table.shape[0]
+    table = tabulate(brdf, jnp.asarray(direction))
+    flux, matrix, covariance = _weighted(table, direction, solid_angle, inside)
+    value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
+    light_map, view_map = _maps(table, solid_angle, flux, matrix, covariance, value, vector)
+    # Transport that another machine made serves the same factors here.
+    turn = eigen.orientation(np.asarray(value), np.asarray(vector))[:, :terms].T.astype(value.dtype)
+    shape = (terms, resolution, resolution, -1)
+    light_map, view_map = (jnp.tensordot(turn, each, 1).reshape(shape) for each in (light_map, view_map))
+    return SeparableBrdf(light_map, view_map, jnp.asarray(remainder[terms - 1]), hemisphere.parabolic_coordinates)
+
+
+@jax.jit
+def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array) -> tuple[Array, Array, Array]:
+    """M diag(cos dw) without and with the weight of the views, in rows of one view and color, and C."""
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
-    covariance = light_covariance(direction[inside], degree=_DEGREE)
-    value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
+    return flux, matrix, light_covariance(direction[inside], degree=_DEGREE)
+
+
+@jax.jit
+def _maps(
+    table: Array, solid_angle: Array, flux: Array, matrix: Array, covariance: Array, value: Array, vector: Array
+) -> tuple[Array, Array]:
+    """Light and view maps [r d c] of some singular vectors."""
+    color = table.shape[0]
     project = vector.reshape(color, -1, value.size) * jnp.sqrt(solid_angle)[:, None]
     light_map = jnp.einsum("cor,coi->ri", project, table)
     # M C M^T u = value u continues the view map to texels of no weight, which bilinear lookup needs at the rim.
@@ -181,12 +200,7 @@ def factor(
     known = value > _NULL * jnp.finfo(value.dtype).eps * jnp.max(value)
     inverse = jnp.where(known, 1 / jnp.where(known, value, 1), 0)
     view_map = jnp.einsum("coi,ir->roc", flux, response * inverse)
-    # Transport that another machine made serves the same factors here.
-    turn = jnp.asarray(eigen.orientation(np.asarray(value), np.asarray(vector)), value.dtype)[:, :terms]
-    light_map, view_map = turn.T @ light_map, jnp.einsum("rs,roc->soc", turn, view_map)
-    shape = (terms, resolution, resolution)
-    light_map, view_map = light_map.reshape(*shape, 1), view_map.reshape(*shape, color)
-    return SeparableBrdf(light_map, view_map, remainder[terms - 1], hemisphere.parabolic_coordinates)
+    return light_map[..., None], view_map
 
 
 def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
@@ -267,17 +281,26 @@ def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c 
     Raises:
         ValueError: The BRDF has no channel axis, or values that are not finite.
     """
-    row = jax.jit(lambda wo: brdf(direction, jnp.broadcast_to(wo, direction.shape)))
-    shape = jax.eval_shape(row, direction[0]).shape
+    shape = eqx.filter_eval_shape(_row, brdf, direction, direction[0]).shape
     if len(shape) != 2 or shape[0] != direction.shape[0] or shape[1] not in (1, 3):
         raise ValueError(
             f"a BRDF must map directions [b 3] to values [b 1] or [b 3], got {shape} for {direction.shape}"
         )
-    table = jnp.moveaxis(jax.lax.map(row, direction, batch_size=64), 2, 0)
-    broken = int(jnp.sum(~jnp.isfinite(table)))
+    table, broken = _rows(brdf, direction)
     if broken:
         raise ValueError(f"a BRDF must be finite above the horizon, got {broken} of {table.size} values that are not")
     return table
+
+
+def _row(brdf: Callable, direction: Array, wo: Array) -> Array:
+    return brdf(direction, jnp.broadcast_to(wo, direction.shape))
+
+
+@eqx.filter_jit
+def _rows(brdf: Callable, direction: Array) -> tuple[Array, Array]:
+    """Values for all pairs of directions, [c, view, light], and how many are not finite."""
+    rows = jax.lax.map(lambda wo: _row(brdf, direction, wo), direction, batch_size=64)
+    return jnp.moveaxis(rows, 2, 0), jnp.sum(~jnp.isfinite(rows))
 
 
 def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Array, "d d"]:
@@ -308,27 +331,38 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
 
 def _leading(
     matrix: Array, covariance: Array, terms: int | None, error: float | None
-) -> tuple[Array, Array, Array, int]:
+) -> tuple[Array, Array, np.ndarray, int]:
     """Squared singular values, vectors and remaining errors of `terms` terms, or of as many as the error needs.
 
     A few more follow, since terms of equal values are told apart together. The last is the number of terms.
     """
-    total = jnp.sum((matrix @ covariance) * matrix)
+    total = _total(matrix, covariance)
     most = min(_MOST_TERMS, matrix.shape[1])
     count = min(4, most) if terms is None else min(terms + _MORE, *matrix.shape)
     while True:
         value, vector, _ = eigen.left_singular(matrix, metric=covariance, terms=count)
-        lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)
-        remainder = jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF is met exactly
+        remainder = np.asarray(_remainder(value, total))
         if terms is not None:
             return value, vector, remainder, terms
         assert error is not None
-        reached = np.flatnonzero(np.asarray(remainder) <= error)
+        reached = np.flatnonzero(remainder <= error)
         if reached.size:
             return value, vector, remainder, int(reached[0]) + 1
         if count == most:
             raise ValueError(f"error must be at least {remainder[-1]:.3g}, which {count} terms reach; got {error}")
         count = min(4 * count, most)
+
+
+@jax.jit
+def _total(matrix: Array, covariance: Array) -> Array:
+    return jnp.sum((matrix @ covariance) * matrix)
+
+
+@jax.jit
+def _remainder(value: Array, total: Array) -> Array:
+    """Errors that the first terms leave."""
+    lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)
+    return jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF is met exactly
 
 
 def _check_resolution(resolution: int) -> None:
