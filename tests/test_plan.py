@@ -1,11 +1,13 @@
 """Plans against the error that carrying them out has, on views that they did not see."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxprt import plan
-from jaxprt.brdf import AshikhminShirley
+from jaxprt.brdf import AshikhminShirley, lobe, lobe_em
 from jaxprt.relight import reference
 from jaxprt.scene import Environment, builtin
 
@@ -13,9 +15,22 @@ BRDF = AshikhminShirley(nu=8, nv=20)
 ASKED = 0.3
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """Few steps, small maps, and lobes fitted to few samples without their error, which no plan reads."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LADDER", tuple(step._replace(resolution=12) for step in plan._LADDER[:3]))
+        patch.setattr(plan, "_LOBES", plan._LOBES[:2])
+        patch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)
+        patch.setattr(lobe, "tabulate", functools.partial(lobe.tabulate, resolution=12))
+        patch.setattr(lobe_em, "RINGS", 24)
+        patch.setattr(lobe_em, "SECTORS", 32)
+        yield
+
+
 @pytest.fixture(scope="module")
 def mesh():
-    return builtin.sphere(rings=10, sectors=12)
+    return builtin.sphere(rings=6, sectors=8)
 
 
 @pytest.fixture(scope="module")
