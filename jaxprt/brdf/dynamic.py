@@ -9,13 +9,14 @@ transport has a term for them. The set is gray where its BRDFs are; of colored o
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import grid, lobe_em
@@ -30,6 +31,8 @@ _RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
 _GRAZING = 1e-3  # least cosine that a product with it is divided by
 _NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
 _RANK = 1e-3  # of the largest singular value, below which float32 has no more
+
+_stack = jax.jit(lambda brdfs: jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
 
 
 class Mixed(eqx.Module):
@@ -138,13 +141,13 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
     colors = max(len(each.weight) for each in tables)
 
     def stack(name: str, axis: int, colored: bool = False) -> Array:
-        every = [getattr(each, name) for each in tables]
+        every = [np.asarray(getattr(each, name)) for each in tables]
         if colored:
-            every = [jnp.broadcast_to(each, (colors, *each.shape[1:])) for each in every]
-        return jnp.stack(every, axis)
+            every = [np.broadcast_to(each, (colors, *each.shape[1:])) for each in every]
+        return jnp.asarray(np.stack(every, axis))
 
-    number = jnp.arange(len(tables), dtype=tables[0].scale.dtype)
-    error = jnp.max(jnp.stack([each.error for each in tables]))
+    number = jnp.asarray(np.arange(len(tables)), tables[0].scale.dtype)
+    error = jnp.asarray(np.max([each.error for each in tables]))
     parts = (stack("mean", 2), stack("scale", 1), stack("weight", 2, True), stack("diffuse", 1, True))
     return LobeBrdf(*parts, (number,), error)
 
@@ -190,7 +193,7 @@ def factor(
         shapes = ((0, 0, 0), (len(brdfs), len(lobe.weight), 0), (0, 4, 4))
         core, along, maps = (jnp.zeros(each, lobe.scale.dtype) for each in shapes)
         return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
-    inside = int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0))
+    inside = int(np.count_nonzero(hemisphere.parabolic_texel_area(resolution=resolution)))
     check_ranks(ranks, (len(brdfs) * colors, inside, (_DEGREE + 1) ** 2))
     found = reflect(brdfs, lobe, resolution=resolution)
     weight, rest = jnp.sqrt(found.area), (lobe, together)
@@ -217,25 +220,22 @@ class Reflected(NamedTuple):
 
 def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> Reflected:
     """What BRDFs reflect without their lobes; arguments as of `factor`, which checks them."""
-    direction = hemisphere.parabolic_texel_direction(resolution=resolution).reshape(-1, 3)
-    area = hemisphere.parabolic_texel_area(resolution=resolution).ravel()
+    direction = jnp.asarray(np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3))
+    area = jnp.asarray(np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel())
     together = stacked(brdfs)
     # All at once where they are of one kind, and else one by one.
-    parts = (
-        [(jax.tree.map(lambda x: x[None], grid.as_argument(each)), jnp.array([n])) for n, each in enumerate(brdfs)]
-        if together is None
-        else [(together, jnp.arange(len(brdfs)))]
-    )
+    parts = [(together, np.arange(len(brdfs)))]
+    if together is None:
+        parts = [(_stack((grid.as_argument(each),)), np.array([n])) for n, each in enumerate(brdfs)]
     # Of isotropic BRDFs one view of each height is enough.
     turned = all(map(is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
     found = [_reflected(part, lobe, number, view) for part, number in parts]
     check_values([least for _, _, least in found])
-    tensor = jnp.concatenate([rest[:, :, back] for rest, _, _ in found])
-    if turned:
-        tensor = _turn(tensor, direction)
-    whole = jnp.sum(jnp.concatenate([square for _, square, _ in found])[:, :, back] * area)
-    return Reflected(tensor, _to_map(direction), direction, area, whole)
+    tensor, square = (np.concatenate([np.asarray(each[part]) for each in found]) for part in (0, 1))
+    tensor = _turn(tensor, back, direction) if turned else jnp.asarray(tensor)
+    whole = jnp.asarray(np.sum(square[:, :, back] * area))
+    return Reflected(tensor, _to_map(direction, _dual()), direction, area, whole)
 
 
 def decompose(
@@ -266,6 +266,13 @@ def decompose(
     count, colors = tensor.shape[:2]
     inside = np.flatnonzero(np.asarray(weight))
     check_ranks(ranks, (count * colors, len(inside), tensor.shape[3]))
+    core, along, view, light, error = _decomposed(tensor, to_map, weight, whole, inside, ranks=tuple(ranks))
+    return DynamicBrdf(core, along, view, light, *rest, error, coordinates)
+
+
+@partial(jax.jit, static_argnames=("ranks",))
+def _decomposed(tensor: Array, to_map: Array, weight: Array, whole: Array, inside: Array, *, ranks: tuple) -> tuple:
+    count, colors = tensor.shape[:2]
     flat = tensor.reshape(count * colors, *tensor.shape[2:])
     met = flat[:, inside] * weight[inside, None]
     found = tucker.oriented(tucker.truncated(met, ranks=ranks))
@@ -280,15 +287,9 @@ def decompose(
     # Light maps carry the size, so that what compresses transport knows what each is worth.
     size = jnp.sqrt(jnp.diagonal(square) / (jnp.sum(weight**2) * count * colors))
     edge = math.isqrt(len(weight))
-    return DynamicBrdf(
-        core / jnp.where(size > 0, size, 1),
-        along.reshape(count, colors, -1),
-        view.T.reshape(-1, edge, edge),
-        (size[:, None] * light @ to_map).reshape(-1, edge, edge),
-        *rest,
-        jnp.sqrt(jnp.maximum(left, 0) / jnp.where(whole > 0, whole, 1)),
-        coordinates,
-    )
+    core, along = core / jnp.where(size > 0, size, 1), along.reshape(count, colors, -1)
+    view, light = (each.reshape(-1, edge, edge) for each in (view.T, size[:, None] * light @ to_map))
+    return core, along, view, light, jnp.sqrt(jnp.maximum(left, 0) / jnp.where(whole > 0, whole, 1))
 
 
 def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> int:
@@ -298,7 +299,7 @@ def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) 
     _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
         raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
-    shapes = [brdf(*jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
+    shapes = [eqx.filter_eval_shape(brdf, *jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
     if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] not in (1, 3):
         raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(shapes)}")
     return shapes[0][1]
@@ -337,7 +338,7 @@ def stacked(brdfs: Sequence[Callable]) -> Callable | None:
     kinds = {(jax.tree.structure(each), tuple(map(jnp.shape, own))) for each, own in zip(brdfs, leaves, strict=True)}
     if len(kinds) > 1:
         return None
-    return jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs)
+    return _stack(tuple(brdfs))
 
 
 @jax.jit
@@ -365,9 +366,10 @@ def _reflected(
     return jnp.moveaxis(rest, 0, 2), jnp.moveaxis(square, 0, 2), jnp.min(least, 0)
 
 
-def _to_map(direction: Array) -> Array:
+@jax.jit
+def _to_map(direction: Array, dual: Array) -> Array:
     """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
-    smooth = jnp.asarray(_dual(), direction.dtype) @ harmonics.evaluate(direction, degree=_DEGREE).T
+    smooth = dual.astype(direction.dtype) @ harmonics.evaluate(direction, degree=_DEGREE).T
     return harmonics.convolve(smooth, 1 / harmonics.natural(degree=_DEGREE))
 
 
@@ -389,12 +391,13 @@ def _heights(direction: Array) -> tuple[Array, np.ndarray]:
 
 
 @jax.jit
-def _turn(tensor: Float[Array, "m c d b"], direction: Float[Array, "d 3"]) -> Float[Array, "m c d b"]:
+def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float[Array, "d 3"]) -> Array:
     """Harmonics of what is reflected to views in the x z plane, turned about the normal to where the views are."""
     azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])
     order = np.concatenate([np.arange(-each, each + 1) for each in range(_DEGREE + 1)])
     opposite = np.arange(len(order)) - 2 * order
     angle = azimuth[:, None] * order
+    tensor = jnp.asarray(tensor)[:, :, back]
     return tensor * jnp.cos(angle) - tensor[..., opposite] * jnp.sin(angle)
 
 

@@ -58,9 +58,7 @@ def light(
     if prior is not None:
         _check_prior(prior, unravel, first)
 
-    def function(x):
-        return pictures.residual(radiance, unravel(x), pixels)
-
+    function = pictures.Residual(radiance, unravel(first), pixels)
     if len(first) <= solve.DENSE and prior is None and not (np.isfinite(low) | np.isfinite(high)).any():
         return solve.at_once(function, first, unravel, error)
     return solve.descend(function, first, unravel, (low, high), prior, steps)

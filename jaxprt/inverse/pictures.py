@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt.image import raster
@@ -184,6 +185,24 @@ def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Ar
     color = color.reshape(-1, color.shape[-1])
     made = sum(pixels.weight[:, i, None] * color[pixels.vertex[:, i]] for i in range(3))
     return ((made - pixels.value) / jnp.linalg.norm(pixels.value)).ravel()
+
+
+class Residual(eqx.Module):
+    """The `residual` as a function of the numbers of the parameters in a row.
+
+    Attributes:
+        radiance: Of the parameters and an eye, of every vertex.
+        like: Parameters of the same structure and shapes.
+        pixels: What was observed.
+    """
+
+    radiance: Callable
+    like: PyTree
+    pixels: Pixels
+
+    def __call__(self, row: Float[Array, " n"]) -> Float[Array, " m"]:
+        """What the pictures differ by."""
+        return residual(self.radiance, ravel_pytree(self.like)[1](row), self.pixels)
 
 
 def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:

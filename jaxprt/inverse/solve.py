@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +71,12 @@ def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m
     return jax.jit(both)
 
 
+@eqx.filter_jit
+def _slopes(function: Callable, x: Array) -> tuple[Float[Array, " m"], Float[Array, "n m"]]:
+    """As `_with_slopes`, of a function that is a pytree: the next with the same shapes needs no compiling."""
+    return _with_slopes(function)(x)
+
+
 def _told(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directions that pictures tell, apart from rounding, and their singular values."""
     square, axis = np.linalg.eigh(rows @ rows.T)
@@ -122,8 +129,7 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     Nor are directions told whose deviations would together be more than the error allows of all that is told.
     Truncation as in Hansen 1998, "Rank-deficient and discrete ill-posed problems".
     """
-    evaluate = _with_slopes(function)
-    r, slope = evaluate(first)
+    r, slope = _slopes(function, first)
     _finite(r, slope)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
     axis, value = _told(rows)
@@ -138,7 +144,7 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
         axis, value, part = axis[:, keep], value[keep], part[keep]
     scores = _scores(axis, value, rows, before + axis @ part @ rows)
     found = first + jnp.asarray(axis @ part, first.dtype)
-    left, expected = float(jnp.linalg.norm(evaluate(found)[0])), np.linalg.norm(before + axis @ part @ rows)
+    left, expected = float(np.linalg.norm(_slopes(function, found)[0])), np.linalg.norm(before + axis @ part @ rows)
     if not abs(left - expected) < _LINEAR * np.linalg.norm(before):
         raise ValueError(
             f"the radiance must be linear in the light: the residual should be {expected:.3g}, and is {left:.3g}; "
