@@ -1,5 +1,7 @@
 """What pictures do not tell, tell wrongly, or tell of nothing at all."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,9 +38,21 @@ def sky():
 
 
 @pytest.fixture(scope="module")
-def matte(mesh):
-    table = harmonic.tabulate(Lambert(0.5), degree=4, resolution=8)
-    return lambda light, eye: relight.unshadowed_radiance(mesh, table, light, eye=eye)
+def dull(mesh):
+    """Radiance of a diffuse ball by harmonics of some degree, of 6 at most."""
+    table = harmonic.tabulate(Lambert(0.5), degree=6, resolution=8)
+
+    @functools.cache
+    def of(degree):
+        cut = table.truncate(degree=degree)
+        return lambda light, eye: relight.unshadowed_radiance(mesh, cut, light, eye=eye)
+
+    return of
+
+
+@pytest.fixture(scope="module")
+def matte(dull):
+    return dull(4)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +75,7 @@ def test_what_a_diffuse_ball_does_not_reflect_is_reported_and_not_invented(mesh,
 
 
 def test_a_sharp_material_tells_all_of_it(mesh, sky, view):
-    table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=48)
+    table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=16)
 
     def shiny(light, eye):
         return relight.unshadowed_radiance(mesh, table, light, eye=eye)
@@ -112,11 +126,10 @@ def test_what_is_told_is_as_right_as_asked(mesh, matte, sky, view, image, noise,
     assert wrong < 2 * error
 
 
-def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, matte, sky, view):
+def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, dull, view):
     """What is left of the pictures is no noise but harmonics of higher degrees, in patterns wider than any block."""
     light = builtin.daylight(size=16)
-    tables = [harmonic.tabulate(Lambert(0.5), degree=degree, resolution=8) for degree in (2, 4)]
-    low, high = (lambda x, eye, table=table: relight.unshadowed_radiance(mesh, table, x, eye=eye) for table in tables)
+    low, high = dull(2), dull(4)
     image = render(mesh, high(relight.project(light, degree=4), view.eye), view)
     found = inverse.light(low, jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
     true = relight.project(light, degree=2)
@@ -127,12 +140,11 @@ def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, matte, sky, v
 
 
 @pytest.mark.parametrize("degree", [2, 3])
-def test_of_a_sun_some_is_told_although_most_of_it_is_too_fine(mesh, view, degree):
+def test_of_a_sun_some_is_told_although_most_of_it_is_too_fine(mesh, dull, view, degree):
     """Of what is left out nothing may make the rest doubtful, until nothing remains."""
     light = np.zeros((6, 16, 16, 3), np.float32)
     light[2, 8:11, 3:6] = 50
-    tables = [harmonic.tabulate(Lambert(0.5), degree=each, resolution=8) for each in (degree, 6)]
-    low, high = (lambda x, eye, table=table: relight.unshadowed_radiance(mesh, table, x, eye=eye) for table in tables)
+    low, high = dull(degree), dull(6)
     image = render(mesh, high(relight.project(Environment(jnp.asarray(light)), degree=6), view.eye), view)
     pixels = inverse.observe(mesh, [Picture(np.maximum(image, 0), view)])
     found = inverse.light(low, jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
@@ -203,12 +215,14 @@ def test_a_region_that_no_picture_shows_is_unknown_and_the_other_is_found(mesh, 
     assert np.isinf(found.deviation["behind"]).all()
 
 
-def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view):
+def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypatch):
     """Its lobes are finer than the light's texels are wide, and the start's as wide as a window."""
+    monkeypatch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)  # Not asked for here, and slow.
     light, seen = builtin.studio(size=16), lobe_transport.precompute(mesh, size=16, progress=False)
     table = lobe.tabulate(
         lambda m: CookTorrance(diffuse=0.0, specular=1.0, roughness=jnp.exp(m), f0=0.5),
         lobes=2,
+        resolution=12,
         knot=[np.log([0.02, 0.06, 0.2, 0.6])],
     )
 

@@ -49,18 +49,30 @@ def moved(mesh, *, scale=1.0, shift=0.0):
     return eqx.tree_at(lambda m: m.position, mesh, mesh.position * scale + jnp.asarray(shift, jnp.float32))
 
 
+def repeated(mesh, vertex):
+    """Vertices again and again, all of them if None, up to a number that all tests share: compiling takes the time."""
+    vertex = np.arange(len(mesh.position)) if vertex is None else vertex
+    return len(vertex), np.resize(vertex, 64 if len(vertex) <= 64 else 128)
+
+
 def relight(mesh, brdf, light, *, keep=24, eye=EYE, vertex=None):
     """Radiance, checked to be finite."""
+    count, vertex = repeated(mesh, vertex)
     transport = precompute(mesh, brdf, keep=keep, size=SIZE, vertex=vertex, progress=False)
     color = np.asarray(separable.radiance(transport, brdf, light, eye=eye))
-    assert color.shape == (len(transport.position), 3)
+    assert color.shape == (len(vertex), 3)
     assert np.isfinite(color).all()
-    return color
+    return color[:count]
+
+
+def exact_radiance(mesh, brdf, light, *, eye=EYE, vertex=None):
+    count, vertex = repeated(mesh, vertex)
+    return np.asarray(reference.radiance(mesh, brdf, light, eye=eye, vertex=vertex))[:count]
 
 
 def known_error(mesh, color, light, *, albedo=(0.8, 0.5, 0.2), keep=24, eye=EYE, vertex=None):
     """Largest deviation from exact radiance, checked to be no more than the coefficients that were dropped can make."""
-    exact = np.asarray(reference.radiance(mesh, Lambert(list(albedo)), light, eye=eye, vertex=vertex))
+    exact = exact_radiance(mesh, Lambert(list(albedo)), light, eye=eye, vertex=vertex)
     error = np.abs(color - exact).max()
     assert (color >= -error - 1e-6).all()
     return error / max(np.abs(exact).max(), 1e-30)
@@ -76,8 +88,8 @@ def sun(strength):
 def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
     mesh, light = sphere(), sun(strength)
     color = relight(mesh, lambert, light, keep=ALL)
-    exact = reference.radiance(mesh, Lambert([0.8, 0.5, 0.2]), light, eye=EYE)
-    np.testing.assert_allclose(color / strength, np.asarray(exact) / strength, atol=1e-5)
+    exact = exact_radiance(mesh, Lambert([0.8, 0.5, 0.2]), light)
+    np.testing.assert_allclose(color / strength, exact / strength, atol=1e-5)
 
 
 def test_no_light_gives_no_radiance(lambert, glossy):
@@ -97,17 +109,17 @@ def test_dull_and_sharp_brdfs_give_finite_radiance(light, exponents):
     brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=exponents[0], nv=exponents[1])
     color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
     assert color.any()
-    exact = reference.radiance(sphere(), brdf, light, eye=EYE)
-    assert np.isfinite(np.asarray(exact)).all()
-    assert (np.asarray(exact) >= 0).all()
+    exact = exact_radiance(sphere(), brdf, light)
+    assert np.isfinite(exact).all()
+    assert (exact >= 0).all()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_black_and_white_brdfs_give_finite_radiance(light, value):
     for brdf in (Lambert(value), AshikhminShirley(diffuse=value, specular=value)):
-        color = relight(sphere(), factor(brdf, terms=2, resolution=8), light)
+        color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
         assert color.any() or isinstance(brdf, Lambert) or value
-    assert not relight(sphere(), factor(Lambert(0.0), terms=2, resolution=8), light).any()
+    assert not relight(sphere(), factor(Lambert(0.0), terms=4, resolution=12), light).any()
 
 
 def test_all_coefficients_equal_the_reference_and_one_is_finite(lambert, light):
@@ -145,7 +157,7 @@ def test_eyes_in_odd_places_give_finite_radiance(lambert, glossy, light, place):
     for brdf in (lambert, glossy):
         color = relight(mesh, brdf, light, eye=eye)
         assert np.isfinite(color).all()
-    assert np.isfinite(np.asarray(reference.radiance(mesh, AshikhminShirley(), light, eye=eye))).all()
+    assert np.isfinite(exact_radiance(mesh, AshikhminShirley(), light, eye=eye)).all()
 
 
 def test_one_triangle_is_lit_from_its_front(lambert, light):
