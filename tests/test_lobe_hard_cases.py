@@ -143,9 +143,10 @@ def test_what_is_diffuse_is_nearly_all_in_the_diffuse_part(tables):
 
 def test_a_mirror_has_no_diffuse_part_and_its_lobes_are_the_finest_in_its_direction(tables):
     table, wo = tables("mirror"), view(0.0, 0.5, 1.0)
+    found = lookup(table, wo)
     np.testing.assert_allclose(table.diffuse, 0, atol=1e-4)
     np.testing.assert_allclose(jnp.exp(table.scale), lobe_em.FINEST, rtol=1e-3)
-    mean = jnp.sum(table.lookup(wo).mean * table.lookup(wo).weight, 1) / jnp.sum(table.lookup(wo).weight, 1)
+    mean = np.sum(found.mean * np.asarray(found.weight), 1) / np.sum(found.weight, 1)
     # Between nodes a mean is on the chord, of 20 degrees, not on the arc.
     np.testing.assert_allclose(mean.T, lobe_em.mirror(wo), atol=0.01)
 
@@ -190,7 +191,8 @@ def transport(seen):
 
 
 def radiances(transport, table, light):
-    return np.stack([relight.radiance(transport, table, light, eye=1e3 * each)[:, 0] for each in view(*HEIGHT)])
+    eyes = 1e3 * np.asarray(view(*HEIGHT))
+    return np.stack([np.asarray(relight.radiance(transport, table, light, eye=jnp.asarray(e)))[:, 0] for e in eyes])
 
 
 @pytest.mark.parametrize("name", ["sharp", "rough", "mirror", "zero", "power", "brushed"])
@@ -198,25 +200,25 @@ def test_vertices_that_see_nothing_or_a_slit_under_constant_light(tables, transp
     """A furnace: never more than the reflectance, from a slit or half no more than from all, from nothing nothing."""
     color = radiances(transport, tables(name), Environment(jnp.ones((6, SIZE, SIZE, 1))))
     assert np.isfinite(color).all()
-    lookup = np.asarray(tables(name).lookup(view(*HEIGHT)).weight)[0].sum(0)
+    whole = np.asarray(lookup(tables(name), view(*HEIGHT)).weight)[0].sum(0)
     free, nothing, slit, half = color.T
     np.testing.assert_array_equal(nothing, 0)
-    assert np.all(free <= lookup * (1 + FURNACE) + 1e-6)
-    assert np.all(free[:-1] >= SEEN * lookup[:-1])
-    assert np.all(half <= 0.52 * lookup)  # Measured .51; the mirror directions lie in the other half.
-    assert np.all(slit <= free + FURNACE * lookup)
-    assert np.all(slit >= -FURNACE * lookup)
+    assert np.all(free <= whole * (1 + FURNACE) + 1e-6)
+    assert np.all(free[:-1] >= SEEN * whole[:-1])
+    assert np.all(half <= 0.52 * whole)  # Measured .51; the mirror directions lie in the other half.
+    assert np.all(slit <= free + FURNACE * whole)
+    assert np.all(slit >= -FURNACE * whole)
 
 
 @pytest.mark.parametrize("name", ["sharp", "rough", "mirror", "brushed"])
 def test_light_of_one_texel_is_finite_and_bounded_by_the_flux(tables, transport, name):
     place = np.argmax(np.asarray(cubemap.direction(size=SIZE))[..., 2].ravel())
-    light = Environment(jnp.zeros(6 * SIZE * SIZE).at[place].set(1e6).reshape(6, SIZE, SIZE, 1))
+    light = Environment(jnp.asarray(1e6 * np.eye(6 * SIZE * SIZE, dtype=np.float32)[place].reshape(6, SIZE, SIZE, 1)))
     color = radiances(transport, tables(name), light)
     assert np.isfinite(color).all()
     np.testing.assert_array_equal(color[:, 1], 0)
-    lookup = np.asarray(tables(name).lookup(view(*HEIGHT)).weight)[0].sum(0)
-    assert np.all(np.abs(color) <= ONE * 1e6 * lookup[:, None])
+    whole = np.asarray(lookup(tables(name), view(*HEIGHT)).weight)[0].sum(0)
+    assert np.all(np.abs(color) <= ONE * 1e6 * whole[:, None])
     texel, _, rest = texels.split(light, count=1)
     assert texel == place
     np.testing.assert_array_equal(rest.radiance, 0)
@@ -227,7 +229,9 @@ def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(se
     center = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
     for wanted in ([0, 0, 1], [1, 0, 1], [0.05, 1, 0.05]):
         place = np.argmax(center @ np.asarray(wanted))
-        light = Environment(jnp.zeros((6 * SIZE * SIZE, 3)).at[place].set(5.0).reshape(6, SIZE, SIZE, 3))
+        radiance = np.zeros((6 * SIZE * SIZE, 3), np.float32)
+        radiance[place] = 5
+        light = Environment(jnp.asarray(radiance.reshape(6, SIZE, SIZE, 3)))
         eye = jnp.asarray(1e4 * center[place], jnp.float32)
         texel, excess, _ = texels.split(light, count=1)
         for name in ("sharp", "rough", "power", "brushed"):
@@ -240,10 +244,9 @@ def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(se
 def test_gradients_stay_finite_where_nothing_is_seen_and_at_the_horizon(tables, transport):
     light = Environment(jnp.ones((6, SIZE, SIZE, 1)))
 
-    def mean(eye, table):
-        return jnp.mean(relight.radiance(transport, table, light, eye=eye))
+    @jax.jit
+    def slopes(eye, table):
+        return jax.grad(lambda *x: jnp.mean(relight.radiance(transport, x[1], light, eye=x[0])), (0, 1))(eye, table)
 
-    for eye in 1e3 * view(0.0, np.pi / 2):
-        assert all(
-            np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(jax.grad(mean, (0, 1))(eye, tables("rough")))
-        )
+    for eye in 1e3 * np.asarray(view(0.0, np.pi / 2)):
+        assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(slopes(eye, tables("rough"))))

@@ -25,7 +25,9 @@ def small():
         patch.setattr(lobe, "tabulate", functools.partial(lobe.tabulate, resolution=12))
         patch.setattr(lobe_em, "RINGS", 24)
         patch.setattr(lobe_em, "SECTORS", 32)
+        lobe_em.samples.clear_cache()  # which both are compiled into
         yield
+    lobe_em.samples.clear_cache()
 
 
 @pytest.fixture(scope="module")

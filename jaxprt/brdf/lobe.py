@@ -274,13 +274,13 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
 def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
     """Mean, logarithm of the concentration, weight and diffuse albedo of one BRDF on the nodes `wo` [*q 3]."""
     nodes = wo.shape[:-1]
-    wo, sample, mass, fixed, extent = np.asarray(wo).reshape(-1, 3), *samples
-    gray, lobe, least, weight = _begin(wo, sample, mass, lobes=lobes)
+    view, (sample, mass, fixed, extent) = np.asarray(wo).reshape(-1, 3), samples
+    gray, lobe, least, weight = _begin(view, sample, mass, lobes=lobes)
     for times, share in _ROUNDS:
         for _ in range(times):
             lobe, weight = lobe_em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
         if share:
-            lobe = lobe_em.blend(wo, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
+            lobe = lobe_em.blend(view, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
     return _end(lobe, lobe_em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
 
 

@@ -221,11 +221,11 @@ def triangulate(
         ValueError: There are fewer than three points, a point is not finite, two coincide, or all lie on one line;
             the latter two up to rounding, in the chart.
     """
-    point = jnp.asarray(point, jnp.result_type(float))
+    point = np.asarray(point).astype(jnp.result_type(float))
     if point.ndim != 2 or point.shape[1] != 2 or len(point) < 3:
         raise ValueError(f"points must be at least three pairs of coordinates, got an array of shape {point.shape}")
     name = name or [f"point {index}" for index in range(len(point))]
-    broken = np.flatnonzero(~np.isfinite(np.asarray(point)).all(-1))
+    broken = np.flatnonzero(~np.isfinite(point).all(-1))
     if broken.size:
         first = f"the first is {name[broken[0]]} at {_text(point[broken[0]])}"
         raise ValueError(f"points must be finite, got {broken.size} that are not, {first}")
@@ -249,12 +249,12 @@ def triangulate(
         raise ValueError(f"points must not all lie on one line, got {len(point)} that do")
     side = np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]])
     outer = ~np.isin(side @ [len(point), 1], side @ [1, len(point)])
-    return Plane(point, jnp.asarray(triangle, jnp.int32), jnp.asarray(side[outer], jnp.int32), chart)
+    return Plane(jnp.asarray(point), jnp.asarray(triangle, jnp.int32), jnp.asarray(side[outer], jnp.int32), chart)
 
 
 def _family(brdf: tuple, navigation: Line | Plane, name: tuple[str, ...], weight: np.ndarray) -> Family:
-    diffuse, specular = jnp.asarray(np.broadcast_to(weight, (2, len(brdf), 3)), jnp.result_type(float))
-    return Family(brdf, navigation, name, diffuse, specular)
+    diffuse, specular = np.broadcast_to(weight, (2, len(brdf), 3)).astype(jnp.result_type(float))
+    return Family(brdf, navigation, name, jnp.asarray(diffuse), jnp.asarray(specular))
 
 
 def _grid() -> np.ndarray:
@@ -264,7 +264,7 @@ def _grid() -> np.ndarray:
     return np.array([(f0, m) for f0, column in ((0, knot), (0.3, between), (1, knot)) for m in column])
 
 
-def _text(point: Array) -> str:
+def _text(point: np.ndarray) -> str:
     return f"({point[0]:g}, {point[1]:g})"
 
 

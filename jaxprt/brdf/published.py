@@ -4,7 +4,9 @@ Maps are orthographic or polar. Either samples the BRDF at its texels; every tex
 cos(theta) d omega over it. On the orthographic disk these are all equal, so that the matrix is the published one.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -63,12 +65,21 @@ def factor_symmetric(
     if not 1 <= terms <= inside.size:
         raise ValueError(f"terms must be between 1 and {inside.size}, got {terms}")
     table = tabulate(brdf, direction)
+    light_map, view_map, error, asymmetry = _eigenvectors(table, area, inside, terms=terms, solve=solve)
+    if asymmetry > _RECIPROCAL:
+        raise ValueError(f"the BRDF must be reciprocal; f(wi, wo) and f(wo, wi) differ by {asymmetry:.3g}")
+    return SeparableBrdf(light_map, view_map, error, coordinates)
+
+
+@partial(jax.jit, static_argnames=("terms", "solve"))
+def _eigenvectors(
+    table: Array, area: Array, inside: Array, *, terms: int, solve: Callable
+) -> tuple[Array, Array, Array, Array]:
+    """Light and view maps, their error, and how far the BRDF is from reciprocal."""
     root = jnp.sqrt(area[inside])
     matrix = table[:, inside][:, :, inside] * root * root[:, None]
     total = jnp.sum(matrix**2)
     asymmetry = jnp.sqrt(jnp.sum((matrix - matrix.swapaxes(1, 2)) ** 2) / jnp.maximum(total, 1e-30))
-    if asymmetry > _RECIPROCAL:
-        raise ValueError(f"the BRDF must be reciprocal; f(wi, wo) and f(wo, wi) differ by {asymmetry:.3g}")
     value, vector, _ = jax.vmap(lambda m: solve(m, terms=terms))(matrix)
     image = matrix @ vector
     # M v continues an eigenvector v to texels outside the disk, which bilinear lookup needs at the rim; divided by its
@@ -76,14 +87,13 @@ def factor_symmetric(
     norm = jnp.linalg.norm(image, axis=1, keepdims=True) * jnp.sign(value)[:, None]
     beyond = table[:, :, inside] @ (vector * root[:, None]) / jnp.where(norm == 0, 1, norm)
     light_map = beyond.at[:, inside].set(vector / root[:, None]) * jnp.sqrt(jnp.abs(value))[:, None]
-    shape = (terms, resolution, resolution, table.shape[0])
+    shape = (terms, math.isqrt(area.size), -1, table.shape[0])
     light_map = jnp.moveaxis(light_map, -1, 0).swapaxes(1, 2).reshape(shape)
     view_map = light_map * jnp.sign(value).T[:, None, None, :]
     # |M - V D V^T|^2, whether or not the vectors are eigenvectors.
     overlap = jnp.einsum("cir,cis->crs", vector, vector) ** 2
     kept = 2 * jnp.sum(value * jnp.sum(vector * image, 1)) - jnp.einsum("cr,crs,cs->", value, overlap, value)
-    error = jnp.sqrt(jnp.maximum(total - kept, 0) / jnp.maximum(total, 1e-30))
-    return SeparableBrdf(light_map, view_map, error, coordinates)
+    return light_map, view_map, jnp.sqrt(jnp.maximum(total - kept, 0) / jnp.maximum(total, 1e-30)), asymmetry
 
 
 def factor_normalized(
@@ -111,7 +121,13 @@ def factor_normalized(
         the decomposition by any norm; which norm, and color in the view map alone, are choices here.
     """
     direction, area = _texels(resolution, coordinates)
-    table = tabulate(brdf, direction)
+    light_map, view_map, error = _normalized(tabulate(brdf, direction), area)
+    return SeparableBrdf(light_map, view_map, error, coordinates)
+
+
+@jax.jit
+def _normalized(table: Array, area: Array) -> tuple[Array, Array, Array]:
+    """Light and view map, and their error."""
     view_map = jnp.sum(jnp.abs(table) * area, -1)
     weight = area * (view_map > 0)
     rows = weight / jnp.where(view_map > 0, view_map, 1) / jnp.maximum(jnp.sum(weight), 1e-30)
@@ -119,9 +135,8 @@ def factor_normalized(
     both = area * area[:, None]
     total = jnp.sum(table**2 * both)
     lost = jnp.sum((table - view_map[..., None] * light_map) ** 2 * both)
-    shape = (1, resolution, resolution, -1)
-    error = jnp.sqrt(lost / jnp.maximum(total, 1e-30))
-    return SeparableBrdf(light_map.reshape(shape), view_map.T.reshape(shape), error, coordinates)
+    shape = (1, edge := math.isqrt(area.size), edge, -1)
+    return light_map.reshape(shape), view_map.T.reshape(shape), jnp.sqrt(lost / jnp.maximum(total, 1e-30))
 
 
 def red_plastic() -> models.BlinnPhong:

@@ -52,30 +52,41 @@ def _look(plane, spot):
     return jax.vmap(each)(spot)
 
 
-def look(plane, spot):
-    """Shares, whether inside, their derivatives, and gradients of sum_m cos(m) share_m in the points and the spot.
+@jax.jit
+def _place(plane, spot):
+    return jax.vmap(lambda spot: (plane.share(spot), plane.inside(spot)))(spot)
+
+
+def ask(function, plane, spot):
+    """What a function has to say of spots in a plane.
 
     All that planes are asked is asked in one shape, with copies of what comes first: compiling is what takes time.
     """
-    count = len(plane.point), len(spot)
     fields = plane.point, plane.triangle, plane.edge, np.asarray(spot, plane.point.dtype)
-    point, triangle, edge, spot = (
+    point, triangle, edge, wide = (
         np.concatenate([field, np.broadcast_to(field[:1], (size - len(field), field.shape[1]))])
         for field, size in zip(fields, (90, 160, 40, 2048), strict=True)
     )
-    seen = _look(Plane(jnp.asarray(point), jnp.asarray(triangle), jnp.asarray(edge), plane.chart), spot)
-    weight, within, ahead, by_point, by_spot = (np.array(each)[: count[1]] for each in seen)
-    assert not np.any(weight[:, count[0] :])
-    by_point[:, 0] += np.sum(by_point[:, count[0] :], 1)
-    return weight[:, : count[0]], within, ahead[:, : count[0]], by_point[:, : count[0]], by_spot
+    seen = function(Plane(jnp.asarray(point), jnp.asarray(triangle), jnp.asarray(edge), plane.chart), wide)
+    seen = [np.array(each)[: len(spot)] for each in seen]
+    assert not np.any(seen[0][:, len(plane.point) :])
+    return seen
+
+
+def look(plane, spot):
+    """Shares, whether inside, their derivatives, and gradients of sum_m cos(m) share_m in the points and the spot."""
+    count = len(plane.point)
+    weight, within, ahead, by_point, by_spot = ask(_look, plane, spot)
+    by_point[:, 0] += np.sum(by_point[:, count:], 1)
+    return weight[:, :count], within, ahead[:, :count], by_point[:, :count], by_spot
 
 
 def share(plane, spot):
-    return look(plane, spot)[0]
+    return ask(_place, plane, spot)[0][:, : len(plane.point)]
 
 
 def inside(plane, spot):
-    return look(plane, spot)[1]
+    return ask(_place, plane, spot)[1]
 
 
 def scaled(plane, coordinate):

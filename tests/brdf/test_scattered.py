@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,18 @@ SWING = 3.0
 # 80 degrees from the normal, comes out a third too dark with 48 cells in theta_d and 5 % with 192.
 SMOOTHED = 0.14
 evaluate = jax.jit(lambda brdf, wi, wo: brdf(wi, wo))
+
+
+@pytest.fixture(scope="module")
+def made(data):
+    """Directions and colors of a material's samples, and the BRDF that is made of them."""
+
+    @functools.cache
+    def of(material):
+        path = data / f"brdf/{material}.brdf"
+        return *scattered.read_scattered(path), load_scattered(path)
+
+    return of
 
 
 def norm(difference, expected):
@@ -59,10 +73,9 @@ def test_samples_left_out_are_predicted(data, material):
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_values_between_samples_are_like_those_of_the_samples_around(data, material):
+def test_values_between_samples_are_like_those_of_the_samples_around(made, material):
     """Leaving out single samples does not show how splines swing between the few angles of incidence; this does."""
-    wi, wo, color = scattered.read_scattered(data / f"brdf/{material}.brdf")
-    brdf = load_scattered(data / f"brdf/{material}.brdf")
+    wi, wo, color, brdf = made(material)
     a, b = upper(1000, 14, lowest=0.25), upper(1000, 15, lowest=0.25)
     # Isotropic and reciprocal: the angle between the directions, and both cosines, the larger first.
     place, query = (
@@ -78,9 +91,8 @@ def test_values_between_samples_are_like_those_of_the_samples_around(data, mater
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_measured_materials_are_brdfs(data, material):
-    wi, wo, color = scattered.read_scattered(data / f"brdf/{material}.brdf")
-    brdf = load_scattered(data / f"brdf/{material}.brdf")
+def test_measured_materials_are_brdfs(made, material):
+    wi, wo, color, brdf = made(material)
     assert norm(np.cbrt(values(brdf, wi, wo)) - np.cbrt(color), np.cbrt(color)) < SMOOTHED
     wi, wo = upper(4000, 1, lowest=0), upper(4000, 2, lowest=0)
     found = values(brdf, wi, wo)

@@ -9,17 +9,23 @@ from jaxprt.sphere import hemisphere
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
 
 
+@jax.jit
+def evaluate(brdf, wi, wo):
+    return brdf(wi, wo)
+
+
 def _texels(resolution):
-    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
+    direction = np.asarray(hemisphere.texel_direction(resolution=resolution)).reshape(-1, 3)
     inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
-    wi, wo = jnp.meshgrid(inside, inside)
+    wi, wo = np.meshgrid(inside, inside)
     return direction[wi.ravel()], direction[wo.ravel()]
 
 
 def test_lambert_needs_one_term():
     factored = separable.factor(Lambert([0.5, 0.2, 0.1]), terms=1)
     wi, wo = _texels(12)
-    np.testing.assert_allclose(factored(wi, wo), jnp.array([[0.5, 0.2, 0.1]]) / np.pi * jnp.ones((len(wi), 1)), 1e-4)
+    expected = np.array([[0.5, 0.2, 0.1]]) / np.pi * np.ones((len(wi), 1))
+    np.testing.assert_allclose(evaluate(factored, wi, wo), expected, 1e-4)
     assert separable.factor(Lambert(0.5), error=0.01).terms == 1
 
 
@@ -35,18 +41,18 @@ def _parabolic_texels(resolution):
     place = np.stack(np.meshgrid(center, center), -1).reshape(-1, 2).astype(np.float32)
     place = place[np.linalg.norm(2 * place - 1, axis=1) <= 1 - 0.5 / resolution]
     wi, wo = np.meshgrid(np.arange(len(place)), np.arange(len(place)))
-    direction = hemisphere.parabolic_direction(jnp.asarray(place))
+    direction = np.asarray(hemisphere.parabolic_direction(jnp.asarray(place)))
     return direction[wi.ravel()], direction[wo.ravel()]
 
 
 def test_all_terms_reproduce_every_texel():
     resolution = 8
     wi, wo = _parabolic_texels(resolution)
-    inside = int(jnp.sum(hemisphere.texel_area(resolution=resolution) > 0))
-    factored = separable.factor(WANG, terms=inside, resolution=resolution)
-    expected = WANG(wi, wo)
+    inside = np.count_nonzero(hemisphere.texel_area(resolution=resolution))
+    factored = separable.factor(WANG, terms=int(inside), resolution=resolution)
+    expected = np.asarray(evaluate(WANG, wi, wo))
     # The last eigenvalues lie below single precision of the first, and with them their share of the norm.
-    assert jnp.linalg.norm(factored(wi, wo) - expected) < 1e-2 * jnp.linalg.norm(expected)
+    assert np.linalg.norm(evaluate(factored, wi, wo) - expected) < 1e-2 * np.linalg.norm(expected)
     assert factored.error < 2e-3
 
 
@@ -69,13 +75,13 @@ def test_kept_terms_are_the_leading_ones():
 
 def test_maps_are_finite_and_continue_beyond_the_rim():
     for texel in jax.tree.leaves(separable.factor(WANG, terms=16, resolution=32)):
-        assert jnp.all(jnp.isfinite(texel))
+        assert np.all(np.isfinite(texel))
     factored = separable.factor(Lambert(0.5), terms=1)
-    angle = jnp.linspace(0, 6.28, 50)
-    rim = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.full(50, 1e-3)], -1)
-    zenith = jnp.broadcast_to(jnp.array([0.0, 0, 1]), rim.shape)
-    np.testing.assert_allclose(factored(rim, zenith), 0.5 / np.pi, rtol=1e-4)
-    np.testing.assert_allclose(factored(zenith, rim), 0.5 / np.pi, rtol=1e-4)
+    angle = np.linspace(0, 6.28, 50)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.full(50, 1e-3)], -1).astype(np.float32)
+    zenith = np.broadcast_to(np.float32([0.0, 0, 1]), rim.shape)
+    np.testing.assert_allclose(evaluate(factored, rim, zenith), 0.5 / np.pi, rtol=1e-4)
+    np.testing.assert_allclose(evaluate(factored, zenith, rim), 0.5 / np.pi, rtol=1e-4)
 
 
 def test_prior_is_a_covariance():
@@ -112,7 +118,7 @@ def test_bad_brdfs_are_refused():
 def test_black_brdf_gives_zero_without_nan():
     factored = separable.factor(Lambert(0.0), terms=2, resolution=8)
     wi, wo = _texels(8)
-    assert jnp.all(factored(wi, wo) == 0)
+    assert not np.any(evaluate(factored, wi, wo))
     assert factored.error == 0
     assert separable.factor(Lambert(0.0), error=0.1, resolution=8).error == 0
 
