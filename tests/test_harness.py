@@ -1,7 +1,7 @@
 """The helpers that judge everything else are judged here: ``close`` and the benchmark harness."""
 
 import json
-import time
+import types
 
 import jax
 import jax.numpy as jnp
@@ -76,26 +76,32 @@ def test_x64_is_off_for_a_test_that_does_not():
     assert jnp.zeros(1).dtype == jnp.float32
 
 
-def test_compiling_is_measured_apart():
-    calls = []
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands until a call lets it go on: what is measured depends on no machine."""
+    now = [0.0]
+    monkeypatch.setattr(harness, "time", types.SimpleNamespace(perf_counter=lambda: now[0]))
 
-    def function():
-        calls.append(1)
-        time.sleep(0.05 if len(calls) == 1 else 0.001)
+    def taking(*seconds):
+        """A function whose calls take so long, one after another."""
+        each = iter(seconds)
 
-    timing = harness.measure(function, repeats=3)
-    assert len(calls) == 4
-    assert timing.compile_seconds > 0.03 > timing.seconds
+        def function():
+            now[0] += next(each)
+
+        return function
+
+    return taking
 
 
-def test_median_ignores_one_slow_call():
-    calls = []
+def test_compiling_is_measured_apart(clock):
+    timing = harness.measure(clock(8.0, 1.0, 1.0, 1.0), repeats=3)
+    assert timing.seconds == 1.0
+    assert timing.compile_seconds == 7.0
 
-    def function():
-        calls.append(1)
-        time.sleep(0.1 if len(calls) == 3 else 0.001)
 
-    assert harness.measure(function, repeats=3).seconds < 0.05
+def test_median_ignores_one_slow_call(clock):
+    assert harness.measure(clock(1.0, 2.0, 64.0, 2.0), repeats=3).seconds == 2.0
 
 
 def test_measure_waits_for_the_result(monkeypatch):

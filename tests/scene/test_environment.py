@@ -1,4 +1,3 @@
-import time
 import warnings
 
 import jax
@@ -397,17 +396,14 @@ def test_the_cross_and_the_latlong_copy_of_grace_are_inversions_of_each_other(da
     assert np.linalg.norm(inverted - cross.radiance) < GRACE_BOUND * np.linalg.norm(cross.radiance)
 
 
-def test_a_sunrise_keeps_its_sun_in_time(data):
-    start = time.perf_counter()
+def test_a_sunrise_keeps_its_sun(data):
     with pytest.warns(UserWarning, match=r"polyhaven_sunrise_1k\.exr: .* pixels are negative"):
         light = environment.load_environment(data / "env" / "polyhaven_sunrise_1k.exr")
-    seconds = time.perf_counter() - start
     radiance = np.asarray(light.radiance, np.float64)
     assert radiance.max() > 5000
     area = np.asarray(cubemap.solid_angle(size=64))[..., None]
     brightest = np.sort((area * radiance).sum(-1).ravel())[::-1]
     assert 0.4 < brightest[:10].sum() / brightest.sum() < 0.7
-    assert seconds < 10  # Alone it takes one.
 
 
 @pytest.mark.parametrize("name", ["uffizi_latlong_256x128.hdr", "eucalyptus_rnl_cross.hdr", "grace_cross.hdr"])
