@@ -3,18 +3,24 @@
 import gc
 import os
 import pathlib
+import sys
 from collections.abc import Callable, Iterator
 
-# Programs and notebooks started by tests share what took long to compile, and a later run finds it; `make clean`
-# removes it. What compiles fast takes longer to keep. Set before jax is imported, and inherited by what tests start.
+# Both workers, and programs and notebooks that tests start, share compiled programs, and a later run finds them;
+# `make clean` removes them. Keeping a program takes an eighth of the time of compiling it, finding it much less.
+# Set before jax is imported, and inherited by what tests start.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Its threads, in jax's QR, wait by spinning beside other processes.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and 3 % of the time
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Notebooks and
 # programs, which compute more, inherit a little of it once jax has read what is for tests.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+# Splitting small programs for several compiling threads costs a fifth of the time of compiling them.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1",
+)
 
 import jax
 import jaxtyping
@@ -25,16 +31,37 @@ from numpy.typing import ArrayLike
 jax.devices()
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace("optimization_level=0", "optimization_level=1")
 
+# Compiling the package's source anew takes each process that tests start a second, and workers three.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Rounding error that a few thousand operations may leave, relative to the norm of the result.
 TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
+
+# Linux gives a process 65,530 memory mappings, and each compiled program takes several.
+MAPPINGS = 40_000
+
+
+def pytest_collection_finish() -> None:
+    """Keeps the garbage collector from walking modules and tests, which stay, and from running every 700 objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
+def pytest_unconfigure() -> None:
+    """Lets the interpreter free at its end what was kept from the garbage collector."""
+    gc.unfreeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def room() -> Iterator[None]:
-    """Forgets what a file has compiled: Linux gives a process 65,530 mappings, and each function takes several."""
+    """Forgets what is compiled when the process nears the limit of mappings; until then, files share programs."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    mappings = pathlib.Path("/proc/self/maps")
+    if not mappings.exists() or mappings.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
