@@ -10,6 +10,8 @@ NumPy is given the matrix in float64, in which the optimum is computed; in float
 relative, of 1 to 16 terms on maps of 16 to 64 texels along an edge. It needs JAXPRT_DATA for clay and skin.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +28,10 @@ RESOLUTIONS = (16, 24, 32, 48, 64)
 FIGURE_TERMS = (1, 2, 3, 4, 6, 8, 12, 16)
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--figure", action="store_true", help="print the table of figure 4 and measure nothing")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     if arguments.figure:
         figure()
         return

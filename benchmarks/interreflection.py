@@ -26,6 +26,7 @@ one of them diffuse.
 import itertools
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -79,11 +80,11 @@ class Scene(NamedTuple):
     materials: list[list]
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
     parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write pictures beside the exact ones")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     for line in measure(arguments.quick, arguments.store, arguments.pictures):
         harness.report(line, arguments.output)
 

@@ -12,6 +12,7 @@ import concurrent.futures
 import os
 import pathlib
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -40,9 +41,10 @@ class Recorder(visibility.Occluder):
         return super().blocked(origin, direction)
 
 
-def main() -> None:
-    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args()
+def main(options: Sequence[str] | None = None) -> None:
+    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
     name, parts = scene(arguments.quick)
+    size = 16 if arguments.quick else SIZE
     whole = join([mesh for mesh, _, _ in parts])
     factored = [separable.factor(brdf, terms=terms) for _, brdf, terms in parts]
     recorder = Recorder(whole)
@@ -51,20 +53,20 @@ def main() -> None:
     normal = np.asarray(whole.normal)
     # One block of each part compiles.
     for (mesh, _, _), brdf in zip(parts, factored, strict=True):
-        transport.precompute(mesh, brdf, occluder=whole, vertex=np.arange(1), progress=False)
+        transport.precompute(mesh, brdf, size=size, occluder=whole, vertex=np.arange(1), progress=False)
     chosen = np.arange(0, len(start), visibility.BLOCK)[:: 2 if arguments.quick else EVERY]
-    counts = [embree_alone(recorder, start, normal, chosen[0::2])]
+    counts = [embree_alone(recorder, start, normal, chosen[0::2], size)]
     began = time.perf_counter()
     result = [
-        transport.precompute(mesh, brdf, keep=96, occluder=whole, progress=not arguments.quick)
+        transport.precompute(mesh, brdf, keep=96, size=size, occluder=whole, progress=not arguments.quick)
         for (mesh, _, _), brdf in zip(parts, factored, strict=True)
     ]
     seconds = time.perf_counter() - began
-    counts.append(embree_alone(recorder, start, normal, chosen[1::2]))
+    counts.append(embree_alone(recorder, start, normal, chosen[1::2], size))
     before, after = counts
     count, embree_seconds, vertices = before[0] + after[0], before[1] + after[1], before[2] + after[2]
     rays = count.rays / vertices * len(start)
-    error, plain_error = supersampling_error(recorder, start, normal)
+    error, plain_error = supersampling_error(recorder, start, normal, size)
     harness.report(
         {
             "benchmark": "precompute_separable",
@@ -102,7 +104,7 @@ def scene(quick: bool) -> tuple[str, list]:
     return "bunny + ground", [(bunny, glossy, 4), (ground_plane(bunny, vertices=22_000), Lambert(0.5), 1)]
 
 
-def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, first: np.ndarray, size: int = SIZE):
+def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, first: np.ndarray, size: int):
     """Rays of some blocks, the seconds that Embree takes for them on all threads, and the vertices in them."""
     threads = os.cpu_count() or 1
     count, seconds, vertices = visibility.RayCount(0, 0, 0), 0.0, 0
@@ -123,13 +125,13 @@ def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, firs
     return count, seconds, vertices
 
 
-def supersampling_error(recorder: Recorder, start: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
+def supersampling_error(recorder: Recorder, start: np.ndarray, normal: np.ndarray, size: int) -> tuple[float, float]:
     """Relative L2 errors with 16 rays on boundaries only: of visibility x cosine, and of visibility alone."""
     vertex = np.random.default_rng(0).choice(len(start), min(64, len(start)), replace=False)
-    mine, _ = visibility.fractional(recorder, start[vertex], normal[vertex], size=SIZE)
-    exact = visibility.exhaustive(recorder, start[vertex], normal[vertex], size=SIZE)
+    mine, _ = visibility.fractional(recorder, start[vertex], normal[vertex], size=size)
+    exact = visibility.exhaustive(recorder, start[vertex], normal[vertex], size=size)
     recorder.rays.clear()
-    cosine = np.maximum(normal[vertex] @ np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3).T, 0)
+    cosine = np.maximum(normal[vertex] @ np.asarray(cubemap.vector_area(size=size)).reshape(-1, 3).T, 0)
     errors = []
     for weight in (cosine, 1.0):
         difference = (mine.astype(float) - exact) * weight

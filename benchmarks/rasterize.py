@@ -8,6 +8,7 @@ The error is the part of the pixels whose triangle differs from Embree's.
 import concurrent.futures
 import os
 import pathlib
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,8 @@ from jaxprt.scene import Camera, Mesh
 THREADS = 2
 
 
-def main() -> None:
-    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args()
+def main(options: Sequence[str] | None = None) -> None:
+    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
     n, m = (50, 40) if arguments.quick else (250, 200)
     cases = {"torus": torus(n, m)}
     folder = pathlib.Path(os.environ.get("JAXPRT_DATA", "")) / "meshes"

@@ -20,6 +20,7 @@ norm of the disk, over materials of equal norm; the paper has 6.23e-4 with five 
 import itertools
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -69,10 +70,10 @@ class Triple(NamedTuple):
     eye: np.ndarray
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     for line in measure(arguments.quick, arguments.store):
         harness.report(line, arguments.output)
 
@@ -148,7 +149,9 @@ def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: 
     for roughness, each in found.items():
         part = dict(zip(("error", "brdf_error", "matte_error"), np.median(each, 0).tolist(), strict=True))
         yield {**common, "case": f"m = {roughness}, {case}", **timing.line(), **part}
-    yield gradient(mesh, transport, brdfs, plane, triples[0], median, {**common, "case": f"gradient, {case}"}, repeats)
+    yield gradient(
+        mesh, transport, brdfs, plane, triples[0], median, {**common, "case": f"gradient, {case}"}, repeats, quick
+    )
 
 
 def draw(mesh: Mesh, size: int, quick: bool) -> list[Triple]:
@@ -213,9 +216,12 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
     return result
 
 
-def gradient(mesh: Mesh, transport, brdfs, plane, triple: Triple, error: float, common: dict, repeats: int) -> dict:
+def gradient(
+    mesh: Mesh, transport, brdfs, plane, triple: Triple, error: float, common: dict, repeats: int, quick: bool
+) -> dict:
     """An image's loss and its gradient in light, weights and coordinates, beside the loss alone."""
-    view = camera.orbit(mesh, width=256, height=256)
+    edge = 64 if quick else 256
+    view = camera.orbit(mesh, width=edge, height=edge)
     fragments = raster.rasterize(mesh, view)
     fixed = materials(plane, triple, common["adjustable"])
 

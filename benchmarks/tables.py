@@ -12,6 +12,7 @@ stands in, which has no peer.
 """
 
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -52,10 +53,10 @@ PUBLISHED = {
 }
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--mesh", choices=list(PUBLISHED), action="append", help="only this mesh; may be repeated")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     folder = harness.data() / "meshes"
     lines = []
     if arguments.quick or not folder.exists():
@@ -64,8 +65,9 @@ def main() -> None:
     else:
         cases = (case(name) for name in arguments.mesh or PUBLISHED)
     for name, mesh, ground, faces, paper in cases:
-        repeats = 3 if arguments.quick else 21
-        lines += [harness.report(line, arguments.output) for line in measure(name, mesh, ground, faces, paper, repeats)]
+        size, repeats = (16, 3) if arguments.quick else (SIZE, 21)
+        measured = measure(name, mesh, ground, faces, paper, size=size, repeats=repeats)
+        lines += [harness.report(line, arguments.output) for line in measured]
     print(table(lines))
 
 
@@ -75,29 +77,31 @@ def case(name: str) -> tuple[str, Mesh, Mesh, int, Published]:
     return name, mesh, ground_plane(mesh, vertices=paper.ground), 2 * paper.simplified, paper
 
 
-def measure(name: str, mesh: Mesh, ground: Mesh, faces: int, paper: Published | None, repeats: int) -> list[dict]:
+def measure(
+    name: str, mesh: Mesh, ground: Mesh, faces: int, paper: Published | None, *, size: int, repeats: int
+) -> list[dict]:
     """The lines of one mesh: precomputation, view and light, each with one and with four terms."""
     whole = join([mesh, ground])
     shadows = occluder.simplify(whole, faces=faces)
     one_term = separable.factor(Lambert(0.5), terms=1)
     # One vertex compiles and does not count.
-    transport.precompute(ground, one_term, keep=KEEP, size=SIZE, occluder=shadows, vertex=np.arange(1), progress=False)
+    transport.precompute(ground, one_term, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
     began = time.perf_counter()
-    below = precompute(ground, one_term, shadows)
+    below = precompute(ground, one_term, shadows, size)
     ground_seconds = time.perf_counter() - began
     lines = []
     for column, terms in enumerate((1, 4)):
         glossy = separable.factor(AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100), terms=terms)
         began = time.perf_counter()
-        transport.precompute(mesh, glossy, keep=KEEP, size=SIZE, occluder=shadows, vertex=np.arange(1), progress=False)
+        transport.precompute(mesh, glossy, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
         compiled = time.perf_counter() - began
         began = time.perf_counter()
-        upon = precompute(mesh, glossy, shadows)
+        upon = precompute(mesh, glossy, shadows, size)
         seconds = time.perf_counter() - began + ground_seconds
         parts = [(upon, glossy), (below, one_term)]
         common = {
             "benchmark": "tables",
-            "error": change(parts),
+            "error": change(parts, size),
             "bytes": sum(q.nbytes for (_, q), _ in parts),
             "vertices": len(mesh.position),
             "ground": len(ground.position),
@@ -105,7 +109,9 @@ def measure(name: str, mesh: Mesh, ground: Mesh, faces: int, paper: Published | 
             "mesh": name,
             "terms": terms,
         }
-        view, light = frames([(q, brdf) for (_, q), brdf in parts], camera.orbit(mesh, elevation=0.3).eye, repeats)
+        view, light = frames(
+            [(q, brdf) for (_, q), brdf in parts], camera.orbit(mesh, elevation=0.3).eye, size, repeats
+        )
         timings = {"precompute": harness.Timing(seconds, compiled, 1), "view": view, "light": light}
         for what, timing in timings.items():
             line = {**common, "case": f"{what}, {name}, {terms} terms", "what": what, **timing.line()}
@@ -113,17 +119,17 @@ def measure(name: str, mesh: Mesh, ground: Mesh, faces: int, paper: Published | 
     return lines
 
 
-def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh):
+def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh, size: int):
     """Transport in floating point and in whole numbers."""
-    result = transport.precompute(mesh, brdf, keep=KEEP, size=SIZE, occluder=shadows, progress=False)
+    result = transport.precompute(mesh, brdf, keep=KEEP, size=size, occluder=shadows, progress=False)
     return result, jax.block_until_ready(quantize(result))
 
 
 def frames(
-    parts: list[tuple[QuantizedTransport, SeparableBrdf]], eye: jax.Array, repeats: int
+    parts: list[tuple[QuantizedTransport, SeparableBrdf]], eye: jax.Array, size: int, repeats: int
 ) -> tuple[harness.Timing, harness.Timing]:
     """A change of view, which keeps the light's tuples, and one of light, which keeps the view's."""
-    environment = builtin.daylight(size=SIZE)
+    environment = builtin.daylight(size=size)
     lights = [light_tuple(each, environment) for each, _ in parts]
     views = [view_tuple(each, brdf, eye) for each, brdf in parts]
 
@@ -136,9 +142,9 @@ def frames(
     return harness.compare(view, light, repeats=repeats)
 
 
-def change(parts: list) -> float:
+def change(parts: list, size: int) -> float:
     """Relative L2 difference of the light tuples that whole numbers make."""
-    environment = builtin.daylight(size=SIZE)
+    environment = builtin.daylight(size=size)
     pairs = [[light_tuple(each, environment) for each in both] for both, _ in parts]
     return float(
         jnp.sqrt(sum(jnp.sum((q - plain) ** 2) for plain, q in pairs) / sum(jnp.sum(plain**2) for plain, _ in pairs))

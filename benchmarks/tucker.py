@@ -19,7 +19,7 @@ import importlib
 import importlib.util
 import multiprocessing
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 
 import jax
@@ -44,8 +44,8 @@ EXPONENTS = 200
 RESOLUTION = 48  # of the larger table, which has the 1,804 texels inside the disk
 
 
-def main() -> None:
-    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args()
+def main(options: Sequence[str] | None = None) -> None:
+    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
     for line in measure(arguments.quick):
         harness.report(line, arguments.output)
 

@@ -1,9 +1,14 @@
-"""The notebooks as committed: readable without running. That they run is tested by nbmake, which collects them."""
+"""The notebooks: readable as committed, without running; and every cell runs, at the small size of the tests."""
 
 import json
+import linecache
 import pathlib
 import re
+import sys
 
+import jax
+import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 
 FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
@@ -32,10 +37,53 @@ def _texts(value: object) -> list[str]:
     return [text for each in value for text in _texts(each)] if isinstance(value, list) else []
 
 
-def test_there_are_notebooks_and_nbmake_runs_them(pytestconfig):
+@pytest.fixture
+def small(monkeypatch):
+    """The small size, the folder and the drawing of a notebook that runs in this process, and its caches after it."""
+    monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
+    monkeypatch.chdir(FOLDER)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    monkeypatch.setattr(plt, "show", lambda: None)
+    with matplotlib.rc_context({"backend": "agg"}):
+        yield
+    jax.clear_caches()
+
+
+def execute(path: pathlib.Path) -> None:
+    """Runs the code cells in order, as a kernel does; an error is told with its cell. Lines of magics are left out."""
+    namespace = {"__name__": "__main__"}
+    for number, cell in enumerate(_code(path), 1):
+        source = "".join("\n" if line.startswith("%") else line for line in cell["source"])
+        place = f"{path.name}, cell {number}"
+        # Tracebacks show the line.
+        linecache.cache[place] = (len(source), None, source.splitlines(keepends=True), place)
+        try:
+            exec(compile(source, place, "exec"), namespace)
+        except Exception as error:
+            error.add_note(f"in {place}")
+            raise
+        finally:
+            plt.close("all")
+
+
+def test_there_are_notebooks():
     assert NOTEBOOKS
-    assert pytestconfig.getoption("nbmake")
-    assert "notebooks" in pytestconfig.getini("testpaths")
+
+
+# The size may cause warnings. The outputs of full size hold none.
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_every_cell_of_a_notebook_runs(path, small):
+    execute(path)
+
+
+def test_a_cell_that_fails_is_named(tmp_path):
+    cells = [["first = 1\n"], ["%config InlineBackend.figure_formats = []\n", "first / 0"]]
+    written = {"cells": [{"cell_type": "code", "source": source} for source in cells]}
+    (tmp_path / "broken.ipynb").write_text(json.dumps(written))
+    with pytest.raises(ZeroDivisionError) as caught:
+        execute(tmp_path / "broken.ipynb")
+    assert caught.value.__notes__ == ["in broken.ipynb, cell 2"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
