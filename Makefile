@@ -22,7 +22,7 @@ check: $(VENV)/.setup-test ## format, lint and types
 	$(BIN)/ruff check
 	$(BIN)/pyright
 
-test: check ## check, then all tests, doctests and notebooks; real data where JAXPRT_DATA names its folder
+test: check ## check, then all tests, doctests and notebooks at a small size; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)
 
 bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
@@ -33,7 +33,7 @@ bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable 
 tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half an hour: ARGS="--mesh stanford_bunny" for one
 	$(BIN)/python -m benchmarks.tables $(ARGS)
 
-notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place
+notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
 	$(BIN)/jupyter nbconvert --to notebook --execute --inplace $(sort $(wildcard notebooks/*.ipynb))
 

@@ -1,4 +1,4 @@
-"""Fixtures that every test may ask for: ``data``, ``x64``, ``unchecked`` and ``close``."""
+"""Fixtures that every test may ask for: ``data``, ``coarse``, ``x64``, ``unchecked`` and ``close``."""
 
 import gc
 import os
@@ -54,6 +54,15 @@ def pytest_unconfigure() -> None:
     gc.unfreeze()
 
 
+# These files take minutes each. One that came last would leave the other process idle.
+LONG = ("test_notebooks.py", "test_benchmarks.py", "test_command_line.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the tests of the longest files first."""
+    items.sort(key=lambda item: item.path.name not in LONG)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def room() -> Iterator[None]:
     """Forgets what is compiled when the process nears the limit of mappings; until then, files share programs."""
@@ -79,6 +88,21 @@ def data() -> pathlib.Path:
     if os.environ.get("JAXPRT_DATA_REQUIRED") == "1":
         pytest.fail(f"{reason}; JAXPRT_DATA_REQUIRED=1 asks for it")
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Iterator[None]:
+    """For one file, lobes and factors are fitted to BRDFs at fewer directions; the code that fits them is the same."""
+    from jaxprt.brdf import dynamic, lobe_em, paths
+
+    with pytest.MonkeyPatch.context() as patch:
+        for room, names in (
+            (lobe_em, ("RINGS", "SECTORS")),
+            *((each, ("_RINGS", "_SECTORS")) for each in (dynamic, paths)),
+        ):
+            for name, value in zip(names, (20, 28), strict=True):
+                patch.setattr(room, name, value)
+        yield
 
 
 @pytest.fixture

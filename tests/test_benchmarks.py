@@ -11,7 +11,6 @@ import jax
 import pytest
 
 import jaxprt as prt
-from jaxprt.brdf import lobe_em
 from jaxprt.image import raster
 from jaxprt.transport import lobe
 
@@ -41,7 +40,7 @@ MOST_ERROR = {
 
 
 @pytest.fixture
-def small(monkeypatch):
+def small(coarse, monkeypatch):
     """Coarse tables where a benchmark leaves their size open, and blocks so short that quick cases have several."""
     for room, name, options in (
         (prt.brdf.separable, "factor", {"resolution": 12}),
@@ -51,8 +50,6 @@ def small(monkeypatch):
     ):
         monkeypatch.setattr(room, name, functools.partial(getattr(room, name), **options))
     for room, name, value in (
-        (lobe_em, "RINGS", 24),
-        (lobe_em, "SECTORS", 32),
         (prt.brdf.separable, "_BLOCK", 64),
         (lobe, "_BLOCK", 64),
         (raster, "CHUNK", 1024),

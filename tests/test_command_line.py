@@ -32,7 +32,7 @@ WHOLE = ("--ground", "--azimuth", "-30", "--system", *SYSTEMS)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small():
+def small(coarse):
     """Coarse maps, skies and ground: what the command does with them is the same."""
     with pytest.MonkeyPatch.context() as patch:
         for room, name, options in (
@@ -52,8 +52,6 @@ def small():
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
         for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
             patch.setattr(animation, name, value)
-        for name, value in (("RINGS", 16), ("SECTORS", 24)):
-            patch.setattr(prt.brdf.lobe_em, name, value)
         yield
 
 

@@ -38,7 +38,7 @@ def _texts(value: object) -> list[str]:
 
 
 @pytest.fixture
-def small(monkeypatch):
+def small(coarse, monkeypatch):
     """The small size, the folder and the drawing of a notebook that runs in this process, and its caches after it."""
     monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
     monkeypatch.chdir(FOLDER)
