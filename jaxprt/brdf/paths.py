@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import dynamic
+from jaxprt.brdf import dynamic, reflected
 from jaxprt.brdf.dynamic import DynamicBrdf
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.linalg import tucker
@@ -53,7 +53,7 @@ def factor(
     Reference: Sun et al. 2007, section 3.1, in the norm of natural light in place of Frobenius'.
     """
     colors = dynamic.check(brdfs, None, resolution=resolution)
-    found = dynamic.reflect(brdfs, None, resolution=resolution)
+    found = reflected.reflect(brdfs, None, resolution=resolution)
     count, _, views, harmonic = found.tensor.shape
     kinds = (_SMOOTH + 1) ** 2
     functions = min(_FUNCTIONS, count * colors) if functions is None else functions
@@ -77,7 +77,7 @@ def factor(
         jnp.moveaxis(view / size, 1, 2).reshape(-1, edge, edge),
         (size[:, None] * (across.T @ found.to_map)).reshape(terms, edge, edge),
         None,
-        dynamic.stacked(brdfs),
+        reflected.stacked(brdfs),
         jnp.sqrt(left / jnp.where(whole > 0, whole, 1)),
     )
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxprt.brdf import dynamic, lobe, lobe_em, models
+from jaxprt.brdf import dynamic, lobe, lobe_em, models, reflected
 from jaxprt.brdf.separable import SeparableBrdf, tabulate
 from jaxprt.linalg import eigen, mixture
 from jaxprt.sphere import hemisphere
@@ -231,9 +231,9 @@ def factor_tensor(
     # Texels outside the disk, which bilinear lookup needs at the rim, count next to nothing.
     flux = jnp.sqrt(jnp.maximum(area, 1e-6 * jnp.max(area)))
     tensor = jnp.asarray(np.stack([np.asarray(tabulate(brdf, direction) * flux) for brdf in brdfs]))
-    dynamic.check_values([jnp.min(tensor, (1, 2, 3))])
+    reflected.check_values([jnp.min(tensor, (1, 2, 3))])
     whole = jnp.sum(jnp.sum(tensor**2, (0, 1, 3)) * area)
-    rest = (None, dynamic.stacked(brdfs))
+    rest = (None, reflected.stacked(brdfs))
     return dynamic.decompose(
         tensor, jnp.diag(1 / flux), jnp.sqrt(area), whole, ranks, rest, hemisphere.disk_coordinates
     )

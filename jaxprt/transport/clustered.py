@@ -222,18 +222,8 @@ def precompute(
     weight = jnp.asarray(result["weight"]).reshape(*member.shape, vectors)
     row, place = member.ravel(), places(member)
     rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
-    return ClusteredTransport(
-        index,
-        mode,
-        core,
-        weight,
-        direct.position,
-        direct.frame,
-        jnp.asarray(row, jnp.int32),
-        jnp.asarray(place),
-        rms,
-        jnp.asarray(marked(brdf.light_map)),
-    )
+    same = (direct.position, direct.frame, jnp.asarray(row, jnp.int32), jnp.asarray(place))
+    return ClusteredTransport(index, mode, core, weight, *same, rms, jnp.asarray(marked(brdf.light_map)))
 
 
 def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:
