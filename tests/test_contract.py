@@ -15,6 +15,7 @@ Public classes that can be called, as BRDF models can, have examples too: the fi
 Functions that are not pure, or run on the host, are named in HOST with the reason.
 """
 
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -717,6 +718,12 @@ def on_host(name: str) -> bool:
 PUBLIC = _public()
 PURE = [name for name in PUBLIC if not on_host(name)]
 TAKING_ARRAYS = [name for name in PURE if name in EXAMPLES and EXAMPLES[name].build is not nothing]
+# BRDFs are called by compiled functions; other functions without jit may look at values, or have parts in NumPy.
+IN_PARTS = [
+    name
+    for name in PURE
+    if name in EXAMPLES and not isinstance(PUBLIC[name], JITTED) and PUBLIC[name].__name__ != "__call__"
+]
 each_pure = pytest.mark.parametrize("name", [name for name in PURE if name in EXAMPLES])
 
 
@@ -781,71 +788,92 @@ def test_defaults_are_keyword_only(name):
     assert not wrong
 
 
+@functools.cache
+def single(name: str) -> tuple[Callable, Call, Any]:
+    """A function compiled for float32, its arguments and their result."""
+    arrays = build(name)
+    function = jax.jit(lambda arrays: run(name, arrays))
+    return function, arrays, function(arrays)
+
+
+@functools.cache
+def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
+    """What a function gives for the arguments of ``single`` in float64.
+
+    Beside it, where the function is differentiable, the program that gave it: of arguments that move, by their names,
+    and of those that stand still it makes a weighted sum of all results, the results, and derivatives of the sum.
+    """
+    with jax.enable_x64(True):
+        arrays = jax.tree.map(lambda leaf: leaf.astype(float) if is_float(leaf) else leaf, single(name)[1])
+        function, example = PUBLIC[name], EXAMPLES[name]
+        given = dict(inspect.signature(function).bind_partial(*arrays.position, **arrays.name).arguments)
+        asked = [key for key in given if floats(given[key])] if example.gradient is None else example.gradient
+        if not asked:
+            return jax.jit(lambda arrays: run(name, arrays))(arrays), None, {}, {}
+        moving, still = eqx.partition({key: given[key] for key in asked}, is_float)
+        still = still, {key: value for key, value in given.items() if key not in asked}
+
+        def weigh(moving, still):
+            result = function(**still[1] | eqx.combine(moving, still[0]), **example.options)
+            weighed = (jnp.vdot(Draw(100 + i).normal(*leaf.shape), leaf) for i, leaf in enumerate(floats(result)))
+            return sum(weighed), result
+
+        program = jax.jit(jax.value_and_grad(weigh, has_aux=True))
+        (_, result), gradient = program(moving, still)
+        return result, lambda moving: program(moving, still)[0][0], moving, gradient
+
+
 @each_pure
-def test_jit_equals_eager(name, close):
-    arrays, function = build(name), PUBLIC[name]
-    if isinstance(function, JITTED):
-        compiled = run(name, arrays)
-        eager = inspect.getattr_static(function, "__wrapped__")(
-            *arrays.position, **arrays.name, **EXAMPLES[name].options
-        )
-    else:
-        compiled = jax.jit(lambda arrays: run(name, arrays))(arrays)
-        eager = run(name, arrays)
-    jax.tree.map(close, compiled, eager)
+def test_float32_equals_float64(name, close):
+    jax.tree.map(close, single(name)[2], double(name)[0])
+
+
+@pytest.mark.parametrize("name", IN_PARTS)
+def test_functions_that_compile_only_their_parts_give_the_same_under_jit(name, close):
+    _, arrays, compiled = single(name)
+    jax.tree.map(close, run(name, arrays), compiled)
 
 
 @each_pure
 def test_float32_in_gives_float32_out(name):
-    _check_dtype(name, jnp.float32)
+    _, arrays, result = single(name)
+    _check_dtype(arrays, result, jnp.float32)
 
 
 @each_pure
 def test_float64_in_gives_float64_out(name, x64):
-    _check_dtype(name, jnp.float64)
+    _check_dtype(build(name), double(name)[0], jnp.float64)
 
 
-def _check_dtype(name, dtype):
-    arrays = build(name)
+def _check_dtype(arrays, result, dtype):
     assert all(leaf.dtype == dtype for leaf in floats(arrays)), "the example itself must have the dtype"
-    result = floats(jax.eval_shape(lambda: run(name, arrays)))
+    result = floats(result)
     assert [leaf.dtype for leaf in result] == [dtype] * len(result)
     assert result, "a function without floating-point results is for HOST"
 
 
 @pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].batch])
 def test_vmap_equals_a_loop(name, close):
-    arrays = [build(name, seed) for seed in range(BATCH)]
+    function, first, result = single(name)
+    arrays = [first, *(build(name, seed) for seed in range(1, BATCH))]
     stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *arrays)
-    function = jax.jit(lambda arrays: run(name, arrays))
     together = jax.jit(jax.vmap(function))(stacked)
-    apart = jax.tree.map(lambda *leaf: np.stack(leaf), *[function(each) for each in arrays])
+    apart = jax.tree.map(lambda *leaf: np.stack(leaf), result, *[function(each) for each in arrays[1:]])
     jax.tree.map(close, together, apart)
 
 
 @pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].gradient != ()])
 def test_gradient_equals_finite_differences(name, x64):
-    arrays, options = build(name), EXAMPLES[name].options
-    given = dict(inspect.signature(PUBLIC[name]).bind_partial(*arrays.position, **arrays.name).arguments)
-    asked = EXAMPLES[name].gradient or [key for key in given if floats(given[key])]
-    moving, still = eqx.partition({key: given[key] for key in asked}, is_float)
+    _, weigh, moving, gradient = double(name)
     random = Draw(200)
-
-    def weigh(moving):
-        result = floats(PUBLIC[name](**given | eqx.combine(moving, still), **options))
-        return sum(jnp.vdot(Draw(100 + i).normal(*leaf.shape), leaf) for i, leaf in enumerate(result))
-
-    value_and_gradient = jax.jit(jax.value_and_grad(weigh))
-    _, gradient = value_and_gradient(moving)
-    for key in asked:
-        slope, direction = gradient[key], jax.tree.map(lambda leaf: random.normal(*leaf.shape), moving[key])
+    assert weigh is not None, "no argument holds floating-point arrays: say gradient=()"
+    for key, slope in gradient.items():
+        direction = jax.tree.map(lambda leaf: random.normal(*leaf.shape), moving[key])
         norm = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in floats(slope)))
         assert np.isfinite(norm), f"the gradient in {key} is not finite"
         assert norm > 0, f"the gradient in {key} is zero: not what an example is for"
         analytic = sum(np.vdot(*pair) for pair in zip(floats(slope), floats(direction), strict=True))
-        ahead, back = (
-            value_and_gradient(moving | {key: _moved(moving[key], direction, step)})[0] for step in (STEP, -STEP)
-        )
+        ahead, back = (weigh(moving | {key: _moved(moving[key], direction, step)}) for step in (STEP, -STEP))
         numeric = (ahead - back) / (2 * STEP)
         assert abs(analytic - numeric) <= GRADIENT_TOLERANCE * norm, f"in {key}: {analytic}, differences {numeric}"
 
