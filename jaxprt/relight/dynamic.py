@@ -35,8 +35,8 @@ class Material(eqx.Module):
     """What a region is made of at present. Numbers, lists and NumPy arrays become arrays.
 
     Relighting refuses shares that are negative or do not sum to one, negative weights, and values that are not finite.
-    Inside `jax.jit`, `jax.grad` and the like values are not known, and a material is used as it is: radiance is linear
-    in shares and weights, and a NaN in one region reaches all vertices to which that region sends light.
+    Inside `jax.jit`, `jax.grad` and the like values are not known, and nothing is refused: shares that sum to two make
+    twice as bright lobes, and a NaN in one region reaches every vertex to which that region sends light.
 
     Attributes:
         share: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
