@@ -1,13 +1,19 @@
-"""Checks of values where they enter the package, with errors that name what was required and what came.
+"""Checks of arguments where they enter the package, with errors that name what was required and what came.
 
 Values inside `jax.jit`, `jax.vmap` or `jax.grad` are not known while Python runs: these checks let them pass. There a
 NaN reaches every vertex that reads it.
 """
 
-from typing import Any
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
+import jax
 import numpy as np
 from jax.core import Tracer
+
+Function = TypeVar("Function", bound=Callable)
 
 
 def finite(name: str, value: Any) -> None:
@@ -84,3 +90,82 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
     """
     if value is not None and not low <= value <= high:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
+
+
+def kind(name: str, value: Any, *wanted: type, source: str) -> None:
+    """Refuses objects of other classes than those wanted.
+
+    Args:
+        name: What the value is, for the message: "the light".
+        value: The object.
+        wanted: The classes.
+        source: The function that makes one.
+
+    Raises:
+        TypeError: The object is of another class.
+    """
+    if not isinstance(value, wanted):
+        names = " or ".join(each.__name__ for each in wanted)
+        raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_described(value)}")
+
+
+def array(name: str, value: Any, *axes: str, source: str = "") -> None:
+    """Refuses what is no array, or has other axes.
+
+    Args:
+        name: What the value is, for the message: "the eye".
+        value: The array.
+        axes: Each way in which its axes may be, as "v 3": letters stand for any size.
+        source: The function that makes one, if there is one.
+
+    Raises:
+        TypeError: The value is no array.
+        ValueError: It has another number of axes, or a size that is not the one required.
+    """
+    shape = value.shape if isinstance(value, jax.Array | np.ndarray) else None
+    if shape is not None and any(_fits(shape, each.split()) for each in axes):
+        return
+    required = " or ".join(f"[{', '.join(each.split())}]" for each in axes)
+    made = f", which {source} makes" if source else ""
+    message = f"{name} must be an array {required}{made}, got {_described(value)}"
+    raise TypeError(message) if shape is None else ValueError(message)
+
+
+def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
+    """Decorates a function with checks of its arguments, which run before it: outside `jax.jit` if they come first.
+
+        @require.arguments(eye=partial(require.finite, "the eye"))
+        @jax.jit
+        def radiance(..., eye): ...
+
+    Args:
+        check: For the name of each argument a function that raises.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def checked(*argument, **named):
+            given = signature.bind_partial(*argument, **named).arguments
+            for name, each in check.items():
+                if name in given:
+                    each(given[name])
+            return function(*argument, **named)
+
+        return cast(Function, checked)
+
+    return decorate
+
+
+def _fits(shape: tuple[int, ...], axes: list[str]) -> bool:
+    """Whether a shape has the axes, and the sizes of those that are numbers."""
+    return len(shape) == len(axes) and all(
+        not want.isdigit() or int(want) == got for want, got in zip(axes, shape, strict=True)
+    )
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, jax.Array | np.ndarray):
+        return f"an array of shape {list(value.shape)}"
+    return f"one of class {type(value).__name__}"

@@ -301,9 +301,9 @@ class Draw:
         """Wide lobes on the sphere."""
         return linalg.mixture.Mixture(self.uniform(lobes), self.unit(lobes), self.uniform(lobes, low=1, high=9))
 
-    def harmonic(self):
-        """A BRDF in four harmonics."""
-        return brdf.HarmonicBrdf(self.normal(4, 3, 5, 5), (), self.uniform())
+    def harmonic(self, *nodes):
+        """A BRDF in four harmonics, over the view angle or on a map."""
+        return brdf.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
 
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
@@ -397,6 +397,7 @@ EXAMPLES = {
     "sphere.harmonics.least_laplacian": example(lambda draw: call(draw.normal(9, 2), draw.uniform())),
     "sphere.harmonics.disc": example(lambda draw: call(draw.unit(4), draw.uniform(4)), degree=4),
     # Derivatives by a rotation are along rotations only; tests of the module's own compare those.
+    "sphere.rotation.about_z": example(lambda draw: call(draw.normal(9, 2, 4), draw.normal(4), draw.normal(4))),
     "sphere.rotation.rotate": example(lambda draw: call(draw.normal(9, 2), draw.rotation()), gradient=("coefficient",)),
     "sphere.rotation.rotate_each": example(
         lambda draw: call(draw.normal(9, 2), draw.rotation(4)), gradient=("coefficient",)
@@ -668,7 +669,7 @@ EXAMPLES = {
         lambda draw: call(draw.matrix(), draw.normal(4, 3, 3)), gradient=("view",)
     ),
     "relight.harmonic.view_coefficients": example(
-        lambda draw: call(draw.harmonic(), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
+        lambda draw: call(draw.harmonic(5), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
         gradient=("brdf", "position", "eye"),
     ),
     "relight.harmonic.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),

@@ -59,3 +59,33 @@ def test_numbers_outside_a_range_are_refused_and_none_passes():
     for value in (-1, 0, 5):
         with pytest.raises(ValueError, match=f"terms must be between 1 and 4, got {value}"):
             require.between("terms", value, 1, 4)
+
+
+def test_objects_of_another_class_are_refused_by_the_class_required_and_the_function_that_makes_it():
+    require.kind("the light", 1.0, int, float, source="make")
+    with pytest.raises(
+        TypeError, match="the light must be of class int or str, which make makes, got one of class list"
+    ):
+        require.kind("the light", [], int, str, source="make")
+    with pytest.raises(TypeError, match=r"class int, which make makes, got an array of shape \[2, 3\]"):
+        require.kind("the light", jnp.zeros((2, 3)), int, source="make")
+
+
+def test_arrays_must_have_one_of_the_ways_of_axes():
+    require.array("the eye", np.zeros((5, 3)), "3", "v 3")
+    with pytest.raises(ValueError, match=r"the eye must be an array \[3\] or \[v, 3\], got an array of shape \[4, 2\]"):
+        require.array("the eye", np.zeros((4, 2)), "3", "v 3")
+    with pytest.raises(TypeError, match=r"an array \[3\], which look makes, got one of class tuple"):
+        require.array("the eye", (1, 2, 3), "3", source="look")
+
+
+def test_checked_arguments_are_known_before_the_function_is_compiled():
+    @require.arguments(x=lambda x: require.finite("x", x))
+    @jax.jit
+    def double(x, *, y=0):
+        return 2 * x + y
+
+    assert double(jnp.ones(()), y=1) == 3
+    with pytest.raises(ValueError, match="x must be finite"):
+        double(x=jnp.asarray(jnp.nan))
+    assert jnp.isnan(jax.jit(double)(jnp.asarray(jnp.nan)))

@@ -52,8 +52,10 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         the flux of the brightest texel not taken; and the environment without that.
 
     Raises:
+        TypeError: The light is no Environment.
         ValueError: The light is a batch, or as many texels as there are are asked for, or less than none.
     """
+    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     size, colors = light.radiance.shape[-2:]
     if light.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")

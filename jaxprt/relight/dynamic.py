@@ -121,7 +121,7 @@ def radiance(
         Differentiable in the light, the eye and the materials.
 
     Raises:
-        TypeError: The light is no Environment, or a material no Material.
+        TypeError: The light is no Environment, a BRDF is neither dynamic nor factored, or a material is no Material.
         ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
             be, shares of another number of BRDFs, weights of two or more than three colors, values that `Material`
             refuses, an eye that is not one position, a light of another size, or an eye or a light that is not finite.
@@ -247,6 +247,8 @@ def _has_pyramid(region: RegionTransport) -> bool:
 
 def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:
     """Refuses what does not fit a region."""
+    source = "jaxprt.brdf.dynamic.factor or jaxprt.brdf.separable.factor"
+    require.kind(f"the BRDF of region {number}", brdf, DynamicBrdf, SeparableBrdf, source=source)
     changes = isinstance(brdf, DynamicBrdf)
     terms = brdf.light_map.shape[0] + changes
     if terms != own.terms.terms or (changes and brdf.lobe is not None) != _has_pyramid(own):

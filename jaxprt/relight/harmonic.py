@@ -4,12 +4,18 @@ The published four steps are `local_light` (rotate the light to each vertex's fr
 and the table looked up there (`view_coefficients`), and their dot product (`combine`). With fixed light a caller keeps
 the first, or `transferred_light`; with fixed view the BRDF's coefficients turned to the world, `world_view` or
 `transferred_view`, which then meet the light's coefficients alone. `radiance` and `unshadowed_radiance` do all of it.
+
+Lights, eyes and probes must be finite. Inside `jax.jit`, `jax.vmap` and `jax.grad` values are not known and not
+checked: NaN in a light or in an eye then reaches every vertex, NaN in a probe every vertex that it has a share in.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
@@ -17,11 +23,64 @@ from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector, right_handed
 
 
-def project(light: Environment, *, degree: int) -> Float[Array, "lm c"]:
-    """SH coefficients of an environment, in its radiance times sr^1/2."""
-    return harmonics.project(light.radiance, degree=degree)
+def _light_shape(value: Any) -> None:
+    require.array("the light", value, "lm c", "lm c v", source="jaxprt.relight.harmonic.project")
 
 
+def _light(value: Any) -> None:
+    _light_shape(value)
+    require.finite("the light", value)
+
+
+def _environment(value: Any) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+    require.finite("the light", value.radiance)
+
+
+def _brdf(value: Any) -> None:
+    require.kind("the BRDF", value, HarmonicBrdf, source="jaxprt.brdf.harmonic.tabulate")
+
+
+def _matrix(value: Any) -> None:
+    require.kind("the transport", value, TransferMatrix, source="jaxprt.transport.harmonic.precompute")
+
+
+def _vector(value: Any) -> None:
+    require.kind("the transport", value, TransferVector, source="jaxprt.transport.harmonic.precompute_diffuse")
+
+
+def _eye(value: Any) -> None:
+    require.array("the eye", value, "3")
+    require.finite("the eye", value)
+
+
+def _probe(value: Any) -> None:
+    require.array("probes", value, "p 3")
+    require.finite("probes", value)
+    if not value.shape[0]:
+        raise ValueError("there must be at least one probe, got an array of shape [0, 3]")
+
+
+def _probe_coefficient(value: Any) -> None:
+    require.array("the light at the probes", value, "p lm c")
+    require.finite("the light at the probes", value)
+
+
+@require.arguments(light=_environment)
+def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
+    """SH coefficients of an environment, in its radiance times sr^1/2; of each one of a batch.
+
+    Raises:
+        TypeError: The light is no Environment.
+        ValueError: The light is not finite, or the degree is negative.
+    """
+    *batch, faces, edge, _, colors = light.radiance.shape
+    every = jnp.moveaxis(light.radiance.reshape(-1, faces, edge, edge, colors), 0, -1)
+    coefficient = harmonics.project(every, degree=degree)
+    return jnp.moveaxis(coefficient, -1, 0).reshape(*batch, -1, colors)
+
+
+@require.arguments(transport=_matrix, brdf=_brdf, light=_light, eye=_eye)
 @jax.jit
 def radiance(
     transport: TransferMatrix,
@@ -45,7 +104,9 @@ def radiance(
         Linear radiance; negative where the harmonics ring.
 
     Raises:
-        ValueError: Light, transport and table differ in degree.
+        TypeError: The transport is no matrix, the BRDF is no table, or the light is an environment.
+        ValueError: Light, transport and table differ in degree, an array has other axes, or the light or the eye is
+            not finite.
 
     Reference: Kautz, Sloan, Snyder 2002, sections 4 and 5.
     """
@@ -53,6 +114,7 @@ def radiance(
     return combine(light, transferred_view(transport, view))
 
 
+@require.arguments(brdf=_brdf, light=_light, eye=_eye)
 @jax.jit
 def unshadowed_radiance(
     mesh: Mesh,
@@ -63,7 +125,19 @@ def unshadowed_radiance(
 ) -> Float[Array, "v _"]:
     """Radiance of every vertex towards the eye without shadows: nothing is precomputed but the BRDF's table.
 
-    Arguments as of `radiance`.
+    Args:
+        mesh: The vertices.
+        brdf: The BRDF's table.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Per vertex, the parameters of a BRDF that varies.
+        eye: Position of the viewer.
+
+    Returns:
+        Linear radiance; negative where the harmonics ring.
+
+    Raises:
+        TypeError: The BRDF is no table, or the light is an environment.
+        ValueError: Light and table differ in degree, an array has other axes, or the light or the eye is not finite.
 
     Reference: Kautz, Sloan, Snyder 2002, section 4.
     """
@@ -71,6 +145,7 @@ def unshadowed_radiance(
     return combine(local_light(frame, light), view_coefficients(brdf, mesh.position, frame, *parameter, eye=eye))
 
 
+@require.arguments(transport=_vector, light=_light)
 @jax.jit
 def diffuse_radiance(
     transport: TransferVector, albedo: Float[Array, "..."], light: Float[Array, "lm c *w"]
@@ -80,14 +155,16 @@ def diffuse_radiance(
     Args:
         transport: Transfer vectors.
         albedo: One for all or one for each vertex.
-        light: As of `radiance`.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
 
     Raises:
-        ValueError: Light and transport differ in degree.
+        TypeError: The transport is no vector, or the light is an environment.
+        ValueError: Light and transport differ in degree, or the light has other axes or is not finite.
     """
     return combine(light, transport.vector) * albedo
 
 
+@require.arguments(probe=_probe, coefficient=_probe_coefficient)
 @jax.jit
 def probe_light(
     position: Float[Array, "v 3"], probe: Float[Array, "p 3"], coefficient: Float[Array, "p lm c"]
@@ -102,8 +179,14 @@ def probe_light(
         probe: Where it is known.
         coefficient: SH coefficients of the light around each probe.
 
+    Raises:
+        TypeError: Probes or coefficients are no arrays.
+        ValueError: There are no probes, the light is not that of as many, or some values are not finite.
+
     Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting); Shepard 1968.
     """
+    if len(probe) != len(coefficient):
+        raise ValueError(f"there must be light at each of the {len(probe)} probes, got light at {len(coefficient)}")
     square = jnp.sum((position[:, None] - probe) ** 2, -1)
     nearest = jnp.min(square, -1, keepdims=True)
     ratio = jnp.where(nearest > 0, nearest, 1) / jnp.where(nearest > 0, square, 1)
@@ -112,6 +195,7 @@ def probe_light(
     return jnp.einsum("vp,plc->lcv", weight, coefficient)
 
 
+@require.arguments(light=_light)
 @jax.jit
 def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
     """Light turned to the frame of every vertex: the light side without transfer.
@@ -123,6 +207,7 @@ def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) ->
     return rotation.rotate_each(light, right_handed(frame))
 
 
+@require.arguments(transport=_matrix, light=_light)
 @jax.jit
 def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm _ v"]:
     """Light that arrives at every vertex in its own frame: the light side with transfer.
@@ -147,6 +232,7 @@ def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"])
     return jnp.einsum("vcoi,ic->ocv", transport.matrix, jnp.broadcast_to(light, (terms, colors)))
 
 
+@require.arguments(brdf=_brdf, eye=_eye)
 @jax.jit
 def view_coefficients(
     brdf: HarmonicBrdf,
@@ -165,6 +251,7 @@ def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Fl
     return rotation.rotate_each(view, right_handed(frame).swapaxes(1, 2))
 
 
+@require.arguments(transport=_matrix)
 @jax.jit
 def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) -> Float[Array, "lm _ v"]:
     """`view_coefficients` through the transfer, to the distant light in the world: for a fixed view with shadows.
@@ -183,6 +270,7 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
     return jnp.einsum("vcoi,vco->icv", transport.matrix, jnp.broadcast_to(rows, (count, colors, terms)))
 
 
+@require.arguments(light=_light_shape)
 @jax.jit
 def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Float[Array, "v _"]:
     """Dot product of light and BRDF coefficients: radiance.

@@ -10,6 +10,7 @@ costs nothing.
 
 import math
 from functools import lru_cache, partial, reduce
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -68,6 +69,15 @@ class LobeView(eqx.Module):
     size: int = eqx.field(static=True)
 
 
+def _brdf(value: Any) -> None:
+    require.kind("the BRDF", value, LobeBrdf, source="jaxprt.brdf.lobe.tabulate")
+
+
+def _environment(value: Any) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+
+
+@require.arguments(brdf=_brdf, light=_environment)
 def radiance(
     transport: LobeTransport, brdf: LobeBrdf, light: Environment, *, eye: Float[Array, "3"]
 ) -> Float[Array, "v c"]:
@@ -87,6 +97,7 @@ def radiance(
         Differentiable in the light, the eye and the table.
 
     Raises:
+        TypeError: The BRDF is no table of lobes, or the light no Environment.
         ValueError: The light has another size than the transport, the table has parameters, or the light or the eye is
             not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
 
@@ -95,6 +106,7 @@ def radiance(
     return combine(prefilter(light), look(transport, brdf, eye=eye))
 
 
+@require.arguments(light=_environment)
 def prefilter(light: Environment) -> LobeLight:
     """Blurs a light to all widths; linear in it.
 
@@ -112,6 +124,7 @@ def prefilter(light: Environment) -> LobeLight:
     return _prefilter(light, _blurs(light.radiance.shape[1], light.radiance.dtype))
 
 
+@require.arguments(brdf=_brdf)
 def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) -> LobeView:
     """Where each vertex reads the light for a view, and what it sees there.
 

@@ -44,9 +44,11 @@ def radiance(
         Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
 
     Raises:
+        TypeError: The light is no Environment.
         ValueError: No such vertices, the BRDF's values have no axis for colors, or the light or the eye is not finite.
             Inside `jax.jit` values are not known: NaN then reaches the vertices.
     """
+    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     require.finite("the light", light.radiance)
     require.position("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)

@@ -4,7 +4,7 @@ Turning the light redoes only `light_tuple`, moving the eye only `view_tuple`; t
 """
 
 from functools import partial, reduce
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,15 @@ class Transport(Protocol):
         ...
 
 
+def _brdf(value: Any) -> None:
+    require.kind("the BRDF", value, SeparableBrdf, source="jaxprt.brdf.separable.factor")
+
+
+def _environment(value: Any) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+
+
+@require.arguments(light=_environment)
 @jax.jit
 def project(light: Environment) -> Float[Array, "b c"]:
     """Haar coefficients of an environment, each cubemap face by itself.
@@ -174,6 +183,7 @@ def _spread_gray(fixed: Array, cotangent: Array) -> Array:
     return reduce(jnp.add, (fixed[..., c] * cotangent[:, None, c] for c in colors))[..., None]
 
 
+@require.arguments(light=_environment)
 def light_tuple(transport: Transport, light: Environment, *, light_keep: int | None = None) -> Float[Array, "v r c"]:
     """The light side: what changes when the light turns.
 
@@ -199,6 +209,7 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
     return transport.apply(coefficient)
 
 
+@require.arguments(brdf=_brdf)
 def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
     """The view side: view maps looked up at each vertex's direction to the eye.
 
@@ -278,6 +289,7 @@ def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[
     return _product(light, view)
 
 
+@require.arguments(brdf=_brdf, light=_environment)
 def radiance(
     transport: Transport,
     brdf: SeparableBrdf,
@@ -303,6 +315,7 @@ def radiance(
         Linear radiance per vertex, in the light's units.
 
     Raises:
+        TypeError: The BRDF is not factored, or the light is no Environment.
         ValueError: The BRDF has another number of terms than the transport, the transport was made for another BRDF,
             or as in `light_tuple`.
 

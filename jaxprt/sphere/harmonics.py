@@ -27,7 +27,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, Float, Num
 
 from jaxprt.sphere import cubemap
 
@@ -55,7 +56,7 @@ def degree_of(count: int) -> int:
 
 
 @functools.partial(jax.jit, static_argnames="degree")
-def evaluate(direction: Float[Array, "*b 3"], *, degree: int) -> Float[Array, "*b lm"]:
+def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b lm"]:
     """The basis functions in some directions.
 
     By recurrences in the Cartesian components, without trigonometry. The result is a polynomial in them, which is
@@ -72,6 +73,7 @@ def evaluate(direction: Float[Array, "*b 3"], *, degree: int) -> Float[Array, "*
     Raises:
         ValueError: The degree is negative.
     """
+    direction = direction.astype(jnp.result_type(direction.dtype, float))  # Whole numbers would round the basis.
     basis = _basis(jnp, direction, degree) if degree <= _UNROLLED else _basis_by_scan(direction, degree)
     return jnp.moveaxis(basis, 0, -1)
 
@@ -95,7 +97,7 @@ def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 
 
 
 @functools.partial(jax.jit, static_argnames="degree")
-def project(radiance: Float[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
+def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
     """SH coefficients of a cubemap: the integral of basis times radiance over the sphere.
 
     Each texel counts as constant, and the basis is integrated over its solid angle by Gauss points, as many as make
@@ -112,6 +114,7 @@ def project(radiance: Float[Array, "6 n n *c"], *, degree: int) -> Float[Array, 
     Raises:
         ValueError: The degree is negative, or the edge is 0.
     """
+    radiance = radiance.astype(jnp.result_type(radiance.dtype, float))  # Whole numbers would round the basis.
     size, channel = radiance.shape[1], radiance.shape[3:]
     index, place, table = _projection(size, degree)
     folded = radiance.reshape(6 * size * size, -1)[index]
@@ -317,7 +320,6 @@ def natural(*, degree: int) -> Float[Array, " l"]:
     return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
-@jax.jit
 def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
     """The window that rings least for what it changes: 1 / (1 + lambda l^2 (l+1)^2).
 
@@ -326,13 +328,24 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""])
 
     Args:
         coefficient: What will be windowed.
-        share: Of its squared Laplacian, above 0 and up to 1, that may remain.
+        share: Of its squared Laplacian, from 0 to 1, that may remain. Share 0 keeps the mean alone.
 
     Returns:
-        One factor for each band, for `convolve`; ones where there is no Laplacian to reduce.
+        One factor for each band, for `convolve`; ones where there is no Laplacian to reduce. Inside `jax.jit`, where
+        shares are not known, NaN for negative ones.
+
+    Raises:
+        ValueError: The share is not from 0 to 1.
 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
+    if not isinstance(share, Tracer) and not 0 <= share <= 1:
+        raise ValueError(f"the share of the squared Laplacian must be from 0 to 1, got {share}")
+    return _least_laplacian(coefficient, share)
+
+
+@jax.jit
+def _least_laplacian(coefficient: Array, share: Array) -> Array:
     degree = degree_of(coefficient.shape[0])
     band = _band(degree)
     energy = jnp.sum(coefficient.reshape(len(band), -1) ** 2, -1)
@@ -348,10 +361,13 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""])
         factor = 1 / (1 + strength * weight)
         remains = jnp.where(some, jnp.sum(spectrum * factor**2), share)
         slope = jnp.where(some, jnp.sum(spectrum * factor**3 * weight), 1)
-        return strength + remains / slope * (jnp.sqrt(remains / share) - 1), None
+        return strength + remains / slope * (jnp.sqrt(remains / some_share) - 1), None
 
+    # Nothing remains in the limit of an infinite strength.
+    some_share = jnp.where(share == 0, 1, share)
     strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
-    return 1 / (1 + jnp.maximum(strength, 0) * weight)
+    factor = 1 / (1 + jnp.maximum(strength, 0) * weight)
+    return jnp.where((share == 0) & some, weight == 0, factor)
 
 
 @functools.partial(jax.jit, static_argnames="degree")

@@ -11,7 +11,8 @@ beside the diagonals only. This is the derivative of the function that maps any 
 (its polar factor) and then rotates; the gradient lies in the tangent space of the rotations at R. It holds at every
 rotation, the identity, half turns and fixed poles included, and so do second derivatives along turns.
 
-Matrices are taken to be proper rotations to rounding; for others the result has no meaning.
+Mirrors, whose determinant is -1, are -1 times a proper rotation: s -> f(-s) changes the sign of the odd bands, and the
+rest is turned. Matrices must be orthogonal to rounding; for others the result has no meaning.
 
 Reference: Kautz, Sloan, Snyder 2002, appendix.
 """
@@ -41,7 +42,7 @@ def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) ->
 
     Args:
         coefficient: Coefficients in l(l+1)+m order; (degree+1)^2 rows.
-        rotation: A proper rotation matrix.
+        rotation: A rotation matrix, or one of a mirror.
 
     Returns:
         Coefficients in the same units.
@@ -60,7 +61,7 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
 
     Args:
         coefficient: Coefficients of one function for all, [lm, c], or of one function for each rotation, [lm, c, w].
-        rotation: Proper rotation matrices.
+        rotation: Rotation matrices, or those of mirrors.
 
     Returns:
         Rotated coefficients.
@@ -74,6 +75,30 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
     elif coefficient.shape[2:] != (count,):
         raise ValueError(f"the last axis must count the {count} rotations, got the shape {coefficient.shape}")
     return _rotated(coefficient, jnp.moveaxis(rotation, 0, -1))
+
+
+@jax.jit
+def about_z(
+    coefficient: Float[Array, "lm *c"], cosine: Float[Array, "*v"], sine: Float[Array, "*v"]
+) -> Float[Array, "lm *d"]:
+    """Rotates about z, by angles given by their cosine and sine: orders m and -m of each band mix.
+
+    A polynomial in cosine and sine, differentiable as such. Off the unit circle order m is also scaled by the radius to
+    the power of |m|.
+
+    Args:
+        coefficient: Coefficients in l(l+1)+m order.
+        cosine: Cosine of each angle; its axes broadcast against the last ones of the coefficients.
+        sine: Sine of each angle.
+
+    Raises:
+        ValueError: The number of rows is not a square.
+
+    Reference: Kautz, Sloan, Snyder 2002, appendix.
+    """
+    degree = harmonics.degree_of(coefficient.shape[0])
+    angle = _signed_multiples(cosine, sine, degree, coefficient.ndim)
+    return jnp.concatenate([_about_z(coefficient[l * l : (l + 1) ** 2], angle) for l in range(degree + 1)])
 
 
 @functools.partial(jax.jit, static_argnames="degree")
@@ -90,7 +115,7 @@ def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array,
     trace, so that its block is made of products of two entries. Differentiable as the polynomial that it is.
 
     Args:
-        rotation: Proper rotation matrices.
+        rotation: Rotation matrices, or those of mirrors.
         degree: The largest l, 0 to 2.
 
     Raises:
@@ -122,11 +147,12 @@ def _rotated(coefficient: Array, rotation: Array) -> Array:
     """Coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the end of *c."""
     degree = harmonics.degree_of(coefficient.shape[0])
     shape = jnp.broadcast_shapes(coefficient.shape[1:], rotation.shape[2:])
-    angle = _euler_angles(rotation)
+    hand = _hand(rotation)
+    angle = _euler_angles(rotation * hand)
     if degree <= _UNROLLED:
-        row = _turn_rows(coefficient, *(_multiples(*each, degree) for each in angle))
+        row = _turn_rows(coefficient, hand, *(_multiples(*each, degree) for each in angle))
         return jnp.stack([jnp.broadcast_to(each, shape) for each in row])
-    band = _turn_bands(coefficient, *(_signed_multiples(*each, degree, coefficient.ndim) for each in angle))
+    band = _turn_bands(coefficient, hand, *(_signed_multiples(*each, degree, coefficient.ndim) for each in angle))
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), *shape)) for each in band])
 
 
@@ -144,7 +170,13 @@ def _rotated_jvp(primal, tangent):
     return result, change
 
 
-def _turn_rows(coefficient: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+def _hand(rotation: Array) -> Array:
+    """1 for proper rotations and -1 for mirrors: the sign of the determinant."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    return jnp.where(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0, -1, 1).astype(rotation.dtype)
+
+
+def _turn_rows(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
     """Rows of all bands, every sum written out over its few terms."""
 
     def about_z(row, angle):
@@ -160,23 +192,26 @@ def _turn_rows(coefficient: Array, alpha: tuple, beta: tuple, gamma: tuple) -> l
     for l in range(harmonics.degree_of(len(coefficient)) + 1):
         quarter = _quarter_turn(l)
         row = fixed(about_z(list(coefficient[l * l : (l + 1) ** 2]), gamma), quarter.T)
-        result.extend(about_z(fixed(about_z(row, beta), quarter), alpha))
+        row = about_z(fixed(about_z(row, beta), quarter), alpha)
+        result.extend([each * hand for each in row] if l % 2 else row)
     return result
 
 
-def _turn_bands(coefficient: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
+def _about_z(row: Array, angle: tuple[Array, Array]) -> Array:
+    """One band turned about z by an angle of `_signed_multiples`."""
+    cosine, sine = (part[(len(part) - len(row)) // 2 :][: len(row)] for part in angle)
+    return row * cosine + row[::-1] * sine
+
+
+def _turn_bands(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
     """The bands by matrix products; cosines and sines are of m = -degree to degree."""
-
-    def about_z(row, angle):
-        cosine, sine = (part[(len(part) - len(row)) // 2 :][: len(row)] for part in angle)
-        return row * cosine + row[::-1] * sine
-
     result = []
     for l in range(harmonics.degree_of(len(coefficient)) + 1):
         quarter = jnp.asarray(_quarter_turn(l), coefficient.dtype)
-        row = about_z(coefficient[l * l : (l + 1) ** 2], gamma)
-        row = about_z(jnp.tensordot(quarter.T, row, axes=1, precision="highest"), beta)
-        result.append(about_z(jnp.tensordot(quarter, row, axes=1, precision="highest"), alpha))
+        row = _about_z(coefficient[l * l : (l + 1) ** 2], gamma)
+        row = _about_z(jnp.tensordot(quarter.T, row, axes=1, precision="highest"), beta)
+        row = _about_z(jnp.tensordot(quarter, row, axes=1, precision="highest"), alpha)
+        result.append(row * hand if l % 2 else row)
     return result
 
 

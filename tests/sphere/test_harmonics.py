@@ -298,6 +298,22 @@ def test_no_other_window_of_its_laplacian_changes_the_function_less(x64):
         assert np.linalg.norm(least - coefficient) < 0.999 * np.linalg.norm(other - coefficient)
 
 
+def test_a_share_of_zero_keeps_the_mean_alone_and_shares_out_of_range_are_refused(x64):
+    factor = harmonics.least_laplacian(normal(17, 25, 3), jnp.array(0.0))
+    np.testing.assert_array_equal(factor, [1, 0, 0, 0, 0])
+    for share in (-0.1, 1.5, np.nan):
+        with pytest.raises(ValueError, match="share of the squared Laplacian must be from 0 to 1, got"):
+            harmonics.least_laplacian(normal(17, 25, 3), jnp.array(share))
+
+
+def test_whole_numbers_are_projected_and_evaluated_as_the_floating_point_numbers_that_they_are(close):
+    whole = np.random.default_rng(18).integers(0, 9, size=(6, 4, 4, 2))
+    expected = harmonics.project(jnp.asarray(whole, jnp.float32), degree=3)
+    close(harmonics.project(jnp.asarray(whole), degree=3), expected)
+    axis = jnp.array([[0, 0, 1], [0, -1, 0]])
+    close(harmonics.evaluate(axis, degree=3), harmonics.evaluate(axis.astype(float), degree=3))
+
+
 def test_where_there_is_no_laplacian_the_window_is_one_and_gradients_are_finite(x64):
     for coefficient in (jnp.zeros((25, 3)), jnp.zeros((25, 3)).at[0].set(2.0)):
         factor = harmonics.least_laplacian(coefficient, jnp.array(0.5))

@@ -25,6 +25,12 @@ SPECIAL = {
 }
 # The half turns exact to the last bit, where a cosine is 0 and not 1e-16.
 MATRIX = {name: np.where(abs(r.as_matrix()) < 1e-15, 0.0, r.as_matrix()) for name, r in SPECIAL.items()}
+MIRROR = {
+    "mirror": -MATRIX["random"],
+    "mirror of y": np.diag([1.0, -1, 1]),
+    "mirror of z": np.diag([1.0, 1, -1]),
+    "inversion": -np.eye(3),
+}
 EVERY = np.stack(list(MATRIX.values()))
 
 
@@ -59,9 +65,9 @@ def second_difference(function, h=2e-3):
 
 
 @pytest.mark.parametrize("degree", [0, 3, 7])
-@pytest.mark.parametrize("name", MATRIX)
+@pytest.mark.parametrize("name", MATRIX | MIRROR)
 def test_rotating_the_basis_is_evaluating_it_in_rotated_directions(name, degree, x64, close):
-    turn, direction = jnp.asarray(MATRIX[name]), unit(0, 40)
+    turn, direction = jnp.asarray((MATRIX | MIRROR)[name]), unit(0, 40)
     basis = harmonics.evaluate(direction, degree=degree)
     expected = harmonics.evaluate(direction @ turn.T, degree=degree)
     close(rotation.rotate(basis.T, turn).T, expected)
@@ -122,6 +128,14 @@ def test_the_identity_changes_nothing(degree, dtype, x64, close):
     close(rotation.rotate(coefficient, jnp.eye(3, dtype=dtype)), coefficient)
 
 
+@pytest.mark.parametrize("degree", [3, 7])
+def test_turns_about_z_are_the_rotations_about_z(degree, x64, close):
+    coefficient, angle = normal(25, (degree + 1) ** 2, 2), 0.9
+    turn = jnp.asarray(Rotation.from_euler("z", angle).as_matrix())
+    actual = rotation.about_z(coefficient, jnp.asarray(np.cos(angle)), jnp.asarray(np.sin(angle)))
+    close(actual, rotation.rotate(coefficient, turn))
+
+
 def test_bands_do_not_mix(x64):
     matrix = np.array(rotation.matrix(rotations(6, 1)[0], degree=8))
     for l in range(9):
@@ -131,7 +145,7 @@ def test_bands_do_not_mix(x64):
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_the_polynomial_form_is_the_same_matrix(degree, x64, close):
-    every = jnp.concatenate([jnp.asarray(EVERY), rotations(7, 20)])
+    every = jnp.concatenate([jnp.asarray(EVERY), rotations(7, 20), jnp.asarray(list(MIRROR.values()))])
     expected = jax.vmap(lambda turn: rotation.matrix(turn, degree=degree))(every)
     close(rotation.low_matrix(every, degree=degree), expected)
     close(rotation.low_matrix(every[-1], degree=degree), expected[-1])
@@ -172,10 +186,10 @@ def test_many_rotations_at_once_are_each_alone(x64, close):
     close(rotation.rotate_each(own, turn), expected)
 
 
-@pytest.mark.parametrize("name", MATRIX)
+@pytest.mark.parametrize("name", [*MATRIX, "mirror"])
 def test_derivatives_by_the_rotation_are_those_of_finite_differences_along_rotations(name, x64, close):
     degree = 3
-    matrix, coefficient = MATRIX[name], normal(12, (degree + 1) ** 2, 2)
+    matrix, coefficient = (MATRIX | MIRROR)[name], normal(12, (degree + 1) ** 2, 2)
     weight = normal(13, (degree + 1) ** 2, 2)
     gradient = jax.grad(lambda r: jnp.sum(weight * rotation.rotate(coefficient, r)))(jnp.asarray(matrix))
     slopes, expected_slopes = [], []
