@@ -35,6 +35,7 @@ SIDEWAYS = {
     ("brdf", "published", "separable"),
     ("brdf", "paths", "reflected"),
     ("brdf", "published", "reflected"),
+    ("brdf", "reflected", "grid"),
     ("brdf", "reflected", "lobe"),
     ("brdf", "reflected", "lobe_em"),
     ("brdf", "scattered", "measured"),
