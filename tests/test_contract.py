@@ -39,6 +39,7 @@ JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
     "staging": "takes functions",
+    "require": "checks values",
     "inverse": "takes functions, and fits on the host",
     "report": "measures, and writes files",
     "animation": "the same",
