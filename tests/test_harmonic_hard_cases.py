@@ -122,7 +122,7 @@ def test_gradients_by_frames_are_those_of_turns_at_half_turns():
 def test_constant_light_through_the_whole_system_is_the_albedo(lambert, degree):
     mesh, albedo = sphere(), np.array([1.0, 0.5, 0.0])
     table = lambert.truncate(degree=degree)
-    table = HarmonicBrdf(table.table * albedo.astype(np.float32)[:, None, None], (), table.error)
+    table = HarmonicBrdf(table.table * albedo.astype(np.float32)[:, None], (), table.error)
     light = harmonic.project(WHITE, degree=degree)
     color = np.asarray(harmonic.unshadowed_radiance(mesh, table, light, eye=EYE))
     seen = color[:, 0] != 0
