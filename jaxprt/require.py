@@ -92,6 +92,21 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
 
 
+def length(name: str, value: Any, count: int) -> None:
+    """Refuses an array with another number of rows.
+
+    Args:
+        name: What the array is, for the message: "the light's coefficients".
+        value: The array.
+        count: The number of rows that it must have.
+
+    Raises:
+        ValueError: The array has another number of rows.
+    """
+    if value.shape[0] != count:
+        raise ValueError(f"{name} must be {count}, got {value.shape[0]}")
+
+
 def kind(name: str, value: Any, *wanted: type, source: str) -> None:
     """Refuses objects of other classes than those wanted.
 

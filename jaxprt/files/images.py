@@ -72,7 +72,7 @@ def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
         image: 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
 
     Raises:
-        ValueError: The image is empty or has another number of channels.
+        ValueError: The image is empty, not of floating point, or has another number of channels.
         OSError: The file cannot be written.
     """
     names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
@@ -93,7 +93,7 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
         image: Display values; 0 is black and 1 white, what lies outside is clamped. 1, 3 or 4 channels.
 
     Raises:
-        ValueError: The image is empty, has another number of channels, or holds NaN.
+        ValueError: The image is empty, not of floating point, has another number of channels, or holds NaN.
         OSError: The file cannot be written.
     """
     _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
@@ -114,6 +114,8 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
 
 
 def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
+    if image.dtype.kind != "f":
+        raise ValueError(f"image must be of floating point, with 1 for white in pictures, got {image.dtype}")
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
         raise ValueError(f"image must be [h, w, c] with c one of {list(names)} and no empty axis, got {image.shape}")
     return names[image.shape[-1]]

@@ -140,6 +140,7 @@ def jointly(
         TypeError: As in `light` and `material`; or the start is no pair.
         ValueError: As in `light` and `material`; or the start's light is black.
     """
+    _check(radiance, pixels)
     if not isinstance(start, tuple | list) or len(start) != 2:
         raise TypeError(f"the start must be a light and a material, a pair, got {type(start).__name__}")
     dark, made = start

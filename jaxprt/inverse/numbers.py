@@ -105,8 +105,8 @@ def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Calla
         return jnp.where(both, between, jnp.where(one, beyond, u * size)).astype(first.dtype)
 
     def pinned(u: Array) -> np.ndarray:
-        free = np.asarray(u, float)
-        away = np.where(both, (1 - np.abs(np.sin(free))) / 2, np.sqrt(free**2 + 1) - 1)
+        place = np.asarray(u, float)
+        away = np.where(both, (1 - np.abs(np.sin(place))) / 2, np.sqrt(place**2 + 1) - 1)
         return (both | one) & (away < _AT)
 
     return jnp.asarray(free, first.dtype), bounded, pinned

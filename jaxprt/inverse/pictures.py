@@ -1,6 +1,6 @@
 """What pictures show of a mesh, and how far a scene is from them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -91,11 +91,12 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
             pixels that count and are negative or not finite; exposures or saturations that are not positive numbers;
             pictures that are black; or no pixel that counts.
     """
-    if isinstance(pictures, Picture) or not isinstance(pictures, Sequence):
+    if isinstance(pictures, Picture) or not isinstance(pictures, Iterable):
         raise TypeError(f"pictures must be a sequence of them, got one {type(pictures).__name__}")
     if not isinstance(mesh, Mesh):
         raise TypeError(f"the mesh must be a Mesh, got {type(mesh).__name__}")
-    numbers.outside(mesh, list(pictures))
+    pictures = list(pictures)
+    numbers.outside(mesh, pictures)
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
     parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]

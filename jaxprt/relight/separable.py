@@ -285,7 +285,15 @@ def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[
 
     Returns:
         Linear radiance in e colors, the larger of c and d: a gray side serves all colors of the other.
+
+    Raises:
+        ValueError: The tuples are of other vertices, other terms, or unlike colors.
     """
+    (c, d), shapes = (light.shape[-1], view.shape[-1]), (list(light.shape), list(view.shape))
+    if light.shape[:2] != view.shape[:2] or (c != d and 1 not in (c, d)):
+        raise ValueError(
+            f"light and view must have the same vertices, terms and colors, got {shapes[0]} and {shapes[1]}"
+        )
     return _product(light, view)
 
 

@@ -104,7 +104,11 @@ class ClusteredTransport(eqx.Module):
 
         Returns:
             The light-modulated tuple of Wang et al., in the light's units.
+
+        Raises:
+            ValueError: The light has another number of coefficients than the transport was made for.
         """
+        require.length("the light's coefficients", coefficient, self.rms.shape[0])
         return linear(_relit, _transposed, self, coefficient)
 
 

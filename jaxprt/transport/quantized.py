@@ -57,7 +57,11 @@ class QuantizedTransport(eqx.Module):
 
         Returns:
             The light-modulated tuple of Wang et al., in the light's units.
+
+        Raises:
+            ValueError: The light has another number of coefficients than the transport was made for.
         """
+        require.length("the light's coefficients", coefficient, self.rms.shape[0])
         kept, vertices, terms = self.index.shape
         rows = self.index.reshape(kept, -1), self.level.reshape(kept, -1)
         dtype = jnp.result_type(coefficient, self.quantum)

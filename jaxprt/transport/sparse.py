@@ -95,7 +95,11 @@ class SparseTransport(eqx.Module):
 
         Returns:
             The light-modulated tuple of Wang et al., in the light's units.
+
+        Raises:
+            ValueError: The light has another number of coefficients than the transport was made for.
         """
+        require.length("the light's coefficients", coefficient, self.rms.shape[0])
         colors = max(coefficient.shape[1], self.value.shape[3])
         coefficient = jnp.broadcast_to(coefficient, (len(coefficient), colors))
         if self.transpose is None:

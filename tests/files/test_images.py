@@ -175,8 +175,11 @@ def test_exr_without_color_channels_is_refused_and_its_channels_named(tmp_path):
         read_image(tmp_path / "depth.exr")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_unwritable_images_are_refused(tmp_path):
     for write in (write_exr, write_png):
+        with pytest.raises(ValueError, match=r"image must be of floating point, with 1 for white .*, got uint8"):
+            write(tmp_path / "image", np.full((4, 4, 3), 255, np.uint8))
         with pytest.raises(ValueError, match=r"\(4, 4, 2\)"):
             write(tmp_path / "image", random_image(4, 4, 2))
         with pytest.raises(ValueError, match=r"\(0, 4, 3\)"):

@@ -386,6 +386,17 @@ def test_other_brdfs_and_lights_than_it_was_made_for_are_refused(small, brdf):
         separable.radiance(small, SeparableBrdf(brdf.light_map[:2], brdf.view_map[:2], brdf.error), light, eye=EYE)
     with pytest.raises(ValueError, match=r"the light must be one environment \[6, 8, 8, c\], got \[6, 4, 4, 3\]"):
         separable.radiance(small, brdf, builtin.daylight(size=4), eye=EYE)
+    with pytest.raises(ValueError, match="the light's coefficients must be 384, got 96"):
+        small.apply(jnp.ones((96, 3)))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(7, 2, 3), (7, 4, 3), (1, 3, 3), (7, 3, 2)])
+def test_tuples_of_other_terms_vertices_or_colors_are_not_combined(shape):
+    """Terms that one side lacks were left out, without a word."""
+    for light, view in (((7, 3, 3), shape), (shape, (7, 3, 3))):
+        with pytest.raises(ValueError, match="light and view must have the same vertices, terms and colors, got"):
+            separable.combine(jnp.ones(light), jnp.ones(view))
 
 
 @pytest.mark.parametrize("colors", [(1, 1), (1, 3), (3, 1), (3, 3)])

@@ -113,6 +113,15 @@ def test_keeping_an_impossible_number_of_terms_is_refused(random, terms):
             each.keep(6, terms=terms)
 
 
+def test_lights_of_another_number_of_coefficients_are_refused(random):
+    """Numbers that the light lacks were read from its last coefficient."""
+    transport = make(random.normal(size=(2, 24, 4, 3)), 20)
+    for each in (transport, quantize(transport)):
+        for count in (6, 96):
+            with pytest.raises(ValueError, match=f"the light's coefficients must be 24, got {count}"):
+                each.apply(jnp.ones((count, 3)))
+
+
 @pytest.mark.parametrize("colors", [1, 3])
 def test_rms_is_that_of_the_dense_rows(random, close, colors):
     transport = make(random.normal(size=(6, 24, 3, colors)), 9)
