@@ -18,7 +18,6 @@ import numpy as np
 import zarr
 
 VERSION = 3
-_NEAR = 1e-3  # of the norm: more than rounding on another processor changes, less than another material does
 _FORMAT = "jaxprt blocks"
 _SUMS = 32
 _PART = 1 << 20  # values that are summed at a time
@@ -112,10 +111,18 @@ class BlockStore:
         return np.asarray(self._array(name)[place]).reshape(shape)
 
 
-def sketch(array: Any) -> list[float]:
-    """The norm of an array, and sums of its values with random signs.
+def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
+    """What tells an array from others of its shape: its norm, and sums of its values with random signs.
 
-    The distance between the sketches of two arrays of one shape is about that between the arrays.
+    The distance between the sums of two arrays is about that between the arrays.
+
+    Args:
+        array: Numbers.
+        tolerance: Distance, as a share of the norm, up to which arrays count as the same: more than rounding changes
+            on another kind of processor, and less than would be seen.
+
+    Returns:
+        The tolerance, the norm and the sums.
     """
     flat = np.asarray(array).reshape(-1)
     sign = np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
@@ -126,7 +133,7 @@ def sketch(array: Any) -> list[float]:
         signed = part * sign[start : start + len(part)]
         total += np.pad(signed, (0, -len(part) % _SUMS)).reshape(-1, _SUMS).sum(0)
         square += float(part @ part)
-    return [float(np.sqrt(square)), *total.tolist()]
+    return [tolerance, float(np.sqrt(square)), *total.tolist()]
 
 
 def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:
@@ -173,9 +180,9 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
     if sorted(found) != sorted(near):
         raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {sorted(found)}; delete it")
     for name, now in near.items():
-        norm = max(now[0], found[name][0])
-        distance = float(np.linalg.norm(np.subtract(now, found[name])))
-        if not distance <= _NEAR * norm:
+        norm = max(now[1], found[name][1])
+        distance = float(np.linalg.norm(np.subtract(now[2:], found[name][2:])))
+        if not distance <= now[0] * norm:
             raise ValueError(
                 f"{path} holds arrays made from something else ({name}: there and now differ by "
                 f"{distance / (norm or 1):.2g} of the norm); name another path or delete it. Where it was factored or "

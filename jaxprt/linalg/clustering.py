@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from jaxprt.linalg import eigen
 
-_TIE = 1e-6  # of the width, below which points are side by side
+_TIE = 1e-5  # of the width, below which neighbors are side by side
 
 
 def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray, "p m"]:
@@ -37,11 +37,19 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
         offset = point[member] - point[member].mean(0)
         value, axis = np.linalg.eigh(offset.T @ offset)
         axis = axis[:, ::-1] @ eigen.orientation(value[::-1], axis[:, ::-1])
-        # Symmetric meshes have points side by side that rounding alone would order, otherwise on other processors.
-        along = offset @ axis[:, 0]
-        order = member[np.argsort(np.round(along / (_TIE * (np.ptp(along) or 1))), kind="stable")]
+        order = member[_ordered(offset @ axis[:, 0])]
         # Whole clusters' worth of points on either side, so that in the end all sizes differ by at most one.
         first = parts // 2
         cut = len(member) // parts * first + min(len(member) % parts, first)
         todo += [(order[cut:], parts - first), (order[:cut], first)]
     return np.stack(done)
+
+
+def _ordered(along: Float[np.ndarray, " v"]) -> Int[np.ndarray, " v"]:
+    """Points in rising order, those that are side by side by their numbers.
+
+    Symmetric meshes have many of these, and rounding, which is another on other processors, must not order them.
+    """
+    order = np.argsort(along, kind="stable")
+    rises = np.diff(along[order], prepend=along[order[0]]) > _TIE * np.ptp(along)
+    return order[np.lexsort((order, np.cumsum(rises)))]

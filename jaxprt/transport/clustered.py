@@ -31,7 +31,6 @@ from jaxprt.transport.direct import DirectTransport
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.ALGORITHM, "clustered": 1}
 SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
-_PART = 16  # texels, of which one is compared with those of a store
 _SAMPLE = 24  # vertices of a cluster that choose its coefficients
 
 
@@ -358,11 +357,9 @@ class _Job(ClusterJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        given = self.direct.level if self.direct.key is None else self.direct.key
         return {
             "system": "clustered",
             "algorithm": ALGORITHM,
-            "direct": blocks.fingerprint(given),
             "member": blocks.fingerprint(np.asarray(self.member, np.int64)),
             "maps": self.brdf.coordinates.__name__,
             **self._shape,
@@ -370,9 +367,9 @@ class _Job(ClusterJob):
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        # The level itself is known by its key: a part of it shows whether it is still what the key says.
-        parts = {"direct": self.direct.level[::_PART], "frame": self.direct.frame, "brdf": self.brdf.light_map}
-        return {name: sketch(each) for name, each in parts.items()}
+        vertices = {"position": self.direct.position, "frame": self.direct.frame}
+        near = {name: sketch(each, tolerance=visibility.ROUNDING) for name, each in vertices.items()}
+        return {**near, "direct": sketch(self.direct.level), "brdf": sketch(self.brdf.light_map)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

@@ -14,7 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8, UInt32
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
@@ -35,14 +35,11 @@ class DirectTransport(eqx.Module):
             Texels first, so that one texel's are contiguous.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
-        key: Fingerprint of the meshes, vertices and size that were given, by which stores of what is made of the
-            visibility are known; None if unknown.
     """
 
     level: UInt8[Array, "d w"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
-    key: UInt32[Array, "8"] | None = None
 
     @property
     def size(self) -> int:
@@ -104,10 +101,7 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = mesh.position[visibility.chosen(mesh, vertex)]
-    key = np.frombuffer(
-        bytes.fromhex(blocks.fingerprint(np.frombuffer(repr(job.header).encode(), np.uint8))), np.uint32
-    )
-    return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame), jnp.asarray(key))
+    return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame))
 
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:

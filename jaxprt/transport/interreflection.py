@@ -182,7 +182,7 @@ class _BounceJob(visibility.VisibilityJob):
     @property
     def near(self) -> Mapping[str, list[float]]:
         tables = {f"brdf {number}": sketch(each.table) for number, each in enumerate(self.brdf)}
-        return {"rows": sketch(self.rows), **tables}
+        return {**super().near, "rows": sketch(self.rows), **tables}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -218,7 +218,7 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        return {"rows": sketch(self.rows)}
+        return {**super().near, "rows": sketch(self.rows)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

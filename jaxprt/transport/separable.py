@@ -138,7 +138,7 @@ class _Job(visibility.VisibilityJob):
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        return {"brdf": sketch(self.brdf.light_map)}
+        return {**super().near, "brdf": sketch(self.brdf.light_map)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:

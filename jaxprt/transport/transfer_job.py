@@ -38,7 +38,7 @@ class ResponseJob(visibility.VisibilityJob):
     @property
     def near(self) -> Mapping[str, list[float]]:
         """Sketches of the light factors."""
-        return {"brdf": sketch(self.basis.light_map)}
+        return {**super().near, "brdf": sketch(self.basis.light_map)}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -91,7 +91,7 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
             parts |= {f"response {number}": response}
-        return {name: sketch(each) for name, each in parts.items()}
+        return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
         """Harmonics of what arrives at some vertices, before it is decomposed."""

@@ -15,11 +15,13 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float32, UInt8
 
+from jaxprt.files.arrays import sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions
 from jaxprt.transport import blocks
 
 ALGORITHM = 1  # version of what is traced; a release that traces differently raises it
+ROUNDING = 3e-6  # of the norm: more than the last bits of single precision
 BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
 LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
 _SIDE = 4
@@ -179,7 +181,8 @@ class VisibilityJob(blocks.Job):
         frame: Rows are tangent, bitangent, normal.
         occluder: What casts shadows, in NumPy arrays.
         size: Edge of the cubemap's faces in texels.
-        mesh_key: Fingerprint of all that is given and the visibility depends on.
+        mesh_key: Fingerprint of the faces and vertices that are given.
+        mesh_near: Sketches of their positions, normals and tangents.
     """
 
     start: np.ndarray
@@ -187,6 +190,7 @@ class VisibilityJob(blocks.Job):
     occluder: Mesh
     size: int
     mesh_key: str
+    mesh_near: Mapping[str, list[float]]
 
     @classmethod
     def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
@@ -195,15 +199,21 @@ class VisibilityJob(blocks.Job):
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
         frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
-        # By what is given, and not by what is computed of it, which another kind of processor rounds otherwise.
-        given = (mesh.position, mesh.normal, mesh.tangent, shadowing.position)
-        numbers = (np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face))
-        key = blocks.fingerprint(*given, *numbers)
-        return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, **more)
+        # By what is given, not by what is traced or computed of it, which other kinds of processors round otherwise.
+        key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
+        given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
+        rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
+        near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}
+        return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
 
     def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
         """The header of a system's job: what is traced, and by which versions of the algorithms."""
         return {"system": system, "algorithm": dict(algorithm), "mesh": self.mesh_key, "size": self.size, **more}
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of what the result depends on."""
+        return self.mesh_near
 
     @cached_property
     def rays(self) -> Occluder:

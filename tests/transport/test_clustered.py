@@ -419,14 +419,12 @@ def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_ref
     darker = eqx.tree_at(lambda x: x.light_map, brdf, 0.99 * brdf.light_map)
     turned = eqx.tree_at(lambda x: x.light_map, brdf, brdf.light_map.at[-1].multiply(-1))
     dimmed = eqx.tree_at(lambda x: x.level, seen, seen.level & 7)
-    elsewhere = eqx.tree_at(lambda x: x.key, seen, seen.key + 1)
-    unknown = eqx.tree_at(lambda x: (x.key, x.level), seen, (None, seen.level.at[5, 5].add(1)))
+    moved = eqx.tree_at(lambda x: x.position, seen, seen.position.at[7, 1].add(1e-3))
     for what, name in (
         ((seen, darker), "brdf"),
         ((seen, turned), "brdf"),
         ((dimmed, brdf), "direct"),
-        ((elsewhere, brdf), "direct"),
-        ((unknown, brdf), "direct"),
+        ((moved, brdf), "position"),
     ):
         with pytest.raises(ValueError, match=rf"a\.prt holds arrays made from something else \({name}: there"):
             precompute(*what, path=path, **options)
