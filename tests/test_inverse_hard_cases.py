@@ -51,8 +51,9 @@ def dull(mesh):
 
 
 @pytest.fixture(scope="module")
-def matte(dull):
-    return dull(4)
+def matte(mesh):
+    table = harmonic.tabulate(Lambert(0.5), degree=4, resolution=8)
+    return lambda light, eye: relight.unshadowed_radiance(mesh, table, light, eye=eye)
 
 
 @pytest.fixture(scope="module")
