@@ -163,7 +163,7 @@ def tabulated(quick: bool) -> LobeBrdf:
     """Over logarithms of the exponents, powers of which lobes narrow with."""
     knot = np.log(KNOTS[::2] if quick else KNOTS)
     lobes = 4 if quick else 8
-    nodes = 16 if quick else 32
+    nodes = 12 if quick else 32
     return brdf.lobe.tabulate(
         lambda u, v: Shares(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot]
     )

@@ -1,5 +1,6 @@
 """The notebooks: readable as committed, without running; and every cell runs, at the small size of the tests."""
 
+import gc
 import json
 import linecache
 import pathlib
@@ -47,6 +48,7 @@ def small(coarse, monkeypatch):
     with matplotlib.rc_context({"backend": "agg"}):
         yield
     jax.clear_caches()
+    gc.collect()  # Its temporary folders warn when they go, here rather than in another test.
 
 
 def execute(path: pathlib.Path) -> None:

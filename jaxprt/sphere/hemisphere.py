@@ -145,6 +145,7 @@ def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"
     return lookup(around, (coordinates * n + 1) / (n + 2))
 
 
+@partial(jax.jit, static_argnames=("resolution",))
 def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     """Directions at which an n x n disk map is sampled: one per texel, outside the disk too.
 
@@ -158,6 +159,7 @@ def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return jnp.concatenate([xy, jnp.sqrt(1 - jnp.sum(xy**2, -1, keepdims=True))], -1)
 
 
+@partial(jax.jit, static_argnames=("resolution",))
 def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     """Directions at which an n x n parabolic map is sampled: one per texel, those outside the disk drawn in.
 
@@ -176,6 +178,7 @@ def polar_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return polar_direction(jnp.stack(jnp.meshgrid(center, center), -1))
 
 
+@partial(jax.jit, static_argnames=("resolution",))
 def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
 
@@ -186,6 +189,7 @@ def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     return jnp.where(inside, (2 / resolution) ** 2, 0.0)
 
 
+@partial(jax.jit, static_argnames=("resolution",))
 def parabolic_texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Solid angle of each texel of a parabolic map whose center lies inside the unit disk, else 0.
 

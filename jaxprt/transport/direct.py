@@ -100,7 +100,7 @@ def precompute(
         raise ValueError(f"size must be a power of two, got {size}")
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
-    position = mesh.position[visibility.chosen(mesh, vertex)]
+    position = visibility.place(mesh, vertex)
     return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame))
 
 

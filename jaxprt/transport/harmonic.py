@@ -98,7 +98,7 @@ def precompute(
     check(degree, size)
     job = _MatrixJob.make(mesh, occluder, vertex, size, degree=degree)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
-    position = mesh.position[visibility.chosen(mesh, vertex)]
+    position = visibility.place(mesh, vertex)
     return TransferMatrix(jnp.asarray(result["matrix"]), position, jnp.asarray(job.frame))
 
 
@@ -117,7 +117,7 @@ def precompute_diffuse(
     check(degree, size)
     job = _VectorJob.make(mesh, occluder, vertex, size, degree=degree)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
-    return TransferVector(jnp.asarray(result["vector"]), mesh.position[visibility.chosen(mesh, vertex)])
+    return TransferVector(jnp.asarray(result["vector"]), visibility.place(mesh, vertex))
 
 
 @partial(jax.jit, static_argnames="degree")

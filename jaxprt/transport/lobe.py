@@ -213,7 +213,7 @@ def precompute(
     scales(size)
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
-    position = mesh.position[visibility.chosen(mesh, vertex)]
+    position = visibility.place(mesh, vertex)
     level, vector = jnp.asarray(result["level"]), jnp.asarray(result["vector"])
     return LobeTransport(level, vector, position, jnp.asarray(job.frame), size)
 

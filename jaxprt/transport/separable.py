@@ -69,7 +69,7 @@ def precompute(
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
     rms = sparse.rms(result["index"], result["value"], 6 * size * size)
     index, value = jnp.asarray(result["index"]), jnp.asarray(result["value"])
-    position, frame = mesh.position[visibility.chosen(mesh, vertex)], jnp.asarray(job.frame)
+    position, frame = visibility.place(mesh, vertex), jnp.asarray(job.frame)
     return SparseTransport(index, value, position, frame, rms, mark=jnp.asarray(marked(brdf.light_map)))
 
 

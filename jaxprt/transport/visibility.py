@@ -10,10 +10,11 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float32, UInt8
+from jaxtyping import Array, Float, Float32, UInt8
 
 from jaxprt.files.arrays import sketch
 from jaxprt.scene.mesh import Mesh
@@ -172,6 +173,11 @@ def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
     return number[vertex]
 
 
+def place(mesh: Mesh, vertex: np.ndarray | None) -> Float[Array, "v 3"]:
+    """Positions of the vertices to light; see `chosen`."""
+    return jnp.asarray(np.asarray(mesh.position)[chosen(mesh, vertex)])
+
+
 @dataclass(frozen=True)
 class VisibilityJob(blocks.Job):
     """Blocks of vertices whose visibility becomes transport; systems say what is made of it. See `blocks.Job`.
@@ -198,7 +204,8 @@ class VisibilityJob(blocks.Job):
         shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
-        frame = np.asarray(directions.frame(mesh.normal[vertex], mesh.tangent[vertex]), np.float32)
+        normal, tangent = (jnp.asarray(np.asarray(each)[vertex]) for each in (mesh.normal, mesh.tangent))
+        frame = np.asarray(directions.frame(normal, tangent), np.float32)
         # By what is given, not by what is traced or computed of it, which other kinds of processors round otherwise.
         key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
