@@ -94,23 +94,7 @@ class Plane(eqx.Module):
         Raises:
             ValueError: There are not two coordinates.
         """
-        point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, _checked(coordinate, (2,))))
-        # What is picked is not differentiated.
-        still, fixed = jax.lax.stop_gradient((point, spot))
-        weight, flat = _barycentric(still[self.triangle], fixed)
-        triangle = self.triangle[jnp.argmax(jnp.where(flat, -jnp.inf, jnp.min(weight, -1)))]
-        _, nearest = _project(still[self.edge], fixed)
-        # The squared distance less the square of the spot: far away that has no digits left for the difference.
-        edge = self.edge[jnp.argmin(jnp.sum(nearest * (nearest - 2 * fixed), -1))]
-        along, _ = _project(point[edge], spot)
-        weight, _ = _barycentric(point[triangle], spot)
-        # Rounding puts spots on edges just outside all triangles: their values are clipped, their derivatives are not.
-        valid = jnp.maximum(weight, 0)
-        weight = weight + jax.lax.stop_gradient(valid / jnp.sum(valid) - weight)
-        within = _within(still[self.edge], fixed)
-        weight = jnp.where(within, weight, jnp.stack([1 - along, along, jnp.zeros_like(along)]))
-        index = jnp.where(within, triangle, edge[jnp.array([0, 1, 0])])
-        return jnp.zeros(len(point), weight.dtype).at[index].add(weight)
+        return _share(self, _checked(coordinate, (2,)))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is inside the boundary or on it, up to rounding."""
@@ -309,6 +293,28 @@ def _number(row: dict, column: str, line: int) -> float:
         required = {"m": "positive", "F0": "between 0 and 1"}.get(column, "not negative")
         raise ValueError(f"line {line}: {column} must be finite and {required}, got {value}")
     return value
+
+
+@jax.jit
+def _share(plane: Plane, coordinate: Array) -> Array:
+    """`Plane.share` of two numbers that are finite: some sixty operations, as one program."""
+    point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
+    # What is picked is not differentiated.
+    still, fixed = jax.lax.stop_gradient((point, spot))
+    weight, flat = _barycentric(still[plane.triangle], fixed)
+    triangle = plane.triangle[jnp.argmax(jnp.where(flat, -jnp.inf, jnp.min(weight, -1)))]
+    _, nearest = _project(still[plane.edge], fixed)
+    # The squared distance less the square of the spot: far away that has no digits left for the difference.
+    edge = plane.edge[jnp.argmin(jnp.sum(nearest * (nearest - 2 * fixed), -1))]
+    along, _ = _project(point[edge], spot)
+    weight, _ = _barycentric(point[triangle], spot)
+    # Rounding puts spots on edges just outside all triangles: their values are clipped, their derivatives are not.
+    valid = jnp.maximum(weight, 0)
+    weight = weight + jax.lax.stop_gradient(valid / jnp.sum(valid) - weight)
+    within = _within(still[plane.edge], fixed)
+    weight = jnp.where(within, weight, jnp.stack([1 - along, along, jnp.zeros_like(along)]))
+    index = jnp.where(within, triangle, edge[jnp.array([0, 1, 0])])
+    return jnp.zeros(len(point), weight.dtype).at[index].add(weight)
 
 
 def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
