@@ -8,10 +8,10 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo check test bench tables notebooks clean
+.PHONY: help setup demo check test test-long bench tables notebooks clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.setup ## install the package, with what the demo needs
 demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
@@ -24,6 +24,9 @@ check: $(VENV)/.setup-test ## format, lint and types
 
 test: check ## check, then all tests, doctests and notebooks at a small size; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)
+
+test-long: $(VENV)/.setup-test ## what only a long run can show; CONTRIBUTING.md lists it
+	$(BIN)/python -m pytest -m long $(ARGS)
 
 bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
 	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \

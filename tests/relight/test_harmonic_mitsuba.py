@@ -2,10 +2,12 @@
 
 Both sides get the same picture of a sky of broad lobes, the same mesh (a sphere over a ground) and the same eye.
 Mitsuba traces paths to the radiance that leaves points next to chosen vertices; its noise is told from the spread of
-independent renderings. The gloss is Mitsuba's own: half Lambert, half a GGX conductor, whose formula stands here too.
+independent renderings. What it finds is kept beside this file; `make_mitsuba.py` writes it. The gloss is Mitsuba's
+own: half Lambert, half a GGX conductor, whose formula stands here too.
 """
 
 import math
+import pathlib
 from typing import NamedTuple
 
 import equinox as eqx
@@ -27,6 +29,11 @@ BOUNCES = 2
 EYE = np.array([0.8, 2.4, 3.1])
 RENDERINGS = 16
 SAMPLES = 1 << 16
+# A rendering of this many samples is made live. Seeds are the same as in what is kept, which must differ by less: a
+# path that rounding sends elsewhere changes one sample of 64.
+LIVE = 64
+STALE = 0.01
+KEPT = pathlib.Path(__file__).with_name("harmonic_mitsuba.npz")
 ALBEDO = [0.8, 0.5, 0.3]
 SPECULAR = [0.9, 0.8, 0.6]
 ALPHA = 0.4
@@ -128,6 +135,10 @@ class Scene(NamedTuple):
 
 @pytest.fixture(scope="module")
 def scene():
+    return build_scene()
+
+
+def build_scene():
     """A sphere of radius 0.5 that floats over a ground of 13 x 13 vertices; vertices in light, penumbra and shadow."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     center = np.array([0.0, 0.6, 0.0])
@@ -156,6 +167,10 @@ def scene():
 
 @pytest.fixture(scope="module")
 def mitsuba():
+    return load_mitsuba()
+
+
+def load_mitsuba():
     """Mitsuba in its scalar variant."""
     import mitsuba
 
@@ -163,8 +178,17 @@ def mitsuba():
     return mitsuba
 
 
-def estimate(mi, scene, bsdf, *, bounces, samples=SAMPLES):
-    """Radiance towards the eye from points next to the vertices: mean and its standard error, [v, 3]."""
+def cases():
+    """What Mitsuba renders, by the model and the number of bounces."""
+    return {
+        (name, bounces): {"bsdf": bsdf, "bounces": bounces, "samples": SAMPLES // RENDERINGS}
+        for name, bsdf in (("matte", DIFFUSE), ("glossy", GLOSSY))
+        for bounces in (0, BOUNCES)
+    }
+
+
+def render(mi, scene, *, bsdf, bounces, samples, seeds):
+    """Radiance towards the eye from points next to the vertices, in independent renderings, [rendering, v, 3]."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh("mesh", len(scene.position), len(scene.face), has_vertex_normals=True, props=props)
@@ -183,8 +207,7 @@ def estimate(mi, scene, bsdf, *, bounces, samples=SAMPLES):
             "mesh": mesh,
         }
     )
-    result = [np.array(mi.render(world, spp=samples // RENDERINGS, seed=i))[0] for i in range(RENDERINGS)]
-    return np.mean(result, 0), np.std(result, 0, ddof=1) / math.sqrt(RENDERINGS)
+    return np.stack([np.array(mi.render(world, spp=samples, seed=i))[0] for i in seeds])
 
 
 def rays(scene):
@@ -214,13 +237,12 @@ def excess(actual, mean, error):
 
 
 @pytest.fixture(scope="module")
-def estimates(mitsuba, scene):
-    """By model and number of bounces."""
-    return {
-        (name, bounces): estimate(mitsuba, scene, bsdf, bounces=bounces)
-        for name, bsdf in (("matte", DIFFUSE), ("glossy", GLOSSY))
-        for bounces in (0, BOUNCES)
-    }
+def estimates():
+    """Mean and its standard error, [v, 3], by model and number of bounces."""
+    with np.load(KEPT) as kept:
+        each = {(name, bounces): kept[f"{name} {bounces}"] for name, bounces in cases()}
+    error = 1 / math.sqrt(RENDERINGS)
+    return {key: (value.mean(0), value.std(0, ddof=1) * error) for key, value in each.items()}
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +283,21 @@ def test_the_gloss_is_that_of_mitsuba(mitsuba):
         seen.wi = mitsuba.Vector3f(b)
         expected.append(list(bsdf.eval(mitsuba.BSDFContext(), seen, mitsuba.Vector3f(a))))
     np.testing.assert_allclose(GLOSS(jnp.asarray(wi), jnp.asarray(wo)) * wi[:, 2:], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "bounces"), cases())
+def test_what_is_kept_is_what_mitsuba_renders(mitsuba, scene, close, name, bounces):
+    live = render(mitsuba, scene, **cases()[name, bounces] | {"samples": LIVE, "seeds": range(1)})
+    with np.load(KEPT) as kept:
+        close(live, kept[f"{name} {bounces} live"], tolerance=STALE)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "bounces"), cases())
+def test_other_random_numbers_of_mitsuba_agree_within_their_noise(mitsuba, scene, estimates, name, bounces):
+    kept, error = estimates[name, bounces]
+    other = render(mitsuba, scene, **cases()[name, bounces] | {"seeds": range(RENDERINGS, 2 * RENDERINGS)}).mean(0)
+    assert np.linalg.norm(other - kept) < 2 * np.linalg.norm(error)  # Of both, 1.4 on average.
 
 
 def test_noise_of_mitsuba_is_small_beside_what_is_judged(estimates):
