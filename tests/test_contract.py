@@ -44,7 +44,6 @@ HOST = {
     "report": "measures, and writes files",
     "animation": "the same",
     "files": "reads and writes files",
-    "require": "checks values",
     "image.raster.front": "gives truth values",
     "transport.visibility": "traces rays",
     "transport.blocks": "runs workers and writes files",
