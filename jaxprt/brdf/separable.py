@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from jaxprt.files import objects
 from jaxprt.linalg import eigen
-from jaxprt.sphere import harmonics, hemisphere
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import cubemap, directions, harmonics, hemisphere
 from jaxprt.staging import apart
 
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
@@ -34,7 +35,9 @@ class SeparableBrdf(eqx.Module):
     Attributes:
         light_map: g_r on the incident direction; the last axis is 1 (shared by all colors) or one per color.
         view_map: h_r on the view direction, per color; light_map * view_map is in 1/sr.
-        error: Relative error of the terms kept, in the norm that the factorization minimized.
+        error: Relative error of the terms kept. `factor` without lights states the error of reflected radiance under
+            natural light in the mean, without shadows; with lights, the largest of their `light_errors`. Other
+            factorizations state it in the norm that they minimize. A sun makes radiance err many times as much.
         coordinates: From local direction to coordinates in the maps, a function of `sphere.hemisphere`; polar maps are
             periodic, and read as such.
     """
@@ -124,7 +127,12 @@ def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF")
 
 
 def factor(
-    brdf: Callable, *, terms: int | None = None, error: float | None = None, resolution: int = 48
+    brdf: Callable,
+    *,
+    terms: int | None = None,
+    error: float | None = None,
+    light: Sequence[Environment] | None = None,
+    resolution: int = 48,
 ) -> SeparableBrdf:
     """Factors a BRDF with all colors joint, weighted by the light that it will meet.
 
@@ -146,15 +154,18 @@ def factor(
     Args:
         brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
         terms: Number of terms; or
-        error: relative error of the reflected radiance under the prior that the terms must reach.
+        error: relative error that the terms must reach: by `light_errors` under each of the lights, if lights are
+            given; else in the mean over natural light with the covariance above, which promises nothing for one light.
+            Neither has shadows: `jaxprt.plan.separable` measures errors on a mesh.
+        light: Lights that the error must hold for, if `error` is given.
         resolution: Edge of the square maps in texels.
 
     Returns:
         The factored BRDF, terms by falling contribution.
 
     Raises:
-        ValueError: Neither or both of terms and error, more terms than texels, an error that 256 terms do not
-            reach, or a BRDF that is not finite or has no channel axis.
+        ValueError: Neither or both of terms and error, lights without an error, more terms than texels, an error that
+            256 terms do not reach, or a BRDF that is not finite or has no channel axis.
 
     Reference: Wang, Tran, Luebke 2004, section 3.2, with the prior in place of their Frobenius norm.
     """
@@ -162,6 +173,8 @@ def factor(
         raise ValueError(f"give either terms or error, got terms={terms} and error={error}")
     if error is not None and not error > 0:
         raise ValueError(f"error must be positive, got {error}")
+    if light is not None:
+        return _factor_for(brdf, light, terms, error, resolution)
     _check_resolution(resolution)
     direction = np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3)
     solid_angle = np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel()
@@ -201,6 +214,83 @@ def _maps(
     inverse = jnp.where(known, 1 / jnp.where(known, value, 1), 0)
     view_map = jnp.einsum("coi,ir->roc", flux, response * inverse)
     return light_map[..., None], view_map
+
+
+def light_errors(
+    brdf: Callable, factored: SeparableBrdf, light: Environment, *, frames: int = 32, views: int = 32
+) -> Float[Array, " r"]:
+    """Relative L2 error of the radiance that vertices reflect under a light, without shadows, by number of terms.
+
+    Normals and views are spread evenly over the sphere and the hemisphere. The BRDF and its terms are taken at the
+    centers of the light's texels, so that the number tells what the terms lose, and no more.
+
+    Args:
+        brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: Its terms.
+        light: One environment.
+        frames: Number of normals.
+        views: Number of views for each.
+
+    Returns:
+        The error of the first term, of the first two, and so on to all. Zero where all radiance is zero.
+
+    Raises:
+        ValueError: The light is a batch.
+    """
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
+    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
+
+
+@jax.jit
+def _light_errors(brdf: Callable, factored: SeparableBrdf, light: Environment, normal: Array, view: Array) -> Array:
+    size = light.radiance.shape[1]
+    direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+    table = light.radiance.reshape(len(direction), -1)
+    factor = factored.view(view)
+
+    def one(axes):
+        wi = directions.to_local(axes, direction)
+        received = table * jnp.maximum(directions.to_local(axes, area)[:, 2:], 0)
+        met = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
+        met = met[:, 0] if met.shape[1] == 1 else jnp.einsum("rcc->rc", met)
+        by_terms = jnp.cumsum(factor * met, 1)
+
+        def exact(wo):
+            return jnp.sum(brdf(wi, jnp.broadcast_to(wo, wi.shape)) * received, 0)
+
+        true = jax.lax.map(exact, view)
+        return jnp.sum((by_terms - true[:, None]) ** 2, (0, 2)), jnp.sum(true**2)
+
+    error, whole = jax.lax.map(one, directions.frame(normal, jnp.zeros_like(normal)))
+    whole = jnp.sum(whole)
+    return jnp.sqrt(jnp.sum(error, 0) / jnp.where(whole > 0, whole, 1))
+
+
+def _spread(count: int, lowest: int) -> Array:
+    """Directions that a golden spiral spreads evenly over what lies above a height."""
+    height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - height**2)
+    return jnp.asarray(np.stack([radius * np.cos(turn), radius * np.sin(turn), height], -1), jnp.result_type(float))
+
+
+def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None, error: float | None, resolution: int):
+    """As many terms as an error under each of some lights needs."""
+    if error is None or not len(light):
+        raise ValueError(f"lights must be at least one and come with error, got {len(light)} and terms={terms}")
+    count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
+    while True:
+        found = factor(brdf, terms=count, resolution=resolution)
+        reached = np.max([light_errors(brdf, found, each) for each in light], 0)
+        good = np.flatnonzero(reached <= error)
+        if good.size:
+            kept = found.keep(int(good[0]) + 1)
+            number = jnp.asarray(reached[good[0]], found.error.dtype)
+            return SeparableBrdf(kept.light_map, kept.view_map, number, kept.coordinates)
+        if count == most:
+            raise ValueError(f"error must be at least {reached[-1]:.3g}, which {count} terms reach; got {error}")
+        count = min(4 * count, most)
 
 
 def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:

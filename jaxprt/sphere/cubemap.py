@@ -60,6 +60,11 @@ def point(*, size: int) -> Float[Array, "6 n n 3"]:
     return jnp.asarray(_point(size), jnp.result_type(float))
 
 
+def axes() -> Float[np.ndarray, "6 3 3"]:
+    """The axes S, T and N of each face: s S + t T + N is the point (s, t) of the face."""
+    return _FRAME.copy()
+
+
 def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
     """Exact solid angles of the texels, in steradians; they sum to 4 pi.
 

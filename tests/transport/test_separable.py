@@ -1,5 +1,7 @@
 """Projection with visibility made by hand, and precomputation's own checks; no oracle here traces rays."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,20 +42,24 @@ def visible(random, count, size):
 
 
 def direct_sum(seen, frame, brdf, light, size):
-    """Sum over texels of light x light map x visibility x cosine, in float64 and by SciPy's bilinear lookup."""
+    """Sum over 2 x 2 Gauss points of light x light map x visibility x cosine, in float64 and by SciPy's lookup."""
     seen, frame, light = (np.asarray(each, np.float64) for each in (seen, frame, light))
-    direction = np.asarray(cubemap.direction(size=size), np.float64).reshape(-1, 3)
-    area = np.asarray(cubemap.vector_area(size=size), np.float64).reshape(-1, 3)
     light_map = np.asarray(brdf.light_map, np.float64)
     result = np.zeros((len(seen), brdf.terms, light.shape[-1]))
-    for vertex, axes in enumerate(frame):
-        local = direction @ axes.T
-        coordinates = (local[:, :2] / (1 + np.maximum(local[:, 2:], 0)) + 1) / 2
-        place = coordinates[:, ::-1].T * light_map.shape[1] - 0.5
-        flux = np.maximum(area @ axes[2], 0) * seen[vertex] / 16
-        for term in range(brdf.terms):
-            value = scipy.ndimage.map_coordinates(light_map[term, ..., 0], place, order=1, mode="nearest")
-            result[vertex, term] = (value * flux) @ light
+    offset = np.sqrt(1 / 3) / size
+    for right, down in itertools.product((-offset, offset), repeat=2):
+        point = np.asarray(cubemap.point(size=size), np.float64)
+        s, t = cubemap.axes()[:, None, None, 0], cubemap.axes()[:, None, None, 1]
+        point = (point + right * s + down * t).reshape(-1, 3)
+        length = np.linalg.norm(point, axis=1, keepdims=True)
+        for vertex, axes in enumerate(frame):
+            local = point / length @ axes.T
+            coordinates = (local[:, :2] / (1 + np.maximum(local[:, 2:], 0)) + 1) / 2
+            place = coordinates[:, ::-1].T * light_map.shape[1] - 0.5
+            flux = np.maximum(local[:, 2], 0) / length[:, 0] ** 3 / size**2 * seen[vertex] / 16
+            for term in range(brdf.terms):
+                value = scipy.ndimage.map_coordinates(light_map[term, ..., 0], place, order=1, mode="nearest")
+                result[vertex, term] += (value * flux) @ light
     return result
 
 
