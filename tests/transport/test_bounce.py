@@ -1,5 +1,6 @@
 """Light that has been reflected: against another system's bounces, and against loops over rays."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -88,16 +89,19 @@ def test_what_arrives_is_a_loop_over_rays(mesh, seen, frame, met):
     vertex = int(np.bincount(rays.owner).argmax())
     colored = np.einsum("spl,pc->slc", arrived(response, frame, basis, rays, basis_2)[vertex], weight)
     light = cubemap.direction(size=SIZE).reshape(-1, 3)
+    value = jax.jit(lambda axes, wo: glossy(directions.to_local(axes, light), jnp.broadcast_to(wo, light.shape)))
+    axis, visible, way = np.asarray(frame), np.asarray(seen), np.asarray(light)
+    area = np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)
     exact = np.zeros_like(colored)
     for group, ray in zip(*np.nonzero((rays.owner == vertex)[:, None] & (rays.weight.sum(-1) > 0)), strict=True):
         texel = rays.texel[group, ray]
         for place, part in zip(rays.corner[group, ray], rays.weight[group, ray], strict=True):
-            axes = frame[place]
-            met_by = jnp.maximum(cubemap.vector_area(size=SIZE).reshape(-1, 3) @ axes[2], 0) * seen[place] / 16
-            wo = axes @ -light[texel]
-            wo = directions.normalize(wo.at[2].max(1e-3))
-            sent = glossy(directions.to_local(axes, light), jnp.broadcast_to(wo, light.shape)) * met_by[:, None]
-            sent = np.asarray(sent).reshape(6, EDGE, 4, EDGE, 4, 3).sum((2, 4)).reshape(-1, 3)
+            axes = axis[place]
+            met_by = np.maximum(area @ axes[2], 0) * visible[place] / 16
+            wo = axes @ -way[texel]
+            wo[2] = max(wo[2], 1e-3)
+            sent = np.asarray(value(axes, wo / np.linalg.norm(wo))) * met_by[:, None]
+            sent = sent.reshape(6, EDGE, 4, EDGE, 4, 3).sum((2, 4)).reshape(-1, 3)
             exact += part * basis_2[texel][:, None, None] * sent
     assert relative(colored, exact) < 1e-5
 
