@@ -296,5 +296,5 @@ def test_bounces_go_on_from_their_folders_which_know_what_they_are_of(mesh, matr
     close(kept, interreflect_diffuse(mesh, vector, albedo, **options).vector)
     with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*brdf"):
         interreflect(mesh, matrix, lambert[::-1], path=tmp_path / "matrix", **options)
-    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*rows"):
+    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*albedo"):
         interreflect_diffuse(mesh, vector, albedo / 2, path=tmp_path / "vector", **options)
