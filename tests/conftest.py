@@ -93,16 +93,18 @@ def data() -> pathlib.Path:
 @pytest.fixture(scope="module")
 def coarse() -> Iterator[None]:
     """For one file, lobes and factors are fitted to BRDFs at fewer directions; the code that fits them is the same."""
-    from jaxprt.brdf import dynamic, lobe_em, paths
+    from jaxprt.brdf import lobe_em, paths, reflected
 
+    fewer = {"RINGS": 20, "SECTORS": 28}
     with pytest.MonkeyPatch.context() as patch:
-        for room, names in (
-            (lobe_em, ("RINGS", "SECTORS")),
-            *((each, ("_RINGS", "_SECTORS")) for each in (dynamic, paths)),
-        ):
-            for name, value in zip(names, (20, 28), strict=True):
-                patch.setattr(room, name, value)
+        jax.clear_caches()  # Programs hold the numbers that they were compiled with.
+        reflected._dual.cache_clear()
+        for room, prefix in ((lobe_em, ""), (reflected, "_"), (paths, "_")):
+            for name, value in fewer.items():
+                patch.setattr(room, prefix + name, value)
         yield
+    jax.clear_caches()
+    reflected._dual.cache_clear()
 
 
 @pytest.fixture
