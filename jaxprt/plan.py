@@ -136,6 +136,7 @@ class Ready(eqx.Module):
         factored: Its terms, for the rest of the light.
         transport: Transport of the terms.
         texels: Number of single texels.
+        samples: Points along the edge of each, from `jaxprt.relight.direct.samples_for`.
     """
 
     visible: DirectTransport
@@ -143,6 +144,7 @@ class Ready(eqx.Module):
     factored: SeparableBrdf
     transport: ClusteredTransport
     texels: int = eqx.field(static=True)
+    samples: int = eqx.field(static=True)
 
 
 class LobeReady(eqx.Module):
@@ -153,12 +155,14 @@ class LobeReady(eqx.Module):
         brdf: The BRDF itself, for single texels.
         table: Its lobes, for the rest of the light.
         texels: Number of single texels.
+        samples: Points along the edge of each, from `jaxprt.relight.direct.samples_for`.
     """
 
     transport: LobeTransport
     brdf: Callable
     table: LobeBrdf
     texels: int = eqx.field(static=True)
+    samples: int = eqx.field(static=True)
 
 
 def separable(
@@ -203,13 +207,14 @@ def separable(
     judged = np.sort(np.random.default_rng(1).permutation(chosen.size)[:_JUDGED])
     views = _views(mesh)
     exact = _exact(visible, judged, brdf, environments, views)
+    samples = texels.samples_for(brdf, size=size)
     low, high, plan, wrong = 0, len(_LADDER), None, math.inf
     with tqdm.tqdm(total=high.bit_length(), desc="plan", disable=not progress) as bar:
         while low < high:  # The first step that is good enough lies in between: errors fall along the ladder.
             middle = (low + high) // 2
             sizes = _fitted(_LADDER[middle], chosen.shape[1], size)
             start = time.perf_counter()
-            ready = _ready(visible, brdf, sizes, member=member, progress=False)
+            ready = _ready(visible, brdf, sizes, samples, member=member, progress=False)
             seconds = share * (rays + time.perf_counter() - start)
             wrong = max(_error(ready, light, judged, views, at) for light, at in zip(environments, exact, strict=True))
             bar.update()
@@ -248,15 +253,14 @@ def lobe(
     visible = direct.precompute(mesh, size=size, occluder=occluder, vertex=chosen, progress=False)
     transport = pyramids.compress(visible)
     rays = share * (time.perf_counter() - start)
-    views = _views(mesh)
-    judged = np.arange(number)
+    views, judged = _views(mesh), np.arange(number)
     exact = _exact(visible, judged, brdf, environments, views)
-    reached = math.inf
+    reached, samples = math.inf, texels.samples_for(brdf, size=size)
     for count, single in tqdm.tqdm(_LOBES, desc="plan", disable=not progress):
         start = time.perf_counter()
         table = lobes.tabulate(brdf, lobes=count)
         seconds = rays + time.perf_counter() - start
-        ready = LobeReady(transport, brdf, table, min(single, 6 * size * size - 1))
+        ready = LobeReady(transport, brdf, table, min(single, 6 * size * size - 1), samples)
         wrong = max(_error(ready, light, judged, views, at) for light, at in zip(environments, exact, strict=True))
         reached = min(reached, wrong)
         if wrong * MARGIN <= error:
@@ -274,7 +278,6 @@ def precompute(
     brdf: Callable,
     plan: Plan | LobePlan,
     *,
-    size: int | None = None,
     occluder: Mesh | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -286,7 +289,6 @@ def precompute(
         mesh: The vertices to light, as in the plan.
         brdf: Their BRDF, as in the plan.
         plan: The plan.
-        size: Edge of the light's cubemap faces in texels; the plan's if None, and no other.
         occluder: What casts shadows; the mesh itself if None.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None.
@@ -296,23 +298,23 @@ def precompute(
         What `radiance` needs.
 
     Raises:
-        ValueError: Another number of vertices or size than the plan's, or as in `precompute` of the transports.
+        ValueError: Another number of vertices than the plan's, or as in `precompute` of the transports.
     """
     if len(mesh.position) != plan.vertices:
         raise ValueError(f"the mesh must have the plan's {plan.vertices} vertices, got {len(mesh.position)}")
-    if size not in (None, plan.size):
-        raise ValueError(f"size must be the plan's {plan.size}, got {size}")
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     run = {"executor": executor, "progress": progress}
+    samples = texels.samples_for(brdf, size=plan.size)
     if isinstance(plan, LobePlan):
         at = folder and folder / "lobes.prt"
         transport = pyramids.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
-        return LobeReady(transport, brdf, lobes.tabulate(brdf, lobes=plan.lobes), plan.texels)
+        return LobeReady(transport, brdf, lobes.tabulate(brdf, lobes=plan.lobes), plan.texels, samples)
     at = folder and folder / "visibility.prt"
     visible = direct.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
-    return _ready(visible, brdf, plan, clusters=plan.clusters, path=folder and folder / "clusters.prt", **run)
+    at = folder and folder / "clusters.prt"
+    return _ready(visible, brdf, plan, samples, clusters=plan.clusters, path=at, **run)
 
 
 def radiance(ready: Ready | LobeReady, light: Environment, *, eye: Float[Array, "3"]) -> Float[Array, "v c"]:
@@ -326,18 +328,13 @@ def radiance(ready: Ready | LobeReady, light: Environment, *, eye: Float[Array, 
     Returns:
         Linear radiance per vertex, in the light's units. Differentiable in the light and the eye.
     """
+    texel, excess, rest = texels.split(light, count=ready.texels)
     if isinstance(ready, Ready):
-        return _by_terms(ready, light, eye)
-    texel, excess, rest = texels.split(light, count=ready.texels)
-    smooth = blurred.radiance(ready.transport, ready.table, rest, eye=eye)
-    return smooth + texels.radiance(ready.transport, ready.brdf, texel, excess, eye=eye)
-
-
-@jax.jit
-def _by_terms(ready: Ready, light: Environment, eye: Array) -> Array:
-    texel, excess, rest = texels.split(light, count=ready.texels)
-    smooth = combine(light_tuple(ready.transport, rest), view_tuple(ready.transport, ready.factored, eye))
-    return smooth + texels.radiance(ready.visible, ready.brdf, texel, excess, eye=eye)
+        view = view_tuple(ready.transport, ready.factored, eye)
+        visible, smooth = ready.visible, combine(light_tuple(ready.transport, rest), view)
+    else:
+        visible, smooth = ready.transport, blurred.radiance(ready.transport, ready.table, rest, eye=eye)
+    return smooth + texels.radiance(visible, ready.brdf, texel, excess, eye=eye, samples=ready.samples)
 
 
 def _checked(environments: Sequence[Environment], error: float) -> int:
@@ -379,19 +376,22 @@ def _fitted(step: _Sizes, members: int, size: int) -> _Sizes:
     return _Sizes(terms, resolution, vectors, min(modes, keep, vectors * terms), keep, min(count, 6 * size * size - 1))
 
 
-def _ready(visible: DirectTransport, brdf: Callable, sizes: Plan | _Sizes, **options) -> Ready:
+def _ready(visible: DirectTransport, brdf: Callable, sizes: Plan | _Sizes, samples: int, **options) -> Ready:
     """Transport in these sizes; the options are those of `clustered.precompute`."""
     factored = brdfs.factor(brdf, terms=sizes.terms, resolution=sizes.resolution)
     limits = {name: getattr(sizes, name) for name in ("vectors", "modes", "keep")}
     transport = clustered.precompute(visible, factored, **limits, **options)
-    return Ready(visible, brdf, factored, transport, sizes.texels)
+    return Ready(visible, brdf, factored, transport, sizes.texels, samples)
 
 
 def _error(ready, light: Environment, judged: np.ndarray, views: np.ndarray, exact: np.ndarray) -> float:
-    """Relative L2 error of some vertices over all views."""
-    now = np.stack([np.asarray(radiance(ready, light, eye=jnp.asarray(eye)))[judged] for eye in views])
-    whole = float(np.linalg.norm(exact))
-    return float(np.nan_to_num(np.linalg.norm(now - exact), nan=np.inf)) / (whole if whole > 0 else 1.0)
+    """Relative L2 error of some vertices over all views, as far as they face the viewer."""
+    visible = ready.visible if isinstance(ready, Ready) else ready.transport
+    normal, position = np.asarray(visible.frame)[judged, 2], np.asarray(visible.position)[judged]
+    facing = np.einsum("vi,wvi->wv", normal, views[:, None] - position) > 0
+    now = np.stack([np.asarray(radiance(ready, light, eye=jnp.asarray(eye)))[judged] for eye in views])[facing]
+    wrong, whole = (float(np.linalg.norm(each)) for each in (now - exact[facing], exact[facing]))
+    return float(np.nan_to_num(wrong, nan=np.inf)) / (whole if whole > 0 else 1.0)
 
 
 def _seconds(function: Callable) -> float:

@@ -164,12 +164,12 @@ def relight_lobe(whole: Scene, output: Path, *, lobes: int) -> Relit:
             "table_bytes": tables[-1].nbytes,
             **_took(middle, ready[-1]),
         }
-    eye = whole.camera.eye
+    eye, samples = whole.camera.eye, [relight.direct.samples_for(part.brdf) for part in whole.parts]
     return Relit(
         lambda light: [_lobe_light(light, _TEXELS)] * len(ready),
         lambda: [
-            _lobe_view(each, table, part.brdf, eye)
-            for each, table, part in zip(ready, tables, whole.parts, strict=True)
+            _lobe_view(each, table, part.brdf, eye, count)
+            for each, table, part, count in zip(ready, tables, whole.parts, samples, strict=True)
         ],
         _lobe_combine,
         told,
@@ -194,14 +194,16 @@ def _lobe_light(light: Environment, texels: int) -> tuple:
     return relight.lobe.prefilter(rest), texel, excess
 
 
-def _lobe_view(ready: transport.LobeTransport, table: brdf.lobe.LobeBrdf, model: Callable, eye: Array) -> tuple:
-    return relight.lobe.look(ready, table, eye=eye), ready, model, eye
+def _lobe_view(
+    ready: transport.LobeTransport, table: brdf.lobe.LobeBrdf, model: Callable, eye: Array, samples: int
+) -> tuple:
+    return relight.lobe.look(ready, table, eye=eye), ready, model, eye, samples
 
 
 def _lobe_combine(light: tuple, view: tuple) -> Array:
-    (blurred, *bright), (look, ready, model, eye) = light, view
+    (blurred, *bright), (look, ready, model, eye, samples) = light, view
     color = relight.lobe.combine(blurred, look)
-    return color + relight.direct.radiance(ready, model, *bright, eye=eye) if bright else color
+    return color + relight.direct.radiance(ready, model, *bright, eye=eye, samples=samples) if bright else color
 
 
 def _store(output: Path, part: Part, suffix: str) -> Path:
@@ -372,7 +374,8 @@ def table_lobe(whole: Scene, vertex: np.ndarray, truth: np.ndarray) -> list[dict
     """Error against lobes and exact texels on some vertices of the first part."""
     part, eye = whole.parts[0], whole.camera.eye
     full = transport.lobe.precompute(part.mesh, occluder=whole.mesh, vertex=vertex)
-    views = {lobes: _lobe_view(full, _lobes(part.brdf, lobes), part.brdf, eye) for lobes in TABLE_LOBES}
+    samples = relight.direct.samples_for(part.brdf)
+    views = {lobes: _lobe_view(full, _lobes(part.brdf, lobes), part.brdf, eye, samples) for lobes in TABLE_LOBES}
     rows = []
     for (lobes, view), texels in itertools.product(views.items(), TABLE_TEXELS):
         light = next(iter(whole.lights.values()))

@@ -105,6 +105,7 @@ def radiance(
     *,
     eye: Float[Array, "3"],
     texels: int = 16,
+    samples: int = 1,
 ) -> Float[Array, "v c"]:
     """Radiance that each vertex sends to the eye.
 
@@ -114,7 +115,9 @@ def radiance(
         materials: Of each region, what it is made of at present; None where that does not change.
         light: The environment.
         eye: Position of the viewer in world units.
-        texels: How many of the brightest texels light the vertices one by one, exactly.
+        texels: How many of the brightest texels light the vertices one by one.
+        samples: Points along the edge of each at which the BRDF is taken; `jaxprt.relight.direct.samples_for` of the
+            sharpest material tells how many it needs.
 
     Returns:
         Linear radiance per vertex in the light's units; slightly negative values occur at shadow boundaries.
@@ -130,7 +133,7 @@ def radiance(
     Reference: Sun et al. 2007, equation 3 with direct lighting, and section 4.1.
     """
     lit = light_side(transport, light, texels=texels)
-    return combine(transport, lit, view_side(transport, brdfs, materials, eye=eye))
+    return combine(transport, lit, view_side(transport, brdfs, materials, eye=eye), samples=samples)
 
 
 def light_side(transport: DynamicTransport, light: Environment, *, texels: int = 16) -> DynamicLight:
@@ -187,22 +190,25 @@ def view_side(
     return DynamicView(eye, tuple(region))
 
 
-def combine(transport: DynamicTransport, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
+def combine(
+    transport: DynamicTransport, light: DynamicLight, view: DynamicView, *, samples: int = 1
+) -> Float[Array, "v c"]:
     """Radiance of a view under a light.
 
     Args:
         transport: The transport of both.
         light: From `light_side`.
         view: From `view_side`.
+        samples: As in `radiance`.
     """
     result = []
     for own, met, matte, each in zip(transport.region, light.met, light.matte, view.region, strict=True):
         if isinstance(each.brdf, SeparableBrdf):
-            single = direct.radiance(own.seen, each.brdf, light.texel, light.excess, eye=view.eye)
+            single = direct.radiance(own.seen, each.brdf, light.texel, light.excess, eye=view.eye, samples=samples)
             result.append(separable.combine(met, each.factor) + single)
             continue
         model = each.brdf if each.brdf.brdf is None else each.brdf.brdf
-        single = direct.radiance(own.seen, model, light.texel, light.excess, eye=view.eye)
+        single = direct.radiance(own.seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
         glossy = None
         if each.looked is not None:
             glossy = lobe.combine(light.blurred, _glossy(each.looked)), each.looked.diffuse.T

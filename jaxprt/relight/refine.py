@@ -194,6 +194,7 @@ def _visit(fixed: tuple, colors: int) -> Callable:
         vertex, level = cell[:, 0], cell[:, 1]
         wo = integrand.wo[vertex]
         wi, weight, texel = _nodes(cell, integrand.frame[vertex], size)
+        weight *= wo[:, 2:, None] > 0
         sent = value(integrand.brdf, jnp.stack(wi, -1), wo[:, None, None])
         inner = _children(sent * (jnp.maximum(wi[2], 0) * weight)[..., None])
         clear = choice.seen[vertex[:, None, None], texel].astype(weight.dtype) / LEVELS
