@@ -47,7 +47,7 @@ def planned(mesh, sky):
 
 @pytest.fixture(scope="module")
 def ready(mesh, planned):
-    return plan.precompute(mesh, BRDF, planned, size=8, progress=False)
+    return plan.precompute(mesh, BRDF, planned, progress=False)
 
 
 def test_the_error_asked_for_holds_from_other_views(mesh, sky, planned, ready):
@@ -73,7 +73,7 @@ def test_bytes_are_those_of_what_is_made(mesh, planned, ready):
 def test_a_plan_of_lobes_holds_from_other_views_and_stores_what_it_says(mesh, sky):
     wanted = plan.lobe(mesh, BRDF, [sky], error=ASKED, progress=False)
     assert wanted.error * plan.MARGIN <= ASKED
-    ready = plan.precompute(mesh, BRDF, wanted, size=8, progress=False)
+    ready = plan.precompute(mesh, BRDF, wanted, progress=False)
     assert ready.table.lobes == wanted.lobes
     assert wanted.nbytes == ready.transport.nbytes
     _check_other_views(mesh, sky, ready)
@@ -128,8 +128,6 @@ def test_a_brdf_that_is_not_finite_has_no_plan(mesh, sky):
     ],
     ids=["separable", "lobe"],
 )
-def test_a_plan_is_for_its_own_size_of_light_and_its_own_mesh(mesh, planned):
-    with pytest.raises(ValueError, match="size must be the plan's 32, got 64"):
-        plan.precompute(mesh, BRDF, planned, size=64, progress=False)
+def test_a_plan_is_for_its_own_mesh(mesh, planned):
     with pytest.raises(ValueError, match="the mesh must have the plan's 110 vertices, got 9"):
         plan.precompute(builtin.plane(cells=2), BRDF, planned, progress=False)
