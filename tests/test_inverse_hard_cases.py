@@ -95,9 +95,9 @@ def test_saturated_pixels_do_not_count(mesh, matte, sky, view, image):
     assert wrong > 0.3
 
 
-def noisy(image, share):
+def noisy(image, share, seed=0):
     noise = share * np.sqrt(np.mean(image[image > 0] ** 2))
-    return np.maximum(image + noise * np.random.default_rng(0).normal(size=image.shape), 0).astype(np.float32)
+    return np.maximum(image + noise * np.random.default_rng(seed).normal(size=image.shape), 0).astype(np.float32)
 
 
 def test_noise_leaves_a_residual_of_its_size_and_deviations_that_hold(mesh, matte, sky, view, image):
@@ -110,11 +110,13 @@ def test_noise_leaves_a_residual_of_its_size_and_deviations_that_hold(mesh, matt
 
 
 def test_much_noise_leaves_less_that_is_told_and_that_is_right(mesh, matte, sky, view, image):
-    found = fit(mesh, matte, Picture(noisy(image, 0.02), view))
-    assert 0.01 < found.residual[-1] < 0.03
-    assert 12 <= found.rank < 54
-    wrong = np.linalg.norm(found.told @ np.ravel(found.value - sky)) / np.linalg.norm(found.told @ np.ravel(sky))
-    assert wrong < 0.02
+    for seed in range(5):
+        found = fit(mesh, matte, Picture(noisy(image, 0.02, seed), view))
+        assert 0.01 < found.residual[-1] < 0.03
+        assert 12 <= found.rank < 54
+        wrong = np.linalg.norm(found.told @ np.ravel(found.value - sky)) / np.linalg.norm(found.told @ np.ravel(sky))
+        # The error that `inverse.light` is asked for: .015 to .040 for these noises, and rounding moves each by .003.
+        assert wrong < 0.05
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.1])
