@@ -318,7 +318,8 @@ def is_isotropic(brdf: Callable) -> bool:
     wi, wo = np.stack([np.tile(radius, 2) * np.cos(angle), np.tile(radius, 2) * np.sin(angle), height], -1)
     dtype = jnp.result_type(float)
     value = np.split(np.asarray(_values(brdf, wi.astype(dtype), wo.astype(dtype))), 2)
-    return bool(np.linalg.norm(value[0] - value[1]) <= 1e-2 * np.linalg.norm(value[0]))
+    with np.errstate(invalid="ignore", over="ignore"):  # Values that are not finite are refused elsewhere.
+        return bool(np.linalg.norm(value[0] - value[1]) <= 1e-2 * np.linalg.norm(value[0]))
 
 
 @eqx.filter_jit

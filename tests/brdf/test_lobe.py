@@ -293,7 +293,7 @@ def test_weights_are_linear_between_knots_and_places_means_by_weight_and_both_cl
     wi, wo = upper(11, 200), upper(12, 200, least=0.3)
     sharp, middle, wide = (varying.at(jnp.asarray(r)).lookup(wo).concentration for r in (0.2, 0.3, 0.4))
     assert jnp.all((wide - middle) * (sharp - middle) < 0)
-    assert np.isfinite(np.asarray(value(varying.at(jnp.asarray(0.3)), wi, wo))).all()
+    assert np.isfinite(np.asarray(varying.at(jnp.asarray(0.3))(wi, wo))).all()
 
 
 def test_lobes_without_light_have_no_say_between_knots(quick):
