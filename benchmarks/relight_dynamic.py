@@ -6,7 +6,8 @@ Objects on grounds, as many vertices as in three scenes of the paper, with as ma
 model over the Fresnel-roughness plane, by free lobes. `V` are frames of a new view, `V&B` of new materials too, `V&B&L`
 of a new light too. `peer` are frames of the paper, with interreflections, which it says take three quarters of
 `V&B&L`; of two Xeons of 3.2 GHz and a GeForce 7800 in 2007. `error` is the median over thirty random triples of light,
-BRDF and view, relative L2 of the radiance of 600 vertices against the sum over all texels.
+BRDF and view, relative L2 of the radiance of those of 600 vertices that face the eye, against the integral over all
+texels.
 
 Lines `m = ...` are of the triples of one roughness. `brdf_error` is the part of the BRDF, with visibility as it is;
 `matte_error` that of the diffuse part, by clustered wavelets; what is left is light and visibility taken apart.
@@ -210,8 +211,10 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
             for row, (base, sharp) in enumerate([(white, glossy), (white, fitted), (white, 0 * glossy)]):
                 sums[row] += own * (base * diffuse + sharp * specular)
         whole, by_brdf, base = sums
-        norm = np.linalg.norm(whole)
+        facing = np.einsum("vi,vi->v", visible.frame[:, 2], triple.eye - np.asarray(visible.position)) > 0
+        norm = np.linalg.norm(whole[facing])
         wrong = (np.asarray(color)[vertex] - whole, by_brdf - whole, np.asarray(matte)[vertex] - base)
+        wrong = [each[facing] for each in wrong]
         result[ROUGHNESS[number % len(ROUGHNESS)]].append([float(np.linalg.norm(each) / norm) for each in wrong])
     return result
 
