@@ -3,10 +3,9 @@
     python -m benchmarks.lobes [--quick] [--output FILE]
 
 Three hundred random vertices of the bunny on its ground (from JAXPRT_DATA; a sphere where that is not set, and with
---quick) from twenty views, under each light, against the sum over all texels; views within three degrees of the surface
-are left out, where the lobe of a smooth material falls between the centers of texels and that sum is no yardstick.
-Sixteen texels are summed exactly. `specular` is Cook-Torrance's model without a diffuse part, so that nothing hides the
-error.
+--quick) from twenty views, under each light, against the integral over all texels; views within three degrees of the
+surface are left out. Sixteen texels are summed one by one, by as many points as the BRDF needs. `specular` is
+Cook-Torrance's model without a diffuse part, so that nothing hides the error.
 `seconds` is a frame in which light, view and BRDF are all new, on all the vertices taken. `unoccluded` is the error of
 the table itself, without shadows; `terms_error` that of sixteen separable terms with exact visibility and all texels.
 `remainder_errors`, of eight lobes, are what 4, 8 and 16 separable terms of the remainder leave, with exact visibility.

@@ -86,7 +86,8 @@ def _glossy() -> Any:
             result.eta, result.sampled_component = 1.0, 0
             result.sampled_type = mitsuba.UInt32(+mitsuba.BSDFFlags.GlossyReflection)
             value, result.pdf = self.eval_pdf(ctx, si, result.wo, active)
-            return result, drjit.select(result.pdf > 0, value / result.pdf, 0)
+            # In scalar variants both branches are computed.
+            return result, drjit.select(result.pdf > 0, value / drjit.select(result.pdf > 0, result.pdf, 1), 0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             to, _ = self.frame(si)
