@@ -193,7 +193,8 @@ def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Arr
 def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Array]:
     """Directions of the points in some texels, and their integrals of direction, [t k 3]."""
     if samples == 1:
-        return tuple(each(size=size).reshape(-1, 3)[texel, None] for each in (cubemap.direction, cubemap.vector_area))
+        direction, area = cubemap.direction(size=size), cubemap.vector_area(size=size)
+        return direction.reshape(-1, 3)[texel, None], area.reshape(-1, 3)[texel, None]
     place, weight = np.polynomial.legendre.leggauss(samples)
     face, row = jnp.divmod(texel[:, None, None], size**2)
     row, column = jnp.divmod(row, size)

@@ -127,6 +127,21 @@ def _constant(value):
     return lambda wi, wo: jnp.full((*wi.shape[:-1], 1), value) * jnp.ones_like(wi)
 
 
+def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_does_not():
+    sun = Environment(jnp.full((6, 8, 8, 3), 0.1).at[2, 3, 5].set(30.0))
+    brdf = AshikhminShirley(nu=10, nv=10)
+    by_prior = separable.factor(brdf, error=0.4, resolution=24)
+    assert separable.light_errors(brdf, by_prior, sun)[-1] > 2 * by_prior.error
+    chosen = separable.factor(brdf, error=0.4, light=[sun], resolution=24)
+    assert chosen.error <= 0.4
+    assert chosen.terms > by_prior.terms
+    errors = separable.light_errors(brdf, chosen, sun, frames=50, views=20)  # others than it was chosen by
+    assert errors.shape == (chosen.terms,)
+    assert errors[-1] < 0.5
+    with pytest.raises(ValueError, match=r"lights must be at least one and come with error, got 1 and terms=3"):
+        separable.factor(brdf, terms=3, light=[sun])
+
+
 def test_sample_error_of_closed_forms():
     error, relative = separable.sample_error(_constant(0.5), _constant(0.3))
     np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
