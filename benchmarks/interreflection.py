@@ -105,7 +105,7 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     }
     data = harness.data() / "brdf" / "ngan2005_cooktorrance.csv"
     fitted = navigation.cook_torrance(path=data).brdf if data.is_file() and not quick else family.brdf
-    shiny = navigation.blinn_phong(exponents=(1, 8, 64) if quick else range(1, 201)).brdf
+    shiny = navigation.blinn_phong(exponents=(1.0, 8.0, 64.0) if quick else range(1, 201)).brdf
     for name, brdfs in {"Cook-Torrance": fitted, "Blinn-Phong": shiny}.items():
         found = relight_dynamic.principal(brdfs, functions=functions)
         yield {"benchmark": "interreflection", "case": f"basis: {name}, {functions} functions, PCA alone", **found}

@@ -3,9 +3,9 @@
     python -m benchmarks.lobes [--quick] [--output FILE]
 
 Three hundred random vertices of the bunny on its ground (from JAXPRT_DATA; a sphere where that is not set, and with
---quick) from twenty views, under each light, against the integral over all texels; views within three degrees of the
-surface are left out. Sixteen texels are summed one by one, by as many points as the BRDF needs. `specular` is
-Cook-Torrance's model without a diffuse part, so that nothing hides the error.
+--quick) from twenty views that they face, under each light, against the integral over all texels. Sixteen texels are
+summed one by one, by as many points as the BRDF needs. `specular` is Cook-Torrance's model without a diffuse part, so
+that nothing hides the error.
 `seconds` is a frame in which light, view and BRDF are all new, on all the vertices taken. `unoccluded` is the error of
 the table itself, without shadows; `terms_error` that of sixteen separable terms with exact visibility and all texels.
 `remainder_errors`, of eight lobes, are what 4, 8 and 16 separable terms of the remainder leave, with exact visibility.
@@ -29,7 +29,6 @@ from jaxprt.transport import direct
 from jaxprt.transport import lobe as pyramids
 
 SUN = 16
-GRAZING = 0.05
 MATERIALS = {
     **{
         f"specular m = {m}": CookTorrance(diffuse=0.0, specular=0.5, roughness=m, f0=0.3)
@@ -81,7 +80,7 @@ def measure(quick: bool):
                     return color + texels.radiance(transport, brdf, texel, excess, eye=eye)
 
                 color = np.stack([frame(eye) for eye in views])
-                known = np.stack([height(visible, eye) > GRAZING for eye in views])
+                known = np.stack([height(visible, eye) > 0 for eye in views])
                 wrong, other = (error(x, exact[number], known) for x in (color, peer[number]))
                 yield {
                     **{"benchmark": "lobes", "case": f"{material}, {count} lobes, {name}"},

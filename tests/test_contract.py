@@ -40,7 +40,6 @@ JITTED = type(jax.jit(lambda: 0))
 HOST = {
     "require": "checks values",
     "staging": "takes functions",
-    "require": "checks values",
     "inverse": "takes functions, and fits on the host",
     "report": "measures, and writes files",
     "animation": "the same",

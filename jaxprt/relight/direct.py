@@ -193,8 +193,8 @@ def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Arr
 def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Array]:
     """Directions of the points in some texels, and their integrals of direction, [t k 3]."""
     if samples == 1:
-        direction, area = cubemap.direction(size=size), cubemap.vector_area(size=size)
-        return direction.reshape(-1, 3)[texel, None], area.reshape(-1, 3)[texel, None]
+        direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+        return direction[texel, None], area[texel, None]
     place, weight = np.polynomial.legendre.leggauss(samples)
     face, row = jnp.divmod(texel[:, None, None], size**2)
     row, column = jnp.divmod(row, size)
@@ -203,7 +203,7 @@ def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Ar
     point = s[..., None] * axis[..., 0, :] + t[..., None] * axis[..., 1, :] + axis[..., 2, :]
     length = jnp.linalg.norm(point, axis=-1, keepdims=True)
     area = point / length**4 * (weight * weight[:, None] / size**2)[..., None]
-    return tuple(each.reshape(len(texel), -1, 3) for each in (point / length, area))
+    return (point / length).reshape(len(texel), -1, 3), area.reshape(len(texel), -1, 3)
 
 
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:

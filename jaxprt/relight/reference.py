@@ -142,7 +142,8 @@ def _centers(given: refine.Integrand, seen: Array, error: Array) -> tuple[Array,
     def varying(argument):
         gray, flux, clear, weight, axes, wo, height = argument
         scale = clear * jnp.max(mean * weight[:, None, None, None], 0)
-        wi = [sum(direction[..., j] * axes[i, j] for j in range(3)) for i in range(3)]
+        x, y, z = jnp.moveaxis(direction, -1, 0)
+        wi = [x * axes[i, 0] + y * axes[i, 1] + z * axes[i, 2] for i in range(3)]
         return _vary(gray, flux, scale, wi, wo * _MIRROR, height, error)
 
     told = jax.lax.stop_gradient((gray, flat, clear, weight, given.frame, given.wo, height))

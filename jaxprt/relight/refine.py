@@ -156,7 +156,7 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
     place = jnp.insert(place, 1, 0, axis=1)
     spare = _CHUNK * (SIDE**2 * (deepest + 1) + 1)
     stack = jnp.concatenate([place, jnp.zeros((spare, 5), jnp.int32)])
-    child = jnp.stack(jnp.meshgrid(*2 * [jnp.arange(SIDE)], indexing="ij"), -1)
+    child = jnp.stack(jnp.meshgrid(*2 * [jnp.arange(SIDE, dtype=jnp.int32)], indexing="ij"), -1)
 
     def step(state):
         stack, top, total = state
