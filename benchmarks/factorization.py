@@ -6,7 +6,7 @@ The matrix is that of Ashikhmin-Shirley's BRDF (0.5, 0.75, 10, 100) at the texel
 Errors are by how much the Frobenius error of the approximation of that rank exceeds the optimum's, relative to it.
 NumPy is given the matrix in float64, in which the optimum is computed; in float32 its `eigh` takes as long.
 
-`--figure` prints instead the errors that figure 4 of Wang et al. plots, for five BRDFs: `separable.sample_error`,
+`--figure` prints instead the errors that figure 4 of Wang et al. plots, for five BRDFs: `errors.sample_error`,
 relative, of 1 to 16 terms on maps of 16 to 64 texels along an edge. It needs JAXPRT_DATA for clay and skin.
 """
 
@@ -19,6 +19,7 @@ import scipy.sparse.linalg
 
 from benchmarks import harness
 from jaxprt.brdf import AshikhminShirley, load_lafortune, published, separable
+from jaxprt.brdf.errors import sample_error
 from jaxprt.linalg import eigen
 from jaxprt.sphere import hemisphere
 
@@ -111,7 +112,7 @@ def figure() -> None:
             for resolution in RESOLUTIONS
         ]
         for terms in FIGURE_TERMS:
-            errors = [float(separable.sample_error(brdf, each.keep(terms))[1]) for each in factored]
+            errors = [float(sample_error(brdf, each.keep(terms))[1]) for each in factored]
             print(f"{terms:>5}" + "".join(f"{error:8.3f}" for error in errors), flush=True)
 
 

@@ -127,7 +127,7 @@ HOST = {
     "relight.transfer.combine": "takes indices; the same",
     "brdf.lobe_em": "the steps of brdf.lobe.tabulate, and tested through it",
     "brdf.published": "checks values",
-    "brdf.separable.sample_error": "draws its own directions",
+    "brdf.errors": "draws its own directions",
     "brdf.separable.tabulate": "checks values",
     "plan": "measures",
     "brdf.separable.join": "puts arrays side by side, and makes an error that is NaN",

@@ -3,6 +3,7 @@
 from jaxprt.brdf import (
     cylinders,
     dynamic,
+    errors,
     harmonic,
     lobe,
     lobe_em,
@@ -11,6 +12,7 @@ from jaxprt.brdf import (
     navigation,
     paths,
     published,
+    reflected,
     scattered,
     separable,
 )
@@ -47,6 +49,7 @@ __all__ = [
     "WardDuer",
     "cylinders",
     "dynamic",
+    "errors",
     "harmonic",
     "load_lafortune",
     "load_merl",
@@ -59,6 +62,7 @@ __all__ = [
     "navigation",
     "paths",
     "published",
+    "reflected",
     "scattered",
     "separable",
 ]

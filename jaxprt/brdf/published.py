@@ -40,7 +40,7 @@ def factor_symmetric(
 
     Polar maps minimize the same norm and resolve grazing directions more finely: their last row of 48 spans 2.4
     degrees, the last texel of the disk 14. One term of Ashikhmin-Shirley's BRDF, for which the paper finds them
-    significantly better, has the same `separable.sample_error` in both, 0.98; with 4 terms that of the disk is 0.93 and
+    significantly better, has the same `errors.sample_error` in both, 0.98; with 4 terms that of the disk is 0.93 and
     that of polar maps 0.98, since they spend their terms on the large values that they resolve.
 
     Args:

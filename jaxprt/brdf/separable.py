@@ -11,10 +11,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxprt.brdf import errors
 from jaxprt.files import objects
 from jaxprt.linalg import eigen
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import cubemap, directions, harmonics, hemisphere
+from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.staging import apart
 
 _DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
@@ -154,9 +155,9 @@ def factor(
     Args:
         brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
         terms: Number of terms; or
-        error: relative error that the terms must reach: by `light_errors` under each of the lights, if lights are
-            given; else in the mean over natural light with the covariance above, which promises nothing for one light.
-            Neither has shadows: `jaxprt.plan.separable` measures errors on a mesh.
+        error: relative error that the terms must reach: by `jaxprt.brdf.errors.light_errors` under each of the lights,
+            if lights are given; else in the mean over natural light with the covariance above, which promises nothing
+            for one light. Neither has shadows: `jaxprt.plan.separable` measures errors on a mesh.
         light: Lights that the error must hold for, if `error` is given.
         resolution: Edge of the square maps in texels.
 
@@ -216,65 +217,6 @@ def _maps(
     return light_map[..., None], view_map
 
 
-def light_errors(
-    brdf: Callable, factored: SeparableBrdf, light: Environment, *, frames: int = 32, views: int = 32
-) -> Float[Array, " r"]:
-    """Relative L2 error of the radiance that vertices reflect under a light, without shadows, by number of terms.
-
-    Normals and views are spread evenly over the sphere and the hemisphere. The BRDF and its terms are taken at the
-    centers of the light's texels, so that the number tells what the terms lose, and no more.
-
-    Args:
-        brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: Its terms.
-        light: One environment.
-        frames: Number of normals.
-        views: Number of views for each.
-
-    Returns:
-        The error of the first term, of the first two, and so on to all. Zero where all radiance is zero.
-
-    Raises:
-        ValueError: The light is a batch.
-    """
-    if light.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
-    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
-
-
-@jax.jit
-def _light_errors(brdf: Callable, factored: SeparableBrdf, light: Environment, normal: Array, view: Array) -> Array:
-    size = light.radiance.shape[1]
-    direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
-    table = light.radiance.reshape(len(direction), -1)
-    factor = factored.view(view)
-
-    def one(axes):
-        wi = directions.to_local(axes, direction)
-        received = table * jnp.maximum(directions.to_local(axes, area)[:, 2:], 0)
-        met = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
-        met = met[:, 0] if met.shape[1] == 1 else jnp.einsum("rcc->rc", met)
-        by_terms = jnp.cumsum(factor * met, 1)
-
-        def exact(wo):
-            return jnp.sum(brdf(wi, jnp.broadcast_to(wo, wi.shape)) * received, 0)
-
-        true = jax.lax.map(exact, view)
-        return jnp.sum((by_terms - true[:, None]) ** 2, (0, 2)), jnp.sum(true**2)
-
-    error, whole = jax.lax.map(one, directions.frame(normal, jnp.zeros_like(normal)))
-    whole = jnp.sum(whole)
-    return jnp.sqrt(jnp.sum(error, 0) / jnp.where(whole > 0, whole, 1))
-
-
-def _spread(count: int, lowest: int) -> Array:
-    """Directions that a golden spiral spreads evenly over what lies above a height."""
-    height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
-    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
-    radius = np.sqrt(1 - height**2)
-    return jnp.asarray(np.stack([radius * np.cos(turn), radius * np.sin(turn), height], -1), jnp.result_type(float))
-
-
 def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None, error: float | None, resolution: int):
     """As many terms as an error under each of some lights needs."""
     if error is None or not len(light):
@@ -282,7 +224,7 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
     count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
     while True:
         found = factor(brdf, terms=count, resolution=resolution)
-        reached = np.max([light_errors(brdf, found, each) for each in light], 0)
+        reached = np.max([errors.light_errors(brdf, found, each) for each in light], 0)
         good = np.flatnonzero(reached <= error)
         if good.size:
             kept = found.keep(int(good[0]) + 1)
@@ -319,43 +261,6 @@ def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
 
     light_map, view_map = (side_by_side([getattr(b, name) for b in brdfs]) for name in ("light_map", "view_map"))
     return SeparableBrdf(light_map, view_map, jnp.full_like(brdfs[0].error, jnp.nan), brdfs[0].coordinates)
-
-
-def sample_error(
-    brdf: Callable, factored: Callable, *, samples: int = 80_000
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Root mean square difference of two BRDFs over random directions, weighted by the cosine of the incident one.
-
-    sqrt(sum cos_i |f - g|^2 / sum cos_i) over pairs of directions that are drawn independently and uniformly by solid
-    angle above the horizon, the same ones at each call; squares are averaged over colors. Half the views lie within 30
-    degrees of the horizon, where glossy BRDFs are largest: their errors make most of this one. The error of the
-    rendered radiance is another matter.
-
-    Args:
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: The BRDF in its factored form, or any other callable of the same channels or of one.
-        samples: Number of pairs.
-
-    Returns:
-        The error in 1/sr, and relative to the root mean square of the BRDF under the same weight; the latter is zero
-        where both are.
-
-    Raises:
-        ValueError: No samples.
-
-    Reference: Wang, Tran, Luebke 2004, section 4.3, which names no distribution of the samples; uniform is the choice
-        here.
-    """
-    if samples < 1:
-        raise ValueError(f"samples must be at least 1, got {samples}")
-    height, turn = jax.random.uniform(jax.random.key(0), (2, 2, samples), jnp.result_type(float))
-    height = 1 - height  # In (0, 1]: above the horizon.
-    radius, angle = jnp.sqrt(1 - height**2), 2 * jnp.pi * turn
-    wi, wo = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], -1)
-    value = brdf(wi, wo)
-    weight = wi[:, 2:] / jnp.sum(wi[:, 2])
-    error, size = (jnp.sqrt(jnp.sum(weight * f**2) / f.shape[-1]) for f in (factored(wi, wo) - value, value))
-    return error, error / jnp.where((error == 0) & (size == 0), 1, size)
 
 
 def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c d d"]:

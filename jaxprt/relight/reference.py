@@ -1,6 +1,6 @@
 """Direct light integrated over every texel with the BRDF itself: slow, and the yardstick of every error here."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -164,7 +164,9 @@ def _blocks(texel: Array) -> Array:
     return jnp.moveaxis(block, (2, 4), (0, 1)).reshape(edge, edge, -1, *texel.shape[3:])
 
 
-def _vary(gray: Array, flux: Array, scale: Array, wi: Sequence[Array], mirror: Array, height: Array, error: Array) -> Array:
+def _vary(
+    gray: Array, flux: Array, scale: Array, wi: Sequence[Array], mirror: Array, height: Array, error: Array
+) -> Array:
     """First cells of whose texels the BRDF at the center tells too little.
 
     The middle of an interval errs by f'' / 24, and of a product by f' g' / 12 too; the horizon adds an eighth of a

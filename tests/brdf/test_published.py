@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, Lafortune, Lambert, published, separable
+from jaxprt.brdf import AshikhminShirley, Lafortune, Lambert, published
+from jaxprt.brdf.errors import sample_error
 from jaxprt.linalg import eigen
 from jaxprt.sphere import hemisphere
 
@@ -193,5 +194,5 @@ def test_more_terms_than_texels_and_other_than_reciprocal_brdfs_are_refused():
 def test_sample_error_falls_with_the_terms_of_a_smooth_brdf():
     brdf = published.brown_plastic()
     factored = published.factor_symmetric(brdf, terms=8, resolution=16)
-    errors = [float(separable.sample_error(brdf, each)[1]) for each in (factored, factored.keep(1))]
+    errors = [float(sample_error(brdf, each)[1]) for each in (factored, factored.keep(1))]
     assert errors[0] < errors[1] < 1

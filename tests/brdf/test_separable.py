@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, separable
+from jaxprt.brdf.errors import light_errors, sample_error
 from jaxprt.sphere import hemisphere
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
@@ -131,11 +132,11 @@ def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_do
     sun = Environment(jnp.full((6, 8, 8, 3), 0.1).at[2, 3, 5].set(30.0))
     brdf = AshikhminShirley(nu=10, nv=10)
     by_prior = separable.factor(brdf, error=0.4, resolution=24)
-    assert separable.light_errors(brdf, by_prior, sun)[-1] > 2 * by_prior.error
+    assert light_errors(brdf, by_prior, sun)[-1] > 2 * by_prior.error
     chosen = separable.factor(brdf, error=0.4, light=[sun], resolution=24)
     assert chosen.error <= 0.4
     assert chosen.terms > by_prior.terms
-    errors = separable.light_errors(brdf, chosen, sun, frames=50, views=20)  # others than it was chosen by
+    errors = light_errors(brdf, chosen, sun, frames=50, views=20)  # others than it was chosen by
     assert errors.shape == (chosen.terms,)
     assert errors[-1] < 0.5
     with pytest.raises(ValueError, match=r"lights must be at least one and come with error, got 1 and terms=3"):
@@ -143,23 +144,23 @@ def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_do
 
 
 def test_sample_error_of_closed_forms():
-    error, relative = separable.sample_error(_constant(0.5), _constant(0.3))
+    error, relative = sample_error(_constant(0.5), _constant(0.3))
     np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
     # sqrt(mean of cos_i^3 / mean of cos_i) = sqrt(1/2), and views weigh alike: sqrt(mean of cos_o^2) = sqrt(1/3).
     samples = 5e-3
-    incident = separable.sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
+    incident = sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
     assert incident[0] == pytest.approx(np.sqrt(0.5), rel=samples)
     assert incident[1] == pytest.approx(1)
-    view = separable.sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
+    view = sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
     assert view[0] == pytest.approx(np.sqrt(1 / 3), rel=samples)
 
 
 def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
-    first, second = (separable.sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
+    first, second = (sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
     assert first == second
-    assert separable.sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
+    assert sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
     with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
-        separable.sample_error(WANG, WANG, samples=0)
+        sample_error(WANG, WANG, samples=0)
 
 
 def test_factoring_again_with_other_rounding_finds_the_same_factors_in_the_same_order_and_signs():
