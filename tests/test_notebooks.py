@@ -39,7 +39,7 @@ def _texts(value: object) -> list[str]:
 
 
 @pytest.fixture
-def small(coarse, monkeypatch):
+def small(coarse, unchecked, monkeypatch):
     """The small size, the folder and the drawing of a notebook that runs in this process, and its caches after it."""
     monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
     monkeypatch.chdir(FOLDER)

@@ -9,7 +9,6 @@ transport has a term for them. The set is gray where its BRDFs are; of colored o
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -221,16 +220,24 @@ def decompose(
     count, colors = tensor.shape[:2]
     inside = np.flatnonzero(np.asarray(weight))
     check_ranks(ranks, (count * colors, len(inside), tensor.shape[3]))
-    core, along, view, light, error = _decomposed(tensor, to_map, weight, whole, inside, ranks=tuple(ranks))
-    return DynamicBrdf(core, along, view, light, *rest, error, coordinates)
+    flat, met = _met(tensor, weight, inside)
+    found = tucker.oriented(tucker.truncated(met, ranks=tuple(ranks)))
+    core, along, view, light, error = _maps(found, flat, met, to_map, weight, whole, inside)
+    return DynamicBrdf(core, along.reshape(count, colors, -1), view, light, *rest, error, coordinates)
 
 
-@partial(jax.jit, static_argnames=("ranks",))
-def _decomposed(tensor: Array, to_map: Array, weight: Array, whole: Array, inside: Array, *, ranks: tuple) -> tuple:
-    count, colors = tensor.shape[:2]
-    flat = tensor.reshape(count * colors, *tensor.shape[2:])
-    met = flat[:, inside] * weight[inside, None]
-    found = tucker.oriented(tucker.truncated(met, ranks=ranks))
+@jax.jit
+def _met(tensor: Array, weight: Array, inside: Array) -> tuple[Array, Array]:
+    """The tensor with BRDFs and colors in one mode, whole and with the weights of the views that have one."""
+    flat = tensor.reshape(-1, *tensor.shape[2:])
+    return flat, flat[:, inside] * weight[inside, None]
+
+
+@jax.jit
+def _maps(
+    found: tucker.Tucker, flat: Array, met: Array, to_map: Array, weight: Array, whole: Array, inside: Array
+) -> tuple[Array, ...]:
+    """Core, factor of the set, view maps and light maps of a decomposition, and their error."""
     core, (along, _, across) = found.core, found.factor
     seen = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, view, k]
     unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)
@@ -240,11 +247,16 @@ def _decomposed(tensor: Array, to_map: Array, weight: Array, whole: Array, insid
     light = jnp.linalg.pinv(square, rtol=_RANK**2, hermitian=True) @ jnp.einsum("mdk,mdb->kb", made, met)
     left = jnp.vdot(met, met) - jnp.vdot(light, square @ light)
     # Light maps carry the size, so that what compresses transport knows what each is worth.
-    size = jnp.sqrt(jnp.diagonal(square) / (jnp.sum(weight**2) * count * colors))
+    size = jnp.sqrt(jnp.diagonal(square) / (jnp.sum(weight**2) * len(flat)))
     edge = math.isqrt(len(weight))
-    core, along = core / jnp.where(size > 0, size, 1), along.reshape(count, colors, -1)
     view, light = (each.reshape(-1, edge, edge) for each in (view.T, size[:, None] * light @ to_map))
-    return core, along, view, light, jnp.sqrt(jnp.maximum(left, 0) / jnp.where(whole > 0, whole, 1))
+    return (
+        core / jnp.where(size > 0, size, 1),
+        along,
+        view,
+        light,
+        jnp.sqrt(jnp.maximum(left, 0) / jnp.where(whole > 0, whole, 1)),
+    )
 
 
 def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> int:
