@@ -1,6 +1,7 @@
 """How far a factored BRDF is from the BRDF itself: in the radiance under a light, and over pairs of directions."""
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,21 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
 
 
+@runtime_checkable
+class Terms(Protocol):
+    """The two factors of each term, as `jaxprt.brdf.separable.SeparableBrdf` has them."""
+
+    def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
+        """Light factors."""
+        ...
+
+    def view(self, wo: Float[Array, "*b 3"]) -> Float[Array, "*b r c"]:
+        """View factors."""
+        ...
+
+
 def light_errors(
-    brdf: Callable, factored: Callable, light: Environment, *, frames: int = 32, views: int = 32
+    brdf: Callable, factored: Terms, light: Environment, *, frames: int = 32, views: int = 32
 ) -> Float[Array, " r"]:
     """Relative L2 error of the radiance that vertices reflect under a light, without shadows, by number of terms.
 
@@ -21,7 +35,7 @@ def light_errors(
 
     Args:
         brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: Its terms, a `jaxprt.brdf.separable.SeparableBrdf`.
+        factored: Its terms.
         light: One environment.
         frames: Number of normals.
         views: Number of views for each.
@@ -38,11 +52,11 @@ def light_errors(
 
 
 @jax.jit
-def _light_errors(brdf: Callable, factored: Callable, light: Environment, normal: Array, view: Array) -> Array:
+def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
     size = light.radiance.shape[1]
     direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
     table = light.radiance.reshape(len(direction), -1)
-    factor = factored.view(view)  # pyright: ignore[reportFunctionMemberAccess]
+    factor = factored.view(view)
 
     def one(axes):
         wi = directions.to_local(axes, direction)
