@@ -169,6 +169,7 @@ def frames(scene: Scene, published: Published):
     lit = direct.light_side(transport, scene.triples[0].light, texels=TEXELS)
     bounced = relight.light_side(tensor, scene.triples[0].light)
     arrived = relight.arriving(transport, tensor, bounced, scene.materials[0])
+    samples = [relight_dynamic.samples_for(triple, transport.size) for triple in scene.triples]
     turn = itertools.count()
 
     def frame(matter: bool, light: bool):
@@ -182,7 +183,7 @@ def frames(scene: Scene, published: Published):
         if matter:
             comes = relight.arriving(transport, tensor, bounce, now)
         reflected = relight.combine(transport, comes, relight.view_side(transport, view))
-        return direct.combine(transport, sun, view) + reflected
+        return direct.combine(transport, sun, view, samples=samples[number if matter else 0]) + reflected
 
     yield "V", lambda: frame(False, False), published.fps[0]
     yield "V&B", lambda: frame(True, False), published.fps[1]
@@ -207,8 +208,15 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
     for number, triple in enumerate(scene.triples):
         camera = camera_of(scene, triple)
         eye = camera.eye
+        samples = relight_dynamic.samples_for(triple, scene.transport.size)
         color = direct.radiance(
-            scene.transport, scene.brdfs, scene.materials[number], triple.light, eye=eye, texels=TEXELS
+            scene.transport,
+            scene.brdfs,
+            scene.materials[number],
+            triple.light,
+            eye=eye,
+            texels=TEXELS,
+            samples=samples,
         )
         mine = [np.asarray(image.render(scene.mesh, jnp.asarray(each), camera, background=None))
                 for each in (color, *reflected(scene, scene.tensor, number))]  # fmt: skip

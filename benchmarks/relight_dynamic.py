@@ -31,6 +31,7 @@ import numpy as np
 from benchmarks import compression, harness
 from jaxprt.brdf import CookTorrance, Lambert, dynamic, navigation, published, separable
 from jaxprt.image import raster
+from jaxprt.relight import direct as direct_light
 from jaxprt.relight import dynamic as relight
 from jaxprt.relight import reference
 from jaxprt.scene import Environment, Mesh, builtin, camera, environment, load_mesh
@@ -122,6 +123,7 @@ def measure_scene(scene: Published, sets: list, fitted: list, plane, quick: bool
 def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: list[Triple], more: dict, quick: bool):
     """Frames and errors by one set."""
     first = relight.light_side(transport, triples[0].light, texels=TEXELS)
+    samples = [samples_for(triple, transport.size) for triple in triples]
     material = [materials(plane, triple, scene.adjustable) for triple in triples]
     turn = itertools.count()
 
@@ -130,7 +132,7 @@ def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: 
         eye = jnp.asarray(triples[number if view else 0].eye)
         lit = relight.light_side(transport, triples[number].light, texels=TEXELS) if light else first
         seen = relight.view_side(transport, brdfs, material[number if matter else 0], eye=eye)
-        return relight.combine(transport, lit, seen)
+        return relight.combine(transport, lit, seen, samples=samples[number if matter else 0])
 
     found = errors(mesh, transport, brdfs, triples, material, quick)
     count = brdfs[0].lobe.lobes
@@ -180,6 +182,12 @@ def materials(plane, triple: Triple, adjustable: int) -> list:
     return [first, second if adjustable == 2 else None]
 
 
+def samples_for(triple: Triple, size: int) -> int:
+    """Points along the edge of the single texels that a triple's BRDF needs."""
+    f0, roughness = triple.coordinate.tolist()
+    return direct_light.samples_for(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), size=size)
+
+
 def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict[float, list]:
     """Of the triples of each roughness the error, the part of the BRDF, and that of the diffuse part."""
     number = np.random.default_rng(1).permutation(len(mesh.position))[: 40 if quick else 600]
@@ -198,9 +206,10 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
     for number, (triple, matter) in enumerate(zip(triples, material, strict=True)):
         f0, roughness = triple.coordinate.tolist()
         eye = jnp.asarray(triple.eye)
-        color = relight.radiance(transport, brdfs, matter, triple.light, eye=eye, texels=TEXELS)
+        options = {"eye": eye, "texels": TEXELS, "samples": samples_for(triple, transport.size)}
+        color = relight.radiance(transport, brdfs, matter, triple.light, **options)
         dull = [each and relight.Material(each.share, each.diffuse, 0 * each.specular) for each in matter]
-        matte = relight.radiance(transport, brdfs, dull, triple.light, eye=eye, texels=TEXELS)
+        matte = relight.radiance(transport, brdfs, dull, triple.light, **options)
         white = exact(Lambert(1.0), triple)
         glossy = exact(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), triple)
         fitted = exact(brdfs[0].at(matter[0].share), triple)

@@ -79,6 +79,7 @@ def radiance(
     *,
     eye: Float[Array, "3"],
     texels: int = 16,
+    samples: int = 1,
 ) -> Float[Array, "v c"]:
     """Radiance that each vertex sends to the eye, of direct light and of light that other surfaces reflect.
 
@@ -90,6 +91,7 @@ def radiance(
         light: Directly by its texels, reflected by coarser ones.
         eye: Position of the viewer in world units.
         texels: How many light the vertices one by one.
+        samples: Points along the edge of each of them, see `jaxprt.relight.dynamic.radiance`.
 
     Returns:
         Linear radiance per vertex in the light's units. Differentiable in the light, the eye and the materials.
@@ -102,7 +104,8 @@ def radiance(
     Reference: Sun et al. 2007, equations 3 and 4.
     """
     view = dynamic.view_side(transport, brdfs, materials, eye=eye)
-    direct = dynamic.combine(transport, dynamic.light_side(transport, light, texels=texels), view)
+    lit = dynamic.light_side(transport, light, texels=texels)
+    direct = dynamic.combine(transport, lit, view, samples=samples)
     arrived = arriving(transport, tensor, light_side(tensor, light), materials)
     return direct + combine(transport, arrived, view_side(transport, view))
 
