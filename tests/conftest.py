@@ -92,16 +92,21 @@ def data() -> pathlib.Path:
 
 @pytest.fixture(scope="module")
 def coarse() -> Iterator[None]:
-    """For one file, lobes and factors are fitted to BRDFs at fewer directions; the code that fits them is the same."""
-    from jaxprt.brdf import lobe_em, paths, reflected
+    """For one file, BRDFs are fitted and tabulated at fewer directions; the code that does it is the same."""
+    from jaxprt.brdf import harmonic, lobe_em, paths, reflected
 
-    fewer = {"RINGS": 20, "SECTORS": 28}
+    fewer = {
+        lobe_em: {"RINGS": 20, "SECTORS": 28},
+        reflected: {"_RINGS": 20, "_SECTORS": 28},
+        paths: {"_RINGS": 20, "_SECTORS": 28},
+        harmonic: {"_RULES": ((16, 48), (20, 64)), "_ANGLES": (48,), "_EDGES": (16,), "_PROBES": 8, "_ERROR": 0.5},
+    }
     with pytest.MonkeyPatch.context() as patch:
         jax.clear_caches()  # Programs hold the numbers that they were compiled with.
         reflected._dual.cache_clear()
-        for room, prefix in ((lobe_em, ""), (reflected, "_"), (paths, "_")):
-            for name, value in fewer.items():
-                patch.setattr(room, prefix + name, value)
+        for room, values in fewer.items():
+            for name, value in values.items():
+                patch.setattr(room, name, value)
         yield
     jax.clear_caches()
     reflected._dual.cache_clear()

@@ -125,9 +125,7 @@ def test_constant_light_through_the_whole_system_is_the_albedo(lambert, degree):
     table = HarmonicBrdf(table.table * albedo.astype(np.float32)[:, None], (), table.error)
     light = harmonic.project(WHITE, degree=degree)
     color = np.asarray(harmonic.unshadowed_radiance(mesh, table, light, eye=EYE))
-    seen = color[:, 0] != 0
-    assert 10 < seen.sum() < len(seen)
-    np.testing.assert_allclose(color[seen], np.tile(albedo, (seen.sum(), 1)), atol=1e-3)
+    np.testing.assert_allclose(color, np.tile(albedo, (len(color), 1)), atol=1e-3)
     transport = precompute(mesh, degree=degree, size=SIZE, progress=False)
     through = np.asarray(harmonic.radiance(transport, table, light, eye=EYE))
     np.testing.assert_allclose(through, color, atol=FURNACE)
@@ -214,10 +212,12 @@ def test_a_sun_in_one_texel_rings_and_windows_calm_it(degree):
 
 def test_negative_radiance_is_returned_and_windows_lessen_it(mirror):
     mesh = builtin.sphere(rings=12, sectors=20)
+    facing = np.sum(np.asarray(mesh.normal * (EYE - mesh.position)), 1) > 0
     light = harmonic.project(sun(), degree=4)
     counts, energies = [], []
     for factor in (jnp.ones(5), harmonics.lanczos(degree=4), harmonics.hann(degree=4)):
         color = np.asarray(harmonic.unshadowed_radiance(mesh, mirror, harmonics.convolve(light, factor), eye=EYE))
+        color = color[facing]
         assert np.isfinite(color).all()
         counts.append(int((color < -1e-3 * color.max()).sum()))
         energies.append(float(-color[color < 0].sum() / np.abs(color).sum()))
@@ -293,7 +293,7 @@ def test_views_below_the_horizon_see_what_grazing_views_see_with_and_without_tra
             harmonic.radiance(transport, lambert, light, eye=eye),
             harmonic.unshadowed_radiance(mesh, lambert, light, eye=eye),
         ):
-            np.testing.assert_allclose(color, 0.5, rtol=FURNACE)
+            np.testing.assert_allclose(color, 1, rtol=FURNACE)
 
 
 def test_one_coefficient_is_the_mean_of_the_light():

@@ -7,7 +7,6 @@ import pathlib
 import re
 import sys
 
-import jax
 import matplotlib
 import matplotlib.pyplot as plt
 import pytest
@@ -40,14 +39,13 @@ def _texts(value: object) -> list[str]:
 
 @pytest.fixture
 def small(coarse, unchecked, monkeypatch):
-    """The small size, the folder and the drawing of a notebook that runs in this process, and its caches after it."""
+    """The small size, the folder and the drawing of a notebook that runs in this process."""
     monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
     monkeypatch.chdir(FOLDER)
     monkeypatch.setattr("sys.path", [*sys.path])
     monkeypatch.setattr(plt, "show", lambda: None)
     with matplotlib.rc_context({"backend": "agg"}):
         yield
-    jax.clear_caches()
     gc.collect()  # Its temporary folders warn when they go, here rather than in another test.
 
 

@@ -52,6 +52,7 @@ def _brdf(value: Any) -> None:
 
 def _environment(value: Any) -> None:
     require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+    require.finite("the light", value.radiance)
 
 
 @require.arguments(light=_environment)

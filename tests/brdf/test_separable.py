@@ -5,6 +5,7 @@ import pytest
 
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, separable
 from jaxprt.brdf.errors import light_errors, sample_error
+from jaxprt.scene import Environment
 from jaxprt.sphere import hemisphere
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
@@ -60,9 +61,10 @@ def test_all_terms_reproduce_every_texel():
 def test_error_falls_with_the_terms_and_names_them():
     errors = [float(separable.factor(WANG, terms=k, resolution=16).error) for k in (1, 4, 16)]
     assert errors[0] > errors[1] > errors[2]
-    factored = separable.factor(WANG, error=errors[1], resolution=16)
+    asked = 1.001 * errors[1]  # Iterations for other numbers of terms round otherwise.
+    factored = separable.factor(WANG, error=asked, resolution=16)
     assert factored.terms == 4
-    assert factored.error <= errors[1]
+    assert factored.error <= asked
 
 
 def test_kept_terms_are_the_leading_ones():

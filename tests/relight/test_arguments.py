@@ -71,7 +71,7 @@ BROKEN = jnp.ones((9, 3)).at[4, 1].set(jnp.nan)
         (lambda: harmonic.diffuse_radiance(VECTOR, jnp.ones(()), BROKEN), "the light must be finite"),
         (lambda: harmonic.transferred_light(MATRIX, BROKEN), "the light must be finite"),
         (lambda: harmonic.local_light(MATRIX.frame, BROKEN), "the light must be finite"),
-        (lambda: harmonic.project(Environment(LIGHT.radiance * jnp.nan), degree=2), "the light must be finite"),
+        (lambda: harmonic.project(Environment(LIGHT.radiance * jnp.nan), degree=2), "radiance must be finite"),
         (lambda: harmonic.probe_light(POINT, POINT * jnp.nan, jnp.ones((2, 9, 3))), "probes must be finite"),
         (lambda: harmonic.probe_light(POINT, POINT, BROKEN[None]), "the light at the probes must be finite"),
         (lambda: harmonic.probe_light(POINT, POINT[:0], jnp.ones((0, 9, 3))), "there must be at least one probe"),

@@ -130,8 +130,7 @@ def test_unshadowed_radiance_is_the_integral_of_light_times_table(random):
     radius = np.sqrt(1 - node**2)[:, None]
     wi = np.stack([radius * np.cos(angle), radius * np.sin(angle), node[:, None] + 0 * angle], -1).reshape(-1, 3)
     arriving = np.asarray(harmonics.reconstruct(light, jnp.asarray(wi, jnp.float32)))
-    wo = directions.normalize(EYE - mesh.position)
-    wo = jnp.einsum("vij,vj->vi", matrix.frame, wo)
+    wo = directions.view(harmonic.right_handed(matrix.frame), mesh.position, EYE)
     color = harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE)
     for vertex in range(5):
         local = jnp.asarray(wi @ np.asarray(matrix.frame[vertex]).T, jnp.float32)

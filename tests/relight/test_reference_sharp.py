@@ -119,4 +119,4 @@ def test_rough_brdfs_need_one_point_and_mirrors_many():
     assert needed == sorted(needed)
     assert needed[-1] > 2
     with pytest.raises(ValueError, match="error must be positive, got 0"):
-        direct.samples_for(AshikhminShirley(), error=0)
+        direct.samples_for(AshikhminShirley(), error=0.0)
