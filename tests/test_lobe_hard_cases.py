@@ -172,7 +172,7 @@ VISIBLE = {
     "slit": lambda x, y, z: (z > 0) & (abs(x) < 0.07),
     "half": lambda x, y, z: (z > 0) & (x > 0),
 }
-HEIGHT = np.radians([0, 30, 60, 80, 89.9])  # of the eye, from the normal
+HEIGHT = np.radians([0, 30, 60, 80, 89.4])  # of the eye, from the normal; lower ones are raised
 
 
 @pytest.fixture(scope="module")

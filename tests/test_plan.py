@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -108,7 +109,8 @@ def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(mesh, 
     sky = np.ones((6, 8, 8, 3), np.float32)
     damaged = sky.copy()
     damaged[2, 3, 4, 1] = value
-    lights = [Environment(jnp.asarray(each)) for each in (sky, damaged)]
+    whole = Environment(jnp.asarray(sky))
+    lights = [whole, jax.tree.map(lambda _: jnp.asarray(damaged), whole)]  # as a computation that went wrong makes it
     with pytest.raises(ValueError, match=r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)"):
         make(mesh, BRDF, lights, error=ASKED, progress=False)
 
