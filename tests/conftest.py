@@ -14,9 +14,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Its threads, in jax's QR, wait by spinning beside other processes.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and 3 % of the time
-# Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Notebooks and
-# programs, which compute more, inherit a little of it once jax has read what is for tests.
-# Splitting small programs for several compiling threads costs a fifth of the time of compiling them.
+# Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Splitting small
+# programs for several compiling threads costs a fifth of the time of compiling them.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1",
@@ -27,9 +26,6 @@ import jaxtyping
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-
-jax.devices()
-os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace("optimization_level=0", "optimization_level=1")
 
 # Compiling the package's source anew takes each process that tests start a second, and workers three.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -119,7 +119,7 @@ def test_all_coefficients_and_the_view_maps_make_the_radiance_of_a_sum_in_float6
     assert transport.value.shape == (384, 6, 3, 3 if per_color else 1)
     light = Environment(jnp.asarray(random.uniform(size=(6, 8, 8, 3)), jnp.float32))
     eye = jnp.array([3.0, 5, -2])
-    wo = directions.normalize(jnp.einsum("vij,vj->vi", frame, eye - position))
+    wo = directions.view(frame, position, eye)
     met = direct_sum(seen, frame, brdf, light.radiance.reshape(-1, 3), 8)
     expected = np.sum(met * np.asarray(brdf.view(wo), np.float64), 1)
     close(prt.relight.separable.radiance(transport, brdf, light, eye=eye), expected, tolerance=EXACT)
