@@ -53,7 +53,7 @@ def direct_sum(seen, frame, brdf, light, size):
         length = np.linalg.norm(point, axis=1, keepdims=True)
         for vertex, axes in enumerate(frame):
             local = point / length @ axes.T
-            coordinates = (local[:, :2] / (1 + np.maximum(local[:, 2:], 0)) + 1) / 2
+            coordinates = np.asarray(brdf.coordinates(jnp.asarray(local, jnp.float32)), np.float64)
             place = coordinates[:, ::-1].T * light_map.shape[1] - 0.5
             flux = np.maximum(local[:, 2], 0) / length[:, 0] ** 3 / size**2 * seen[vertex] / 16
             for term, color in np.ndindex(brdf.terms, light_map.shape[-1]):
