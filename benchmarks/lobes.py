@@ -59,6 +59,7 @@ def measure(quick: bool):
     batch = Environment(jnp.stack([light.radiance for light in lights]))
     for material, brdf in list(MATERIALS.items())[2:3] if quick else MATERIALS.items():
         exact = radiance(brdf, seen, visible, batch, views)
+        samples = texels.samples_for(brdf)
         factored = separable.factor(brdf, terms=16, resolution=24 if quick else 64)
         peer = radiance(factored, seen, visible, batch, views)
         for count in (3,) if quick else COUNTS:
@@ -74,10 +75,10 @@ def measure(quick: bool):
                 more = [radiance(most.keep(number), seen, visible, rest, views) for number in terms]
             for number, (name, light) in enumerate(zip(names, lights, strict=True)):
 
-                def frame(eye=views[0], table=table, light=light, brdf=brdf):
+                def frame(eye=views[0], table=table, light=light, brdf=brdf, samples=samples):
                     texel, excess, rest = texels.split(light, count=SUN)
                     color = lobe.radiance(transport, table, rest, eye=eye)
-                    return color + texels.radiance(transport, brdf, texel, excess, eye=eye)
+                    return color + texels.radiance(transport, brdf, texel, excess, eye=eye, samples=samples)
 
                 color = np.stack([frame(eye) for eye in views])
                 known = np.stack([height(visible, eye) > 0 for eye in views])
