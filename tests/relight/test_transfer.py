@@ -171,19 +171,17 @@ def test_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, 
     np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-6)
 
 
-def test_radiance_by_light_and_material_is_finite_differences(transport, tensor, brdfs):
+def test_reflected_radiance_by_light_and_material_is_finite_differences(transport, tensor, brdfs):
+    """That of direct light is differentiated beside it in `test_dynamic` and, with this, in `test_contract`."""
     lamp, direction = light(), light(1).radiance - 0.5
 
     def mean(step, color, share):
-        lights = Environment(lamp.radiance + step * direction)
-        return jnp.mean(
-            relight.radiance(
-                transport, tensor, brdfs, [Material(share, color, 0.6), None], lights, eye=EYE, texels=0
-            )
-        )  # fmt: skip
+        now, lights = [Material(share, color, 0.6), None], Environment(lamp.radiance + step * direction)
+        view = relight.view_side(transport, direct.view_side(transport, brdfs, now, eye=EYE))
+        arrived = relight.arriving(transport, tensor, relight.light_side(tensor, lights), now)
+        return jnp.mean(relight.combine(transport, arrived, view))
 
     at = (jnp.array(0.0), jnp.array([0.4, 0.3, 0.2]), jnp.array([0.3, 0.7]))
-    # With texels=0 nothing chooses by values, so that all of it compiles as one.
     both = jax.jit(jax.value_and_grad(mean, (0, 1, 2)))
     slope = both(*at)[1]
     for number, step in ((0, jnp.array(0.05)), (1, jnp.array([0.02, 0.0, 0.01]))):
