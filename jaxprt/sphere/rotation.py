@@ -324,18 +324,16 @@ def _signed_multiples(cosine: Array, sine: Array, degree: int, axes: int) -> tup
 
 @functools.lru_cache(maxsize=128)
 def _quarter_turn(l: int) -> np.ndarray:
-    """D of the turn about x that takes z to y, for one band; by a quadrature that is exact for it.
+    """D of the turn about x that takes z to y, for one band: the exponential of a quarter circle times L_x.
 
-    It keeps parity in x and exchanges those in y and z, so that a quarter of its entries are not zero.
+    The eigenvalues of i L_x are whole numbers, so that only its eigenvectors are rounded. The turn keeps parity in x
+    and exchanges those in y and z, so that a quarter of its entries are not zero.
     """
-    node, weight = np.polynomial.legendre.leggauss(l + 1)
-    angle = np.pi * np.arange(2 * l + 1) / (l + 0.5)
-    radius = np.sqrt(1 - node**2)
-    height = np.broadcast_to(node[:, None], (l + 1, 2 * l + 1))
-    direction = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), height], axis=-1)
-    back = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # The inverse turn; it takes y to z.
-    here = harmonics._basis(np, direction, l)[l * l :]
-    there = harmonics._basis(np, direction @ back.T, l)[l * l :]
-    matrix = np.einsum("aij,bij,i->ab", here, there, weight * np.pi / (l + 0.5), optimize=True)
+    generator = np.zeros((2 * l + 1, 2 * l + 1))
+    for m in range(-l, l + 1):
+        for other, by_x, _ in _ladder(l, m):
+            generator[l + m, l - other] = by_x
+    order, vector = np.linalg.eigh(1j * generator)
+    matrix = ((vector * 1j ** np.round(order)) @ vector.conj().T).real
     matrix[np.abs(matrix) < 1e-12] = 0
     return matrix
