@@ -12,6 +12,8 @@ from jaxprt.scene import Camera, Mesh
 
 POSITION_TOLERANCE = 2e-5  # Relative to the scene: float32 rounding, times the slope of what is seen at grazing angles.
 
+_project, _view_axes = jax.jit(raster._project), jax.jit(raster.view_axes)
+
 
 def _mesh(position, face):
     """A mesh, padded by triangles without area so that most tests share one compilation."""
@@ -74,7 +76,7 @@ def _traced(position, face, camera):
     v = np.sum(np.cross(hit, c - a) * normal, -1) / square
     w = np.sum(np.cross(b - a, hit) * normal, -1) / square
     edge = np.minimum(np.minimum(v, w), 1 - v - w)
-    forward = np.asarray(raster.view_axes(camera), np.float64)[2]
+    forward = np.asarray(_view_axes(camera), np.float64)[2]
     depth = np.where((edge > 0) & (t > 0), t * (ray[..., 0, :] @ forward)[:, None], np.inf)
     two = np.sort(depth, -1)[:, :2]
     with np.errstate(invalid="ignore"):
@@ -92,7 +94,7 @@ def test_each_pixel_of_a_tessellated_square_belongs_to_exactly_one_triangle():
     x, y = np.append(x, [0, 0, 64, 64]), np.append(y, [0, 48, 0, 48])
     face = Delaunay(np.stack([x, y], -1)).simplices
     position = _on_pixels(x, y, camera)
-    np.testing.assert_array_equal(raster._project(jnp.asarray(position, jnp.float32), camera)[0] + 32, x)
+    np.testing.assert_array_equal(np.asarray(_project(jnp.asarray(position, jnp.float32), camera)[0]) + 32, x)
     flipped = np.where(rng.random((len(face), 1)) < 0.5, face, face[:, ::-1])
     count = sum(np.asarray(raster.rasterize(_mesh(position, t[None]), camera).triangle == 0, int) for t in flipped)
     np.testing.assert_array_equal(count, 1)
@@ -155,7 +157,7 @@ def test_an_interpolated_position_lies_on_its_pixels_ray():
     seen = np.asarray(fragments.triangle >= 0)
     point = raster.interpolate(fragments, mesh.face, mesh.position)
     ray = raster.ray_direction(camera)
-    forward = raster.view_axes(camera)[2]
+    forward = _view_axes(camera)[2]
     expected = camera.eye + ray * (fragments.depth / (ray @ forward))[..., None]
     assert seen.mean() > 0.5
     np.testing.assert_allclose(point[seen], expected[seen], atol=8 * POSITION_TOLERANCE)
@@ -257,7 +259,7 @@ def test_the_camera_has_up_above_and_right_at_the_right():
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -3), (0, 0, 0)])
 def test_an_up_along_the_view_still_gives_a_picture(up):
     camera = _camera(up=up)
-    axes = raster.view_axes(camera)
+    axes = _view_axes(camera)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-6)
     position, face = _box()
     assert np.any(raster.rasterize(_mesh(position, face), camera).triangle >= 0)
