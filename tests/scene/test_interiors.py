@@ -37,6 +37,16 @@ def make(name):
     }[name]()
 
 
+@functools.cache
+def occluder(name):
+    return visibility.Occluder(make(name))
+
+
+@functools.cache
+def starts(name):
+    return visibility.start_points(make(name), occluder(name))
+
+
 each_scene = pytest.mark.parametrize("name", ["sides", "room", "corner", "ring"])
 
 
@@ -62,13 +72,12 @@ def regions(mesh, numbers):
     return join([part for number, part in enumerate(split(mesh)) if number in numbers])
 
 
-def rays(mesh, *, count=64):
+def rays(name, *, count=64):
     """Starts and directions of rays from every vertex, above its horizon; none along the lines of a grid."""
-    start = visibility.start_points(mesh, visibility.Occluder(mesh))
     direction = np.random.default_rng(0).normal(size=(count, 3))
     direction = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
-    vertex, number = np.nonzero(np.asarray(mesh.normal) @ direction.T > 0.05)
-    return start[vertex], direction[number]
+    vertex, number = np.nonzero(np.asarray(make(name).normal) @ direction.T > 0.05)
+    return starts(name)[vertex], direction[number]
 
 
 @pytest.mark.parametrize(
@@ -110,10 +119,9 @@ def test_no_face_is_degenerate(name):
 @each_scene
 def test_from_no_vertex_is_the_back_of_a_surface_seen(name):
     """So none starts inside of a closed thing, or beneath a floor."""
-    mesh = make(name)
-    start, direction = rays(mesh)
-    triangle, _, _ = visibility.Occluder(mesh).hit(start, direction)
-    back = (surface(mesh).face_normals[triangle] * direction).sum(1) > 0
+    start, direction = rays(name)
+    triangle, _, _ = occluder(name).hit(start, direction)
+    back = (surface(make(name)).face_normals[triangle] * direction).sum(1) > 0
     assert np.mean(back & (triangle >= 0)) < BETWEEN
 
 
@@ -121,24 +129,21 @@ def test_from_no_vertex_is_the_back_of_a_surface_seen(name):
 def test_regions_relit_apart_see_what_they_see_together(name):
     """A vertex that lies in the plane of another region's faces would see nothing."""
     mesh = make(name)
-    rays = visibility.Occluder(mesh)
+    rays = occluder(name)
     parts = split(mesh)
     normal = np.concatenate([part.normal for part in parts])
     apart = np.concatenate([visibility.start_points(part, rays) for part in parts])
     together = visibility.start_points(join(parts), rays)
     moved = (apart != together).any(1)
-    starts = apart[moved], together[moved]
-    seen = [visibility.fractional(rays, start, normal[moved], size=8)[0].sum(1).astype(int) for start in starts]
+    both = apart[moved], together[moved]
+    seen = [visibility.fractional(rays, start, normal[moved], size=8)[0].sum(1).astype(int) for start in both]
     assert np.abs(seen[0] - seen[1]).max(initial=0) < APART * 16 * 3 * 8 * 8
 
 
 @pytest.mark.parametrize(("name", "share"), [("sides", 0.026), ("room", 0.27), ("corner", 0.025), ("ring", 0.027)])
 def test_few_vertices_see_no_light(name, share):
     """Those beneath the pieces and the ring; in the room those between furniture, and what looks away from windows."""
-    mesh = make(name)
-    occluder = visibility.Occluder(mesh)
-    start = visibility.start_points(mesh, occluder)
-    seen, _ = visibility.fractional(occluder, start, np.asarray(mesh.normal), size=8)
+    seen, _ = visibility.fractional(occluder(name), starts(name), np.asarray(make(name).normal), size=8)
     assert 0.9 * share < np.mean(seen.sum(1) == 0) < share
 
 
@@ -178,11 +183,10 @@ def test_the_room_is_open_at_the_front_and_the_window_only():
 
 
 def test_light_comes_into_the_room_through_the_front_and_the_window_only():
-    mesh = make("room")
-    start, direction = rays(mesh)
+    start, direction = rays("room")
     inside = start[:, 0] > -2
     start, direction = start[inside].astype(float), direction[inside].astype(float)
-    clear = ~visibility.Occluder(mesh).blocked(start.astype(np.float32), direction.astype(np.float32))
+    clear = ~occluder("room").blocked(start.astype(np.float32), direction.astype(np.float32))
     start, direction = start[clear], direction[clear]
     with np.errstate(divide="ignore"):
         ends = np.where(direction > 0, (np.array([2, 2.5, 2]) - start) / direction, ([-2, 0, -2] - start) / direction)
@@ -196,12 +200,12 @@ def test_light_comes_into_the_room_through_the_front_and_the_window_only():
 
 
 def test_the_sun_falls_through_the_window_on_rug_table_and_sofa():
-    mesh = make("room")
-    occluder = visibility.Occluder(mesh)
+    parts = split(make("room"))
     for number in (1, 6, 7):
-        part = split(mesh)[number]
-        start = visibility.start_points(part, occluder)
-        clear = ~occluder.blocked(start, np.broadcast_to(SUN, start.shape)) & (np.asarray(part.normal) @ SUN > 0.1)
+        part = parts[number]
+        start = visibility.start_points(part, occluder("room"))
+        blocked = occluder("room").blocked(start, np.broadcast_to(SUN, start.shape))
+        clear = ~blocked & (np.asarray(part.normal) @ SUN > 0.1)
         z = start[:, 2] + (start[:, 0] + 2) * SUN[2] / -SUN[0]
         assert np.mean(clear & (z < 1.2)) > 0.04
 
@@ -265,16 +269,15 @@ def test_no_vertex_of_the_table_is_beneath_the_ring():
 
 def test_the_sun_that_the_inside_of_the_ring_mirrors_gathers_on_the_table():
     mesh = make("ring")
-    occluder = visibility.Occluder(mesh)
     turns, heights, radius = 720, 60, 0.93
     turn, height = np.meshgrid((np.arange(turns) + 0.5) * 2 * np.pi / turns, (np.arange(heights) + 0.5) * 0.5 / heights)
     turn, height = turn.ravel(), height.ravel()
     normal = -np.stack([np.cos(turn), 0 * turn, np.sin(turn)], -1)
     place = -0.99 * radius * normal + np.stack([0 * turn, height + 0.003, 0 * turn], -1)
     cosine = normal @ SUN
-    lit = (cosine > 0) & ~occluder.blocked(place.astype(np.float32), np.broadcast_to(SUN, place.shape))
+    lit = (cosine > 0) & ~occluder("ring").blocked(place.astype(np.float32), np.broadcast_to(SUN, place.shape))
     direction = 2 * cosine[:, None] * normal - SUN
-    triangle, distance, _ = occluder.hit(place.astype(np.float32), direction.astype(np.float32))
+    triangle, distance, _ = occluder("ring").hit(place.astype(np.float32), direction.astype(np.float32))
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[triangle, 0]]
     x, y, z = (place + distance[:, None] * direction).T
     inside = lit & (triangle >= 0) & (region == 1) & (np.hypot(x, z) < radius)
