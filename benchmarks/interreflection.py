@@ -117,8 +117,8 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
     """Lines of one scene."""
     data = harness.data() / "meshes"
     real = data.is_dir() and not quick
-    glossy = load_mesh(data / f"{published.mesh}.ply") if real else builtin.sphere(rings=8, sectors=10)
-    mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 64)])
+    glossy = load_mesh(data / f"{published.mesh}.ply") if real else builtin.sphere(rings=10, sectors=12)
+    mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 100)])
     size = 64 if real else 16
     path = store and store / published.mesh
     transport = transports.precompute(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)

@@ -7,7 +7,6 @@ import pathlib
 import subprocess
 import sys
 
-import jax
 import pytest
 
 import jaxprt as prt
@@ -39,24 +38,24 @@ MOST_ERROR = {
 }
 
 
-@pytest.fixture
-def small(coarse, monkeypatch):
+@pytest.fixture(scope="module")
+def small(coarse):
     """Coarse tables where a benchmark leaves their size open, and blocks so short that quick cases have several."""
-    for room, name, options in (
-        (prt.brdf.separable, "factor", {"resolution": 12}),
-        (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1e-2}),
-        (prt.brdf.lobe, "tabulate", {"resolution": 12}),
-        (prt.brdf.paths, "factor", {"resolution": 12}),
-    ):
-        monkeypatch.setattr(room, name, functools.partial(getattr(room, name), **options))
-    for room, name, value in (
-        (prt.brdf.separable, "_BLOCK", 64),
-        (lobe, "_BLOCK", 64),
-        (raster, "CHUNK", 1024),
-    ):
-        monkeypatch.setattr(room, name, value)
-    yield
-    jax.clear_caches()  # Programs have these sizes in them.
+    with pytest.MonkeyPatch.context() as patch:
+        for room, name, options in (
+            (prt.brdf.separable, "factor", {"resolution": 12}),
+            (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1e-2}),
+            (prt.brdf.lobe, "tabulate", {"resolution": 12}),
+            (prt.brdf.paths, "factor", {"resolution": 12}),
+        ):
+            patch.setattr(room, name, functools.partial(getattr(room, name), **options))
+        for room, name, value in (
+            (prt.brdf.separable, "_BLOCK", 64),
+            (lobe, "_BLOCK", 64),
+            (raster, "CHUNK", 1024),
+        ):
+            patch.setattr(room, name, value)
+        yield  # Benchmarks share compiled programs, which have these sizes in them; `coarse` forgets them at the end.
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
