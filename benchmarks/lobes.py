@@ -60,9 +60,9 @@ def measure(quick: bool):
     for material, brdf in list(MATERIALS.items())[2:3] if quick else MATERIALS.items():
         exact = radiance(brdf, seen, visible, batch, views)
         samples = texels.samples_for(brdf)
-        factored = separable.factor(brdf, terms=16, resolution=24 if quick else 64)
+        factored = separable.factor(brdf, terms=16, resolution=12 if quick else 64)
         peer = radiance(factored, seen, visible, batch, views)
-        for count in (3,) if quick else COUNTS:
+        for count in (1,) if quick else COUNTS:
             start = time.perf_counter()
             table = lobes.tabulate(brdf, lobes=count, resolution=12 if quick else 32)
             fitted = time.perf_counter() - start
@@ -71,7 +71,7 @@ def measure(quick: bool):
                 terms = (2,) if quick else REMAINDER
                 rest = Environment(jnp.stack([texels.split(light, count=SUN)[2].radiance for light in lights]))
                 left = lobes.Remainder(brdf, table)
-                most = separable.factor(left, terms=max(terms), resolution=24 if quick else 64)
+                most = separable.factor(left, terms=max(terms), resolution=12 if quick else 64)
                 more = [radiance(most.keep(number), seen, visible, rest, views) for number in terms]
             for number, (name, light) in enumerate(zip(names, lights, strict=True)):
 
