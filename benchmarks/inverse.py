@@ -68,7 +68,7 @@ def main(options: Sequence[str] | None = None) -> None:
 
 def measure(quick: bool, store: pathlib.Path | None):
     """All lines."""
-    path, (size, edge, rings) = harness.data(), (16, 24, 10) if quick else (64, 256, 16)
+    path, (size, edge, rings) = harness.data(), (16, 32, 12) if quick else (64, 256, 16)
     real = path.is_dir() and not quick
     mesh = load_mesh(path / "meshes" / "stanford_bunny.ply") if real else builtin.sphere(rings=rings, sectors=2 * rings)
     sky = load_environment(path / "env" / "grace_cross.hdr", size=size) if real else builtin.daylight(size=size)
@@ -230,7 +230,7 @@ def materials(case: Case):
 def together(case: Case):
     """Light and material from three pictures, beside a ground of known color."""
     mesh, sky, views, lobes, exact, store, quick = case
-    ground = scene.mesh.ground_plane(mesh, vertices=64 if quick else 4000, extent=1.5)
+    ground = scene.mesh.ground_plane(mesh, vertices=200 if quick else 4000, extent=1.5)
     whole = scene.mesh.join([mesh, ground])
     light, size = band_limited(sky), sky.radiance.shape[1]
     coated = Coated(whole, lobes, size, DEGREE, store and store / "ground")

@@ -92,6 +92,23 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
 
 
+def within(name: str, value: Any, low: int, high: int) -> None:
+    """Refuses arrays with whole numbers outside a range.
+
+    Args:
+        name: What the numbers are, for the message: "the texels".
+        value: The array.
+        low: The least that is allowed.
+        high: The most that is allowed.
+
+    Raises:
+        ValueError: Some numbers are outside the range; says how many, and where the first one is.
+    """
+    if not isinstance(value, Tracer):
+        known = np.asarray(value)
+        _require(name, f"between {low} and {high}", known, np.asarray((known >= low) & (known <= high)))
+
+
 def length(name: str, value: Any, count: int) -> None:
     """Refuses an array with another number of rows.
 

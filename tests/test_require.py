@@ -89,3 +89,9 @@ def test_checked_arguments_are_known_before_the_function_is_compiled():
     with pytest.raises(ValueError, match="x must be finite"):
         double(x=jnp.asarray(jnp.nan))
     assert jnp.isnan(jax.jit(double)(jnp.asarray(jnp.nan)))
+
+
+def test_whole_numbers_outside_a_range_are_counted():
+    require.within("the texels", np.array([0, 383]), 0, 383)
+    with pytest.raises(ValueError, match=r"the texels must be between 0 and 383, got 2 of 3 .* first at \(0,\): -1"):
+        require.within("the texels", np.array([-1, 5, 384]), 0, 383)

@@ -71,7 +71,8 @@ def interpolate(
     seen = fragments.triangle >= 0
     vertex = face[jnp.maximum(fragments.triangle, 0)]
     wide = (*seen.shape, *(1,) * (attribute.ndim - 1))
-    weight = fragments.barycentric.astype(attribute.dtype)
+    floating = jnp.issubdtype(attribute.dtype, jnp.floating)
+    weight = fragments.barycentric.astype(attribute.dtype) if floating else fragments.barycentric
     total = sum(weight[..., i].reshape(wide) * attribute[vertex[..., i]] for i in range(3))
     return jnp.where(seen.reshape(wide), total, 0)
 

@@ -108,9 +108,17 @@ def radiance(
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    require.finite("the excess", excess)
+    excess = _checked(transport, texel, excess)
     require.position("the eye", eye)
     return _radiance(transport, brdf, texel, excess, eye, samples=samples)
+
+
+def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
+    """The excess as floating-point numbers, once texels and excess are those of one light of the transport's size."""
+    require.length("the rows of the excess", excess, len(texel))
+    require.finite("the excess", excess)
+    require.within("the texels", texel, 0, 6 * transport.size**2 - 1)
+    return jnp.asarray(excess, jnp.result_type(excess, transport.position))
 
 
 @partial(jax.jit, static_argnames=("samples",))
@@ -180,12 +188,23 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     return _SAMPLES[need]
 
 
-@jax.jit
 def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "v c"]:
     """Irradiance over pi of light from some texels: the radiance of white diffuse vertices, from any side.
 
-    Arguments as of `radiance`.
+    Args:
+        transport: Visibility of the vertices.
+        texel: Numbers of the texels.
+        excess: Radiance of each, as `split` returns it.
+
+    Raises:
+        ValueError: Texels that the transport's cubemap does not have, or excess that is not one row for each texel or
+            not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices.
     """
+    return _irradiance(transport, texel, _checked(transport, texel, excess))
+
+
+@jax.jit
+def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
     flux = _flux(transport.frame[:, 2].T, texel, transport.visible(texel), size=transport.size)
     return (excess.T @ flux).T / np.pi
 

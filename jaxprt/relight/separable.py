@@ -267,6 +267,7 @@ def modulate(
             f"terms must be one number for each of {weight.shape[1]} weights that add up to the tuple's "
             f"{view.shape[1]}, got {terms}"
         )
+    require.length("the vertices of the weights", weight, len(view))
     require.finite("the weights", weight)
     return _modulated(view, weight, terms=terms)
 

@@ -30,6 +30,14 @@ _CHUNK = 2**20  # Parts of pixels that are dealt out at a time.
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
+def _floating(radiance):
+    """Lists and whole numbers as floating-point arrays; the rest as it is."""
+    dtype = getattr(radiance, "dtype", None)
+    if dtype is None or jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_):
+        return jnp.asarray(radiance, jnp.result_type(float))
+    return radiance
+
+
 class Environment(eqx.Module):
     """Distant light: mean linear radiance of each cubemap texel.
 
@@ -40,7 +48,7 @@ class Environment(eqx.Module):
         radiance: Mean radiance over each texel, linear Rec. 709; leading axes, if any, are a batch of lights.
     """
 
-    radiance: Float[Array, "*l 6 n n c"]
+    radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=_floating)
 
     def __check_init__(self):
         """Refuses radiance that is not finite."""

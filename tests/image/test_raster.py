@@ -355,3 +355,10 @@ def test_another_number_of_colors_than_vertices_is_refused(shape):
 def test_a_mesh_without_triangles_is_refused():
     with pytest.raises(ValueError, match="got 0 triangles"):
         raster.rasterize(_mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), _camera())
+
+
+def test_colors_of_whole_numbers_are_drawn(unchecked):
+    mesh, color, camera = _scene()
+    whole = jnp.full(color.shape, 200, jnp.uint8)
+    seen = np.asarray(raster.rasterize(mesh, camera).triangle >= 0)
+    np.testing.assert_allclose(raster.render(mesh, whole, camera)[seen], 200, rtol=1e-5)

@@ -1,5 +1,7 @@
 """Bright texels one by one: what is taken out of a light, and that it lights as the light did."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -270,3 +272,24 @@ def test_slopes_are_those_of_the_reference(transport, sky, random, close):
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert np.any(other)
         close(one, other, tolerance=SLOPE)
+
+
+def test_texels_and_excess_of_whole_numbers_count_as_such_and_those_of_another_light_are_refused(
+    transport, close, unchecked
+):
+    """Whole numbers gave black, texels of a finer light those of others."""
+    texel = jnp.arange(16)
+    whole = jnp.full((16, 3), 2)
+    close(
+        direct.radiance(transport, GLOSSY, texel, whole, eye=EYE),
+        direct.radiance(transport, GLOSSY, texel, 2.0 * jnp.ones((16, 3)), eye=EYE),
+    )
+    most = 6 * transport.size**2
+    for call in (
+        partial(direct.irradiance, transport),
+        lambda *given: direct.radiance(transport, GLOSSY, *given, eye=EYE),
+    ):
+        with pytest.raises(ValueError, match=f"the texels must be between 0 and {most - 1}, got 1 of 16"):
+            call(texel + most - 15, jnp.ones((16, 3)))
+        with pytest.raises(ValueError, match="the excess must be finite"):
+            call(texel, jnp.full((16, 3), jnp.nan))

@@ -415,3 +415,11 @@ def test_real_environments_are_brighter_above(data, name):
     luminance = np.log(np.asarray(light.radiance).mean(-1) + 1e-4)
     # Half the sphere above the horizon, without the poles where tripods and lamps are.
     assert luminance[(y > 0.2) & (y < 0.8)].mean() > luminance[(y < -0.2) & (y > -0.8)].mean()
+
+
+def test_light_of_lists_and_whole_numbers_is_floating_point():
+    """Whole numbers gave wrong radiance in every system."""
+    for radiance in (np.full((6, 2, 2, 3), 200, np.uint8), np.full((6, 2, 2, 3), 200).tolist()):
+        light = Environment(radiance)
+        assert jnp.issubdtype(light.radiance.dtype, jnp.floating)
+        np.testing.assert_array_equal(light.radiance, 200)
