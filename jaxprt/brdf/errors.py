@@ -35,7 +35,7 @@ def light_errors(
 
     Args:
         brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: Its terms.
+        factored: The terms that stand for the BRDF.
         light: One environment.
         frames: Number of normals.
         views: Number of views for each.

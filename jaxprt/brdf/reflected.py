@@ -26,9 +26,9 @@ class Reflected(NamedTuple):
     """What each of some BRDFs reflects to views in the texels of a parabolic map, of light of natural spectrum.
 
     Attributes:
-        tensor: Of each BRDF and color, for each view and harmonic.
+        tensor: Reflected radiance for each BRDF, color, view and harmonic.
         to_map: Light maps of what reflects one harmonic each.
-        direction: Of each view.
+        direction: Unit direction of each view.
         area: Solid angle of each view, zero outside the map's disk.
         whole: Squared norm of what they reflect before lobes are taken out.
     """
@@ -58,7 +58,7 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
     parts = [(together, np.arange(len(brdfs)))]
     if together is None:
         parts = [(_stack((grid.as_argument(each),)), np.array([n])) for n, each in enumerate(brdfs)]
-    # Of isotropic BRDFs one view of each height is enough.
+    # Isotropic BRDFs need only one view of each height.
     turned = all(map(is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
     found = [_reflected(part, lobe, number, view) for part, number in parts]

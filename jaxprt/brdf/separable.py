@@ -109,7 +109,7 @@ def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF")
 
     Args:
         known: `marked` of the transport's light factors, or None.
-        light_map: Of the BRDF: those of all of the transport's terms, or of the first ones.
+        light_map: Light maps of the BRDF, for all of the transport's terms or the first ones.
         name: What errors call the BRDF.
 
     Raises:

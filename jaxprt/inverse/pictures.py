@@ -174,7 +174,7 @@ def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Ar
     """What a scene's pictures differ by from those observed, in units of the norm of these.
 
     Args:
-        radiance: Of the parameters and an eye, of every vertex; what does not depend on the eye is computed once.
+        radiance: Function (parameters, eye) -> radiance of every vertex. Parts without the eye are computed once.
         parameters: Of the radiance.
         pixels: What was observed.
     """
@@ -192,7 +192,7 @@ class Residual(eqx.Module):
     """The `residual` as a function of the numbers of the parameters in a row.
 
     Attributes:
-        radiance: Of the parameters and an eye, of every vertex.
+        radiance: Function (parameters, eye) -> radiance of every vertex.
         like: Parameters of the same structure and shapes.
         pixels: What was observed.
     """
