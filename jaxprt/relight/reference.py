@@ -1,6 +1,6 @@
 """Direct light integrated over every texel with the BRDF itself: slow, and the yardstick of every error here."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -122,66 +122,90 @@ def _centers(given: refine.Integrand, seen: Array, error: Array) -> tuple[Array,
     """Sums over texels that need not be divided; what cells are chosen by; and which of the first cells are."""
     size = haar.face_edge(seen.shape[1])
     direction, area = (_blocks(each(size=size)) for each in (cubemap.direction, cubemap.vector_area))
-    light = jax.vmap(lambda each: _blocks(each.reshape(6, size, size, -1)))(given.light)
-    mean = jnp.mean(light, -1)
+    middle = jnp.mean(direction, 0)
+    light = jax.vmap(lambda each: _blocks(each.reshape(6, size, size, -1)), out_axes=1)(given.light)
     level = jax.vmap(lambda each: _blocks(each.reshape(6, size, size)))(seen)
+    mean = jax.lax.stop_gradient(jnp.swapaxes(jnp.mean(light, -1), 0, 1))
+    light = jnp.moveaxis(light, -1, 1)
 
-    def sent(argument):
-        axes, wo = argument
-        flux = jnp.maximum(directions.to_local(axes, area.reshape(-1, 3))[:, 2], 0)
+    # One vertex after the other, whose arrays stay in the processor's cache. What several others are made of is the
+    # result of a loop, or enters one: the compiler would else compute it once for each element that it goes into.
+    def one(argument):
+        axes, wo, level = argument
         value = refine.value(given.brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
+        value = value.reshape(*level.shape, -1)
+        flux = area @ axes[2]
+        clear = level.astype(flux.dtype) / visibility.LEVELS
         peak = wo[2] * jnp.mean(refine.value(given.brdf, (wo * _MIRROR)[None], wo))
-        return value.reshape(*level.shape[1:], -1), flux.reshape(level.shape[1:]), peak
+        arriving = jnp.maximum(flux, 0) * clear
+        gray, lean, height, flat = jax.lax.stop_gradient((jnp.mean(value, -1), flux, peak, arriving))
+        weight = 1 / jnp.maximum(jnp.einsum("let,et->l", mean, gray * flat), _DARK)
+        brightest = jax.lax.scan(
+            lambda most, each: (jnp.maximum(most, each[0] * each[1]), None), jnp.zeros_like(clear), (mean, weight)
+        )[0]
+        away = jax.lax.stop_gradient(middle @ axes.T - wo * _MIRROR)
+        chosen = _vary(gray, lean, clear * brightest, away, height, error)
 
-    # All vertices before what follows: the compiler would compute the BRDF once for each of its uses.
-    value, flux, peak = jax.lax.map(sent, (given.frame, given.wo), batch_size=8)
-    clear = level.astype(flux.dtype) / visibility.LEVELS
-    gray, flat, height = jax.lax.stop_gradient((jnp.mean(value, -1), flux, peak))
-    weight = 1 / jnp.maximum(jnp.einsum("left,beft->bl", jax.lax.stop_gradient(mean), gray * flat * clear), _DARK)
+        def add(total, texel):
+            light, value, arriving = texel
+            return total + _sums(light, value * (arriving * ~chosen)[:, None]), None
 
-    def varying(argument):
-        gray, flux, clear, weight, axes, wo, height = argument
-        scale = clear * jnp.max(mean * weight[:, None, None, None], 0)
-        x, y, z = jnp.moveaxis(direction, -1, 0)
-        wi = [x * axes[i, 0] + y * axes[i, 1] + z * axes[i, 2] for i in range(3)]
-        return _vary(gray, flux, scale, wi, wo * _MIRROR, height, error)
+        colors = max(value.shape[-1], light.shape[1])
+        total = jax.lax.scan(add, jnp.zeros((len(mean), colors), value.dtype), (light, value, arriving))[0]
+        return total, weight, height, chosen
 
-    told = jax.lax.stop_gradient((gray, flat, clear, weight, given.frame, given.wo, height))
-    chosen = jax.lax.map(varying, told, batch_size=8)
-    value = value * (flux * clear * ~chosen[:, None, None])[..., None]
-    value = jnp.broadcast_to(value, (*value.shape[:-1], max(value.shape[-1], light.shape[-1])))
-    total = jnp.einsum("leftc,beftc->blc", light, value)
+    total, weight, height, chosen = jax.lax.map(one, (given.frame, given.wo, level))
     edge = size // refine.root(size)
-    chosen = chosen.reshape(-1, 6, edge, edge)
-    return total, refine.Choice(seen, weight, height, error), chosen
+    return total, refine.Choice(seen, weight, height, error), chosen.reshape(-1, 6, edge, edge)
+
+
+def _sums(light: Array, value: Array) -> Array:
+    """Sums [l c] of light [c l t] times values [t c] over texels; either may be gray, with one color."""
+    # One product for each color: with colors innermost, the compiler's loops take seven times as long.
+    pairs = np.broadcast(np.arange(len(light)), np.arange(value.shape[-1]))
+    return jnp.stack([light[i] @ value[:, j] for i, j in pairs], -1)
 
 
 def _blocks(texel: Array) -> Array:
-    """Texels [6 n n *c] as [e e t *c]: row and column in the first cell, then the cells, next to each other."""
+    """Texels [6 n n *c] as [e t *c]: those at each place in the first cells next to each other."""
     edge = refine.root(texel.shape[1])
     count = texel.shape[1] // edge
     block = texel.reshape(6, count, edge, count, edge, *texel.shape[3:])
-    return jnp.moveaxis(block, (2, 4), (0, 1)).reshape(edge, edge, -1, *texel.shape[3:])
+    return jnp.moveaxis(block, (2, 4), (0, 1)).reshape(edge**2, -1, *texel.shape[3:])
 
 
-def _vary(
-    gray: Array, flux: Array, scale: Array, wi: Sequence[Array], mirror: Array, height: Array, error: Array
-) -> Array:
+def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, error: Array) -> Array:
     """First cells of whose texels the BRDF at the center tells too little.
 
     The middle of an interval errs by f'' / 24, and of a product by f' g' / 12 too; the horizon adds an eighth of a
     texel's edge at most. A peak between centers shows in the mirror direction.
+
+    Args:
+        gray: The BRDF at centers of texels, places in the first cell before the cells, as all of [e t].
+        lean: Integrals of the cosine over texels, negative below the horizon.
+        scale: Light in units of the vertex's radiance.
+        away: From the mirror direction to the middle of each first cell.
+        height: BRDF times cosine in the mirror direction.
+        error: Relative error that is allowed.
     """
     if len(gray) == 1:
-        return jnp.broadcast_to(error < jnp.inf, gray[0, 0].shape)
-    edge = 2 / haar.face_edge(gray.size)
-    miss = jnp.zeros_like(gray[0, 0])
-    for value, other, much in ((gray, flux, scale), [jnp.swapaxes(each, 0, 1) for each in (gray, flux, scale)]):
-        bend = jnp.abs(value[:-2] - 2 * value[1:-1] + value[2:]) * other[1:-1] / 24
-        bend += jnp.abs((value[2:] - value[:-2]) * (other[2:] - other[:-2])) / 48
-        miss += 2 * jnp.sum(bend * much[1:-1], (0, 1))  # for the two rows in the middle and the two outside
-    cut = jnp.where(jnp.abs(wi[2]) < edge / 2, edge / 16 * jnp.max(gray, (0, 1)), 0)
-    near = sum((wi[i] - mirror[i]) ** 2 for i in range(3)) < (2.5 * edge) ** 2
-    hidden = jnp.where(near, jnp.abs(height - gray * jnp.maximum(wi[2], 0)) / 8, 0)
-    miss += jnp.sum((cut + hidden) * scale, (0, 1)) * edge**2
-    return miss > error * jnp.maximum(jnp.sum(gray * flux * scale, (0, 1)), refine.SMALL)
+        return jnp.broadcast_to(error < jnp.inf, gray[0].shape)
+    side, edge = refine.SIDE, 2 / haar.face_edge(gray.size)
+    flux = jnp.maximum(lean, 0)
+    miss, size, top, hidden, cut = (jnp.zeros_like(gray[0]) for _ in range(5))
+    # Written out texel by texel, which the compiler makes one loop over cells.
+    for here in range(side**2):
+        much, sent = scale[here], gray[here] * flux[here]
+        for step, place in ((side, here // side), (1, here % side)):
+            if 0 < place < side - 1:
+                back, ahead = here - step, here + step
+                bend = jnp.abs(gray[back] - 2 * gray[here] + gray[ahead]) * flux[here] / 24
+                bend += jnp.abs((gray[ahead] - gray[back]) * (flux[ahead] - flux[back])) / 48
+                miss += 2 * bend * much  # for the two rows in the middle and the two outside
+        size += sent * much
+        top = jnp.maximum(top, gray[here])
+        hidden += jnp.abs(height * edge**2 - sent) * much
+        cut += jnp.where(jnp.abs(lean[here]) < edge**3 / 2, much, 0)
+    near = jnp.sum(away**2, -1) < ((2.5 + side / np.sqrt(2)) * edge) ** 2
+    miss += jnp.where(near, hidden / 8, 0) + edge**3 / 16 * top * cut
+    return miss > error * jnp.maximum(size, refine.SMALL)

@@ -169,8 +169,9 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
         below = jnp.concatenate(
             [below[..., :1], below[..., 1:2] + 1, below[..., 2:3], SIDE * below[..., 3:] + child], -1
         )
-        order = jnp.argsort(~again.ravel())
-        stack = jax.lax.dynamic_update_slice_in_dim(stack, below.reshape(-1, 5)[order], first, 0)
+        again = again.ravel()
+        place = jnp.where(again, first + jnp.cumsum(again) - 1, len(stack))
+        stack = stack.at[place].set(below.reshape(-1, 5), mode="drop")
         return stack, first + jnp.sum(again), total
 
     return jax.lax.while_loop(lambda state: state[1] > 0, step, (stack, jnp.sum(chosen), total))[2]
