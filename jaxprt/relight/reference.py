@@ -140,10 +140,8 @@ def _centers(given: refine.Integrand, seen: Array, error: Array) -> tuple[Array,
         arriving = jnp.maximum(flux, 0) * clear
         gray, lean, height, flat = jax.lax.stop_gradient((jnp.mean(value, -1), flux, peak, arriving))
         weight = 1 / jnp.maximum(jnp.einsum("let,et->l", mean, gray * flat), _DARK)
-        brightest = jax.lax.scan(
-            lambda most, each: (jnp.maximum(most, each[0] * each[1]), None), jnp.zeros_like(clear), (mean, weight)
-        )[0]
         away = jax.lax.stop_gradient(middle @ axes.T - wo * _MIRROR)
+        brightest = refine.brightest(mean, weight[:, None, None])
         chosen = _vary(gray, lean, clear * brightest, away, height, error)
 
         def add(total, texel):

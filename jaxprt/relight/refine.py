@@ -152,29 +152,32 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
     """
     size = haar.face_edge(choice.seen.shape[1])
     deepest = _deepest(size)
-    place = jnp.stack(jnp.nonzero(chosen, size=chosen.size, fill_value=0), -1).astype(jnp.int32)
-    place = jnp.insert(place, 1, 0, axis=1)
-    spare = _CHUNK * (SIDE**2 * (deepest + 1) + 1)
-    stack = jnp.concatenate([place, jnp.zeros((spare, 5), jnp.int32)])
+    first = jnp.stack(jnp.nonzero(chosen, size=chosen.size, fill_value=0), -1).astype(jnp.int32)
+    first, count = jnp.insert(first, 1, 0, axis=1), jnp.sum(chosen, dtype=jnp.int32)
+    stack = jnp.zeros((_CHUNK * (SIDE**2 * (deepest + 1) + 1), 5), jnp.int32)
     child = jnp.stack(jnp.meshgrid(*2 * [jnp.arange(SIDE, dtype=jnp.int32)], indexing="ij"), -1)
+    number = jnp.arange(_CHUNK, dtype=jnp.int32)
 
     def step(state):
-        stack, top, total = state
-        first = jnp.maximum(top - _CHUNK, 0)
-        cell = jax.lax.dynamic_slice_in_dim(stack, first, _CHUNK)
-        valid = jnp.arange(_CHUNK) < top - first
+        """The last cells of the stack and, where these are fewer than at once, the next of the first cells."""
+        stack, top, begun, total = state
+        after = begun + number - top
+        cell = jnp.where((number < top)[:, None], stack[top - 1 - number], first[after])
+        valid = (number < top) | (after < count)
         total, again = add(total, jnp.where(valid[:, None], cell, jnp.array([0, -1, 0, 0, 0])))
         again &= (valid & (cell[:, 1] < deepest))[:, None, None]
         below = jnp.broadcast_to(cell[:, None, None], (*again.shape, 5))
         below = jnp.concatenate(
             [below[..., :1], below[..., 1:2] + 1, below[..., 2:3], SIDE * below[..., 3:] + child], -1
         )
-        again = again.ravel()
-        place = jnp.where(again, first + jnp.cumsum(again) - 1, len(stack))
+        left, again = jnp.maximum(top - _CHUNK, 0), again.ravel()
+        place = jnp.where(again, left + jnp.cumsum(again) - 1, len(stack))
         stack = stack.at[place].set(below.reshape(-1, 5), mode="drop")
-        return stack, first + jnp.sum(again), total
+        begun = jnp.minimum(begun + jnp.maximum(_CHUNK - top, 0), count)
+        return stack, left + jnp.sum(again, dtype=jnp.int32), begun, total
 
-    return jax.lax.while_loop(lambda state: state[1] > 0, step, (stack, jnp.sum(chosen), total))[2]
+    begin = stack, jnp.int32(0), jnp.int32(0), total
+    return jax.lax.while_loop(lambda state: (state[1] > 0) | (state[2] < count), step, begin)[3]
 
 
 def _deepest(size: int) -> int:
@@ -188,6 +191,7 @@ def _visit(fixed: tuple, colors: int) -> Callable:
     leaf, tree = jax.tree.flatten(whole)
     size = haar.face_edge(choice.seen.shape[1])
     deepest = _deepest(size)
+    mean = jax.lax.stop_gradient(jnp.mean(whole.light, -1))
 
     def visit(moving, cell):
         left = iter(moving)
@@ -199,14 +203,28 @@ def _visit(fixed: tuple, colors: int) -> Callable:
         sent = value(integrand.brdf, jnp.stack(wi, -1), wo[:, None, None])
         inner = _children(sent * (jnp.maximum(wi[2], 0) * weight)[..., None])
         clear = choice.seen[vertex[:, None, None], texel].astype(weight.dtype) / LEVELS
-        light = integrand.light[:, texel]
-        again = _again(jax.lax.stop_gradient((sent, wi, wo, weight, light, clear)), vertex, choice)
+        scale = clear * brightest(mean[:, texel], choice.weight[vertex].T[:, :, None, None])
+        again = _again(jax.lax.stop_gradient((sent, wi, wo, weight, scale)), vertex, choice)
         again &= ((level >= 0) & (level < deepest))[:, None, None]
         kept = clear * ((level >= 0)[:, None, None] & ~again)
         inner = jnp.broadcast_to(inner * kept[..., None], (*inner.shape[:-1], colors))
-        return jnp.sum(light * inner, (2, 3)).swapaxes(0, 1), again
+        # Child by child, since the compiler's loop for a sum over all of them takes ten times as long.
+        light, child = integrand.light.swapaxes(0, 1), np.ndindex(SIDE, SIDE)
+        return sum(light[texel[:, i, j]] * inner[:, i, j, None] for i, j in child), again
 
     return visit
+
+
+def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
+    """The largest over lights of light times weight.
+
+    Light by light, since the compiler's loop for a maximum over all of them takes ten times as long.
+    """
+
+    def step(most, each):
+        return jnp.maximum(most, each[0] * each[1]), None
+
+    return jax.lax.scan(step, jnp.zeros(light.shape[1:], light.dtype), (light, weight))[0]
 
 
 def _nodes(cell: Array, frame: Array, size: int) -> tuple[list[Array], Array, Array]:
@@ -241,7 +259,7 @@ def _again(given: tuple, vertex: Array, choice: Choice) -> Array:
     for it, as it does for a Gaussian lobe. The mirror direction is one more point: a peak between all others shows
     there.
     """
-    sent, wi, wo, weight, light, clear = given
+    sent, wi, wo, weight, scale = given
     gray = jax.lax.optimization_barrier(jnp.mean(sent, -1) * jnp.maximum(wi[2], 0) * weight)
     miss = jnp.zeros_like(gray)
     gap = jnp.where(jnp.arange(2 * SIDE - 1) % 2 == 0, _GAP, 1 - _GAP).astype(gray.dtype)
@@ -252,7 +270,6 @@ def _again(given: tuple, vertex: Array, choice: Choice) -> Array:
     near = (wi[0] + wo[:, 0]) ** 2 + (wi[1] + wo[:, 1]) ** 2 + (wi[2] - wo[:, 2]) ** 2 < _NEAR * weight
     higher = jnp.abs(choice.peak[vertex][:, None, None] * weight - gray)
     miss += jnp.where(near, _loss(_PEAKED * higher, gray + higher), 0)
-    scale = jnp.max(jnp.mean(light, -1) * choice.weight[vertex].T[:, :, None, None], 0) * clear
     return scale * _children(miss) > choice.error * jnp.maximum(scale * jnp.abs(_children(gray)), SMALL)
 
 
