@@ -26,6 +26,7 @@ SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
 SIDEWAYS = {
     ("*", "dynamic", "lobe"),  # Sun's system is built on the lobes of its own section 4.1.
     ("*", "dynamic", "separable"),  # Its terms are separable ones, with view maps that change.
+    ("brdf", "cylinders", "models"),
     ("brdf", "measured", "models"),
     ("brdf", "navigation", "models"),
     ("brdf", "paths", "dynamic"),

@@ -21,11 +21,14 @@ a reciprocal BRDF, and the closed forms of the limits are derived here.
 """
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from jaxprt.brdf.models import Model
 
 _GRAZING = 1e-4  # least cosine
 _DIFFUSE_NODES = 8  # The integrand is a trigonometric polynomial of degree 2: exact to 1e-9 over pi.
@@ -114,7 +117,7 @@ def _mirrored(theta: Array, low: Array, high: Array, period: Array | float = 0) 
     return jnp.where(right, low, period - high), jnp.where(right, high, period - low)
 
 
-class PoulinFournier(eqx.Module):
+class PoulinFournier(Model):
     """Cylinders of radius 1 laid parallel to the tangent, side by side on a plane or sunk into it.
 
     Attributes:
@@ -124,6 +127,8 @@ class PoulinFournier(eqx.Module):
         distance: From axis to axis, in radii, above 0; cylinders that are less than 2 apart run into each other.
         height: Of the axes above the plane, in radii: 1 for whole cylinders, 0 for half ones, -1 for none left.
     """
+
+    least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
     diffuse: Float[Array, " c"] = eqx.field(converter=_color, default=0.3)
     specular: Float[Array, " c"] = eqx.field(converter=_color, default=0.5)
@@ -158,7 +163,7 @@ class PoulinFournier(eqx.Module):
         return _mirrored(theta, left, self.distance - right, self.distance)
 
 
-class PoulinFournierGrooves(eqx.Module):
+class PoulinFournierGrooves(Model):
     """Grooves that cylinders of radius 1, parallel to the tangent, cut into a plane.
 
     Attributes:
@@ -168,6 +173,8 @@ class PoulinFournierGrooves(eqx.Module):
         distance: From axis to axis, in radii, above 0; wider grooves run into each other.
         height: Of the axes above the plane, in radii: 0 for grooves as deep as wide, 1 for none left.
     """
+
+    least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
     diffuse: Float[Array, " c"] = eqx.field(converter=_color, default=0.3)
     specular: Float[Array, " c"] = eqx.field(converter=_color, default=0.5)

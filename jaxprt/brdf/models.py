@@ -8,9 +8,15 @@ All are reciprocal. Which parameters conserve energy stands with each; "conserve
 has more than its flux reflected, in single scattering.
 """
 
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxprt import require
 
 _GRAZING = 1e-4  # least cosine in half vectors and denominators
 _SMOOTHEST = 1e-3  # least roughness: a perfect mirror has no density
@@ -79,7 +85,24 @@ def _schlick(reflectance: Array, cosine: Array) -> Array:
     return reflectance + (1 - reflectance) * (1 - jnp.minimum(cosine, 1)) ** 5
 
 
-class Lambert(eqx.Module):
+class Model(eqx.Module):
+    """What all models have in common: parameters are finite and at least 0, or what `least` says.
+
+    Inside `jax.jit` values are not known, and not checked.
+
+    Raises:
+        ValueError: A parameter is not finite, or less.
+    """
+
+    least: ClassVar[Mapping[str, float]] = {}
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            name = f"{field.name} of {type(self).__name__}"
+            require.at_least(name, getattr(self, field.name), self.least.get(field.name, 0.0))
+
+
+class Lambert(Model):
     """Ideal diffuse reflection, albedo / pi. Conserves energy for albedo <= 1.
 
     Attributes:
@@ -93,7 +116,7 @@ class Lambert(eqx.Module):
         return jnp.where(_lit(wi, wo), self.albedo / jnp.pi, 0)
 
 
-class Phong(eqx.Module):
+class Phong(Model):
     """Phong lobe around the mirror direction, reciprocal: diffuse / pi + specular (n + 2) / (2 pi) cos^n(alpha).
 
     alpha is the angle between wo and the mirror image of wi. There is no division by a cosine, unlike in Phong's
@@ -123,7 +146,7 @@ class Phong(eqx.Module):
         return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + self.specular * peak * lobe, 0)
 
 
-class BlinnPhong(eqx.Module):
+class BlinnPhong(Model):
     """Phong lobe of the half vector, diffuse / pi + specular (n+2)(n+4) / (8 pi (2^(-n/2) + n)) (n.h)^n.
 
     The normalization is exact at normal incidence, where the lobe reflects `specular`; elsewhere it reflects less, so
@@ -152,7 +175,7 @@ class BlinnPhong(eqx.Module):
         return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
-class AshikhminShirley(eqx.Module):
+class AshikhminShirley(Model):
     """Anisotropic Phong model: Fresnel-weighted specular lobe over a diffuse base that gives way to it.
 
     Conserves energy for diffuse + specular <= 1.
@@ -186,7 +209,7 @@ class AshikhminShirley(eqx.Module):
         return jnp.where(_lit(wi, wo), lobe * _schlick(self.specular, cos_d) + base, 0)
 
 
-class Ward(eqx.Module):
+class Ward(Model):
     """Ward's anisotropic Gaussian of slopes, in the form whose albedo is bounded.
 
     The lobe is specular exp(-(h_x^2 / along^2 + h_y^2 / across^2) / h_z^2) |h|^2 / (pi along across h_z^4) with
@@ -214,7 +237,7 @@ class Ward(eqx.Module):
         return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
-class WardDuer(eqx.Module):
+class WardDuer(Model):
     """Ward's model with Duer's normalization, as fitted to measurements by Ngan et al.
 
     The lobe is specular exp(-tan^2 / m^2) / (4 pi m^2 cos_i cos_o), with two roughnesses as in `Ward`. It reflects
@@ -242,7 +265,7 @@ class WardDuer(eqx.Module):
         return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
-class CookTorrance(eqx.Module):
+class CookTorrance(Model):
     """Microfacets in V-shaped grooves: diffuse / pi + specular D G F / (pi cos_i cos_o), isotropic.
 
     D = exp(-tan^2 / m^2) / (pi m^2 cos^4) of the half vector (Beckmann), G = min(1, 2 n.h cos_i / h.wi,
@@ -273,7 +296,7 @@ class CookTorrance(eqx.Module):
         return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + self.specular * lobe, 0)
 
 
-class Lafortune(eqx.Module):
+class Lafortune(Model):
     """Generalized cosine lobes, diffuse / pi + sum_l max(0, C_x x_i x_o + C_y y_i y_o + C_z z_i z_o)^n, per color.
 
     C = (-1, -1, 1) is Phong's lobe around the mirror direction, |C_z| < |C_x| tilts it to grazing angles, C_x > 0
@@ -291,6 +314,8 @@ class Lafortune(eqx.Module):
 
     Reference: Lafortune, Foo, Torrance, Greenberg 1997, "Non-linear approximation of reflectance functions".
     """
+
+    least: ClassVar = {"cx": -jnp.inf, "cy": -jnp.inf, "cz": -jnp.inf}
 
     diffuse: Float[Array, " c"] = eqx.field(converter=_color)
     cx: Float[Array, "l c"] = eqx.field(converter=_lobes)

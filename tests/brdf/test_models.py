@@ -445,3 +445,22 @@ def test_the_lobe_is_long_where_the_surface_is_rough(model):
     tilt = jnp.array([[0.4, 0, 0.9165], [0, 0.4, 0.9165]])
     along, across = evaluate(model, jnp.broadcast_to(UP, tilt.shape), tilt)[:, 0]
     assert along > 2 * across
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: CookTorrance(roughness=-0.2), "roughness of CookTorrance must be at least 0, got 1 of 1 values"),
+        (lambda: Lambert([0.5, np.nan, 0.2]), r"albedo of Lambert must be finite, got 1 of 3 .* first at \(1,\): nan"),
+        (lambda: AshikhminShirley(nu=np.inf), "nu of AshikhminShirley must be finite"),
+        (lambda: Lafortune(0.1, [-0.9], [np.nan], [0.9], [10]), "cy of Lafortune must be finite"),
+        (lambda: PoulinFournier(distance=0), "distance of PoulinFournier must be at least 0.0001, got 1 of 1 values"),
+    ],
+)
+def test_parameters_that_no_surface_has_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_parameters_are_not_looked_at_where_they_are_traced():
+    assert jax.grad(lambda albedo: Lambert(albedo).albedo[0])(-1.0) == 1
