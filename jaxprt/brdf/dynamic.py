@@ -266,7 +266,8 @@ def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) 
     _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
         raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
-    shapes = [eqx.filter_eval_shape(brdf, *jnp.asarray([[[0.6, 0, 0.8]], [[0, 0, 1.0]]])).shape for brdf in brdfs]
+    direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
+    shapes = [eqx.filter_eval_shape(brdf, direction, direction).shape for brdf in brdfs]
     if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] not in (1, 3):
         raise ValueError(f"all BRDFs must map directions [b 3] to values [b 1], or all to [b 3], got {set(shapes)}")
     return shapes[0][1]

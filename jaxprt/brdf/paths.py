@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf import dynamic, reflected
 from jaxprt.brdf.dynamic import DynamicBrdf
+from jaxprt.brdf.reflected import Reflected
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.linalg import tucker
 from jaxprt.sphere import harmonics, hemisphere
@@ -58,26 +59,36 @@ def factor(
     kinds = (_SMOOTH + 1) ** 2
     functions = min(_FUNCTIONS, count * colors) if functions is None else functions
     dynamic.check_ranks((functions, 1, terms), (count * colors, kinds, harmonic))
-    flat = found.tensor.reshape(count * colors, views, harmonic)
-    seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
-    smooth = tucker.multiply(flat, seen, mode=1)
+    smooth = _smoothed(found)
     least = tucker.oriented(tucker.truncated(smooth, ranks=(functions, min(kinds, views), terms)))
+    view, light, error = _maps(found, smooth, least)
+    pairs = np.eye(functions * terms, dtype=error.dtype).reshape(functions, terms, -1).swapaxes(1, 2)
+    along = least.factor[0].reshape(count, colors, functions)
+    return DynamicBrdf(jnp.asarray(pairs), along, view, light, None, reflected.stacked(brdfs), error)
+
+
+@jax.jit
+def _smoothed(found: Reflected) -> Float[Array, "m s b"]:
+    """What each BRDF and color sends, as harmonics of the view."""
+    seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
+    return tucker.multiply(found.tensor.reshape(-1, *found.tensor.shape[2:]), seen, mode=1)
+
+
+@jax.jit
+def _maps(found: Reflected, smooth: Array, least: tucker.Tucker) -> tuple[Array, Array, Array]:
+    """View maps of each function and term, light maps, and the error of a decomposition."""
     along, _, across = least.factor
+    flat = found.tensor.reshape(-1, *found.tensor.shape[2:])
     view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, k]
     # Light maps carry the size, so that view factors have a mean square of about one.
-    square = jnp.einsum("hdk,d->k", view**2, found.area) / (jnp.sum(found.area) * count * colors)
+    square = jnp.einsum("hdk,d->k", view**2, found.area) / (jnp.sum(found.area) * len(flat))
     size = jnp.where(square > 0, jnp.sqrt(square), 1)
     whole = jnp.vdot(smooth, smooth)
     left = jnp.maximum(whole - jnp.vdot(least.core, least.core), 0)
-    edge = math.isqrt(views)
-    pairs = jnp.eye(functions * terms).reshape(functions, terms, -1).swapaxes(1, 2)
-    return DynamicBrdf(
-        pairs,
-        along.reshape(count, colors, functions),
+    edge = math.isqrt(len(found.area))
+    return (
         jnp.moveaxis(view / size, 1, 2).reshape(-1, edge, edge),
-        (size[:, None] * (across.T @ found.to_map)).reshape(terms, edge, edge),
-        None,
-        reflected.stacked(brdfs),
+        (size[:, None] * (across.T @ found.to_map)).reshape(-1, edge, edge),
         jnp.sqrt(left / jnp.where(whole > 0, whole, 1)),
     )
 
@@ -102,10 +113,15 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
     if brdf.lobe is not None or not brdf.core.size:
         found = "those of what its lobes leave" if brdf.core.size else "none"
         raise ValueError(f"light paths need terms of whole BRDFs, from ranks and without lobes, got {found}")
-    view = jnp.einsum("hoi,oyx->iyxh", brdf.core, brdf.view_map)
-    light = jnp.concatenate([brdf.light_map, jnp.ones_like(brdf.light_map[:1])])[..., None]
-    view = jnp.pad(view, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
-    return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
+    return SeparableBrdf(*_functions(brdf.core, brdf.view_map, brdf.light_map), brdf.error, brdf.coordinates)
+
+
+@jax.jit
+def _functions(core: Array, view_map: Array, light_map: Array) -> tuple[Array, Array]:
+    """Light and view maps of the functions of a set, and of a constant one."""
+    view = jnp.einsum("hoi,oyx->iyxh", core, view_map)
+    light = jnp.concatenate([light_map, jnp.ones_like(light_map[:1])])[..., None]
+    return light, jnp.pad(view, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
 
 
 @partial(jax.jit, static_argnames=("degree",))
@@ -154,8 +170,8 @@ def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
     """
     if brdf.light_map.shape[-1] != 1:
         raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
-    size = jnp.sqrt(jnp.mean(brdf.light_map**2, (1, 2, 3), keepdims=True))
-    rows = np.asarray(brdf.view_map * size, np.float64)
+    light, view = (np.asarray(each, np.float64) for each in (brdf.light_map, brdf.view_map))
+    rows = view * np.sqrt(np.mean(light**2, (1, 2, 3), keepdims=True))
     _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
     axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)  # Signs are otherwise as rounding has them.
     return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)

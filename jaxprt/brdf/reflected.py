@@ -137,7 +137,7 @@ def _heights(direction: Array) -> tuple[Array, np.ndarray]:
     """A view in the x z plane for each height among some, and which of these every direction has."""
     height, first, back = np.unique(np.round(np.asarray(direction)[:, 2], 5), return_index=True, return_inverse=True)
     height = np.asarray(direction)[first, 2]
-    return jnp.stack([jnp.sqrt(1 - height**2), 0 * height, height], -1), back
+    return jnp.asarray(np.stack([np.sqrt(1 - height**2), 0 * height, height], -1)), back
 
 
 @jax.jit

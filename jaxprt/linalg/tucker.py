@@ -249,10 +249,10 @@ def oriented(decomposition: Tucker) -> Tucker:
     Each mode is turned by `jaxprt.linalg.eigen.orientation`, and the core against it. What the decomposition stands for
     does not change.
     """
-    core, factor = decomposition.core, []
-    for mode, each in enumerate(decomposition.factor):
-        strength = jnp.diagonal(gram(core, mode=mode))
-        turn = jnp.asarray(eigen.orientation(np.asarray(strength), np.asarray(each)), core.dtype)
-        core = multiply(core, turn, mode=mode)
-        factor.append(each @ turn)
-    return Tucker(core, tuple(factor))
+    core, factor = np.asarray(decomposition.core), []
+    for mode, each in enumerate(map(np.asarray, decomposition.factor)):
+        unfolded = np.moveaxis(core, mode, 0).reshape(core.shape[mode], -1)
+        turn = eigen.orientation(np.sum(unfolded**2, 1), each).astype(core.dtype)
+        core = np.moveaxis(np.tensordot(turn, core, (0, mode)), 0, mode)
+        factor.append(jnp.asarray(each @ turn))
+    return Tucker(jnp.asarray(core), tuple(factor))
