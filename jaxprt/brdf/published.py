@@ -190,26 +190,35 @@ def mirror_lobes(
     if not angles or min(angles) < 0:
         raise ValueError(f"angles must be at least one, none below 0, got {angles}")
     wo, (sample, mass, _, extent) = lobe.sampled(brdf, resolution=resolution)
-    nodes, mean = wo.shape[:-1], lobe_em.mirror(wo.reshape(-1, 3))
     width = np.radians(np.asarray(angles, np.float64)) / 3
-    concentration = jnp.asarray(1 / np.maximum(width**2, 1 / lobe_em.FINEST), mean.dtype)
+    concentration = (1 / np.maximum(width**2, 1 / lobe_em.FINEST)).astype(wo.dtype)
+    mean, scale, weight, diffuse = _mirror_lobes(wo, sample, mass, extent, concentration)
+    return lobe.LobeBrdf(mean, scale, weight, diffuse, (), jnp.asarray(np.asarray(np.nan, wo.dtype)))
+
+
+@jax.jit
+def _mirror_lobes(
+    wo: Array, sample: Array, mass: Array, extent: Array, concentration: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Directions, logarithms of the concentrations, weights, and no diffuse part, on the nodes `wo` [*q 3]."""
+    nodes, mean, count = wo.shape[:-1], lobe_em.mirror(wo.reshape(-1, 3)), len(concentration)
 
     def one(argument):
         sample, mass, extent, mean = argument
-        every = jnp.broadcast_to(mean, (len(angles), 3))
+        every = jnp.broadcast_to(mean, (count, 3))
         rest = jnp.full((len(sample), 1), -np.log(2 * np.pi), sample.dtype)
         density = mixture.log_density(sample, every, concentration)
         above = 4 * np.pi * extent @ jnp.exp(density)  # Part of each lobe; half at least, as means are not below.
         density = jnp.concatenate([density - jnp.log(above), rest], 1)
-        start = jnp.ones(len(angles) + 1, sample.dtype)
+        start = jnp.ones(count + 1, sample.dtype)
         found = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=200)[0], in_axes=1)(mass)
         return found[:, :-1] / above
 
     weight = jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, mean)), 0, -1)
-    table = jnp.broadcast_to(mean.T[:, None], (3, len(angles), len(mean))).reshape(3, -1, *nodes)
-    scale = jnp.broadcast_to(jnp.log(concentration)[:, None], (len(angles), len(mean))).reshape(-1, *nodes)
+    table = jnp.broadcast_to(mean.T[:, None], (3, count, len(mean))).reshape(3, -1, *nodes)
+    scale = jnp.broadcast_to(jnp.log(concentration)[:, None], (count, len(mean))).reshape(-1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
-    return lobe.LobeBrdf(table, scale, weight, 0 * weight[:, 0], (), jnp.asarray(jnp.nan, mean.dtype))
+    return table, scale, weight, 0 * weight[:, 0]
 
 
 def factor_tensor(

@@ -9,13 +9,13 @@ import pytest
 import scipy.integrate
 import scipy.ndimage
 
-from jaxprt.brdf import AshikhminShirley, CookTorrance, HarmonicBrdf, Lambert, Phong
+from jaxprt.brdf import AshikhminShirley, CookTorrance, HarmonicBrdf, Lambert, Phong, harmonic
 from jaxprt.brdf.harmonic import project, tabulate
 from jaxprt.sphere import harmonics, hemisphere
 
 RESOLUTION = 16
 QUADRATURE = 1e-4  # What the independent quadrature is accurate to, where the horizon cuts it.
-NODES = 300  # In each direction of the independent quadrature.
+NODES = 240  # In each direction of the independent quadrature.
 LOOKUP = 2e-5  # Coordinates of a texel in float32, times the sixteen texels between which they tell.
 COLORED = AshikhminShirley(diffuse=[0.5, 0.2, 0.1], specular=[0.2, 0.4, 0.6], nu=10.0, nv=100.0)
 
@@ -34,7 +34,25 @@ def upper(random, *shape, least=0.0):
     """Unit vectors at least so high above the horizon."""
     height, angle = random.uniform(least, 1, shape), random.uniform(0, 2 * np.pi, shape)
     radius = np.sqrt(1 - height**2)
-    return jnp.asarray(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1), jnp.float32)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1).astype(np.float32)
+
+
+@jax.jit
+def value(table, wi, wo):
+    return table(wi, wo)
+
+
+@jax.jit
+def looked_up(table, wo, *parameter):
+    return table.coefficients(wo, *parameter)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fewer():
+    """A third of the views at which errors are measured."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(harmonic, "_PROBES", 16)
+        yield
 
 
 @jax.jit
@@ -104,12 +122,12 @@ def test_tables_agree_with_another_quadrature_at_nodes_and_between_them_as_well_
     radius = np.sqrt(1 - height**2)
     between = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
     with jax.enable_x64(True):
-        brdf = jax.tree.map(lambda leaf: leaf.astype(float), SHARPNESS[name])
-        expected = np.asarray(by_half_vectors(brdf, jnp.asarray(np.concatenate([node, between]))))
+        brdf = jax.tree.map(lambda leaf: np.asarray(leaf, float), SHARPNESS[name])
+        expected = np.asarray(by_half_vectors(brdf, np.concatenate([node, between])))
     single = np.linalg.norm(actual - expected[..., :5], axis=(0, 1)) / np.linalg.norm(expected[..., :5], axis=(0, 1))
     assert single.max() < 2e-3 + QUADRATURE, f"{single}"
-    looked_up, expected = np.asarray(table.coefficients(jnp.asarray(between, jnp.float32))), expected[..., 5:]
-    missed = np.linalg.norm(looked_up - expected) / np.linalg.norm(expected)
+    found, expected = np.asarray(looked_up(table, between.astype(np.float32))), expected[..., 5:]
+    missed = np.linalg.norm(found - expected) / np.linalg.norm(expected)
     said = float(table.error)
     assert missed < 1.5 * said + QUADRATURE, f"{missed:.2e}, said {said:.2e}"
     assert said < 2 * missed + QUADRATURE, f"{missed:.2e}, said {said:.2e}"
@@ -131,10 +149,10 @@ def test_the_error_of_a_brdf_that_varies_counts_parameters_between_knots():
 
     with pytest.warns(UserWarning, match="give knots that are closer to each other"):
         table = tabulate(made, degree=1, error=1e-2, knot=(np.array([2.0, 50.0]),))
-    view = jnp.asarray(np.random.default_rng(2).normal(size=(48, 3)), jnp.float32)
-    view = jnp.abs(view / jnp.linalg.norm(view, axis=1, keepdims=True))
+    view = np.random.default_rng(2).normal(size=(48, 3))
+    view = np.abs(view / np.linalg.norm(view, axis=1, keepdims=True)).astype(np.float32)
     exact = project(made(jnp.asarray(26.0)), view, degree=1, rings=32, sectors=160)
-    missed = jnp.linalg.norm(table.coefficients(view, jnp.full(48, 26.0)) - exact) / jnp.linalg.norm(exact)
+    missed = np.linalg.norm(looked_up(table, view, np.full(48, 26.0, np.float32)) - exact) / np.linalg.norm(exact)
     np.testing.assert_allclose(table.error, missed, rtol=0.3)
 
 
@@ -155,8 +173,9 @@ def test_gradients_of_an_isotropic_table_are_those_of_finite_differences_at_the_
         place = jnp.stack([x, y, jnp.sqrt(1 - x**2 - y**2)])
         return weight @ table.coefficients((turn @ place)[None])[:, 0, 0]
 
+    slope = jax.jit(jax.grad(along, (0, 1)))
     for turn in (np.eye(3), np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]])):
-        gradient = jax.grad(along, (0, 1))(0.0, 0.0, turn)
+        gradient = slope(0.0, 0.0, turn)
         step = 1e-4
         numeric = [
             (along(step, 0.0, turn) - along(-step, 0.0, turn)) / (2 * step),
@@ -169,8 +188,8 @@ def test_an_isotropic_table_turns_with_the_view(tables, random, close):
     table, angle = tables("sharp"), 0.7
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     wi, wo = upper(random, 40), upper(random, 40, least=0.1)
-    turned = table(*(jnp.asarray(np.asarray(each) @ turn.T, jnp.float32) for each in (wi, wo)))
-    close(turned, table(wi, wo), tolerance=LOOKUP)
+    turned = value(table, *((each @ turn.T).astype(np.float32) for each in (wi, wo)))
+    close(turned, value(table, wi, wo), tolerance=LOOKUP)
 
 
 def test_one_coefficient_agrees_with_scipys_adaptive_quadrature():
@@ -183,7 +202,7 @@ def test_one_coefficient_agrees_with_scipys_adaptive_quadrature():
         return (0.2 / np.pi + 0.6 * 10 / (2 * np.pi) * lobe) * height * np.sqrt(15 / (4 * np.pi)) * wi[0] * wi[2]
 
     expected, _ = scipy.integrate.dblquad(integrand, 0, 1, 0, 2 * np.pi, epsabs=1e-7)
-    actual = project(brdf, jnp.asarray(view[None], jnp.float32), degree=2, rings=24, sectors=96)[7, 0, 0]
+    actual = project(brdf, np.float32(view[None]), degree=2, rings=24, sectors=96)[7, 0, 0]
     np.testing.assert_allclose(actual, expected, rtol=1e-4)
 
 
@@ -199,7 +218,7 @@ def test_lookup_at_texels_gives_the_table(table):
     center = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
     row, column = np.nonzero(center[:, None] ** 2 + center**2 < 1 - 1 / RESOLUTION)
     assert len(row) > 100
-    actual = table.coefficients(direction[row, column])
+    actual = looked_up(table, np.asarray(direction)[row, column])
     expected = np.asarray(table.table)[:, :, row, column]
     assert np.linalg.norm(actual - expected) < LOOKUP * np.linalg.norm(expected)
 
@@ -209,7 +228,7 @@ def test_lookup_between_texels_is_bilinear(table, random):
     place = (np.asarray(view, float)[:, :2] / (1 + np.asarray(view, float)[:, 2:]) + 1) / 2 * RESOLUTION - 0.5
     flat = np.asarray(table.table, float).reshape(75, RESOLUTION, RESOLUTION)
     expected = [scipy.ndimage.map_coordinates(each, place[:, ::-1].T, order=1, mode="nearest") for each in flat]
-    actual = table.coefficients(view).reshape(75, -1)
+    actual = np.asarray(looked_up(table, view)).reshape(75, -1)
     assert np.linalg.norm(actual - np.array(expected)) < LOOKUP * np.linalg.norm(expected)
 
 
@@ -217,7 +236,7 @@ def test_finer_tables_interpolate_better(tables, random):
     view, brdf = upper(random, RESOLUTION**2, least=0.2), SHARPNESS["glossy"]
     exact = project(brdf, view, degree=4, rings=24, sectors=96)
     error = [
-        np.linalg.norm(made.coefficients(view) - exact) / np.linalg.norm(exact)
+        np.linalg.norm(looked_up(made, view) - exact) / np.linalg.norm(exact)
         for made in (tabulate(brdf, resolution=6), tables("glossy"))
     ]
     assert error[0] > 5 * error[1]
@@ -225,32 +244,32 @@ def test_finer_tables_interpolate_better(tables, random):
 
 
 def test_views_below_the_horizon_and_on_it_see_nothing_and_gradients_are_finite(table):
-    view = jnp.array([[0.6, 0, -0.8], [0, 0, -1], [1, 0, 0], [0, 1, -1e-7], [0, 0, 1], [0, 1, 1e-7]], jnp.float32)
-    value = table.coefficients(view)
-    np.testing.assert_array_equal(value[..., :4], 0)
-    assert np.all(np.linalg.norm(value[..., 4:], axis=(0, 1)) > 0.01)
-    gradient = jax.grad(lambda v: jnp.sum(table.coefficients(v) ** 2))(view)
+    view = np.float32([[0.6, 0, -0.8], [0, 0, -1], [1, 0, 0], [0, 1, -1e-7], [0, 0, 1], [0, 1, 1e-7]])
+    found = np.asarray(looked_up(table, view))
+    np.testing.assert_array_equal(found[..., :4], 0)
+    assert np.all(np.linalg.norm(found[..., 4:], axis=(0, 1)) > 0.01)
+    gradient = jax.jit(jax.grad(lambda v: jnp.sum(table.coefficients(v) ** 2)))(view)
     assert np.isfinite(np.asarray(gradient)).all()
 
 
 @pytest.mark.parametrize("shape", [(), (7,), (2, 3), (0,)])
 def test_values_are_the_sum_of_coefficients_times_harmonics_for_any_batch(table, random, close, shape):
     wi, wo = upper(random, *shape), upper(random, *shape, least=0.1)
-    value = table(wi, wo)
-    assert value.shape == (*shape, 3)
-    row = table.coefficients(wo.reshape(-1, 3))
-    basis = harmonics.evaluate(wi.reshape(-1, 3), degree=4)
-    expected = jnp.stack([row[:, :, n].T @ basis[n] for n in range(basis.shape[0])]) if value.size else value
-    close(value.reshape(-1, 3), expected.reshape(-1, 3))
+    found = np.asarray(value(table, wi, wo))
+    assert found.shape == (*shape, 3)
+    wi, wo = (np.resize(each, (7, 3)) for each in (wi, wo))
+    row, basis = np.asarray(looked_up(table, wo)), np.asarray(harmonics.evaluate(wi, degree=4))
+    expected = [row[:, :, n].T @ basis[n] for n in range(found.size // 3)]
+    close(found.reshape(-1, 3), np.reshape(expected, (-1, 3)))
 
 
 def test_more_bands_carry_more_of_the_brdf(tables, random):
     table = tables("glossy")
     texel = np.asarray(hemisphere.parabolic_texel_direction(resolution=RESOLUTION))[4:12, 4:12].reshape(-1, 3)
-    wo = jnp.repeat(jnp.asarray(texel), 100, 0)
+    wo = np.repeat(texel, 100, 0)
     wi = upper(random, len(wo))
-    exact = np.asarray(SHARPNESS["glossy"](wi, wo) * wi[:, 2:])
-    error = [np.linalg.norm(table.truncate(degree=n)(wi, wo) - exact) / np.linalg.norm(exact) for n in range(5)]
+    exact = value(SHARPNESS["glossy"], wi, wo) * wi[:, 2:]
+    error = [np.linalg.norm(value(table.truncate(degree=n), wi, wo) - exact) / np.linalg.norm(exact) for n in range(5)]
     assert (np.diff(error) < -0.05).all()
     assert table.truncate(degree=2).degree == 2
     np.testing.assert_array_equal(table.truncate(degree=2).table, table.table[:9])
@@ -270,37 +289,40 @@ def varying():
 
 def test_knots_have_the_tables_of_their_brdfs(varying, close):
     assert varying.table.shape == (4, 1, 3, 2, 6)
-    view = jnp.array([[0.2, -0.3, 0.93], [0.6, 0, 0.8]])
+    view = np.float32([[0.2, -0.3, 0.93], [0.6, 0, 0.8]])
     for i, exponent in ((0, 2.0), (2, 20.0)):
         for j, specular in enumerate((0.0, 0.6)):
             single = tabulate(Phong(diffuse=0.3, specular=specular, exponent=exponent), degree=1, resolution=6)
-            close(varying.table[:, :, i, j], single.table, tolerance=2e-3)  # Each has a rule of its own.
-            parameter = jnp.full(2, exponent), jnp.full(2, specular)
-            close(varying.coefficients(view, *parameter), single.coefficients(view), tolerance=2e-3)
+            close(np.asarray(varying.table)[:, :, i, j], single.table, tolerance=2e-3)  # Each has a rule of its own.
+            parameter = np.full(2, exponent, np.float32), np.full(2, specular, np.float32)
+            close(looked_up(varying, view, *parameter), looked_up(single, view), tolerance=2e-3)
 
 
 def test_parameters_interpolate_linearly_and_clamp_to_their_knots(varying, random, close):
     view = upper(random, 8, least=0.2)
-    exponent = jnp.array([2.0, 3.5, 5.0, 12.5, 20.0, 1.0, -jnp.inf, 1e9])
-    specular = jnp.array([0.0, 0.3, 0.6, 0.15, 0.45, -5.0, 0.7, jnp.inf])
+    exponent = np.float32([2.0, 3.5, 5.0, 12.5, 20.0, 1.0, -np.inf, 1e9])
+    specular = np.float32([0.0, 0.3, 0.6, 0.15, 0.45, -5.0, 0.7, np.inf])
     low, first = np.array([0, 0, 1, 1, 1, 0, 0, 1]), np.array([0, 0.5, 0, 0.5, 1, 0, 0, 1])
     second = np.array([0, 0.5, 1, 0.25, 0.75, 0, 1, 1])
+    table = np.asarray(varying.table)
+    every = np.array(
+        [
+            [looked_up(HarmonicBrdf(jnp.asarray(table[:, :, i, j]), (), varying.error), view) for j in (0, 1)]
+            for i in (0, 1, 2)
+        ]
+    )
 
     def corner(i, j):
-        part = [
-            HarmonicBrdf(varying.table[:, :, a, j], (), varying.error).coefficients(view[n : n + 1])
-            for n, a in enumerate(i)
-        ]
-        return np.concatenate(part, -1)
+        return np.stack([every[a, j][..., n] for n, a in enumerate(i)], -1)
 
     expected = sum(
         corner(low + a, b) * np.where(a, first, 1 - first) * np.where(b, second, 1 - second)
         for a in (0, 1)
         for b in (0, 1)
     )
-    actual = varying.coefficients(view, jnp.clip(exponent, -1e30, 1e30), jnp.clip(specular, -1e30, 1e30))
-    close(actual, expected)
-    close(varying.coefficients(view, exponent, specular), expected)
+    clipped = (np.clip(each, -1e30, 1e30) for each in (exponent, specular))
+    close(looked_up(varying, view, *clipped), expected)
+    close(looked_up(varying, view, exponent, specular), expected)
 
 
 def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
@@ -309,22 +331,23 @@ def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
 
     table = tabulate(made, degree=0, resolution=4, knot=(np.array([0.0, 1.0]),))
     assert table.table.shape == (1, 3, 2, 4)
-    np.testing.assert_allclose(table.table[0, :, 0, 2], 0.5 / np.sqrt(np.pi) / 2 * np.ones(3), rtol=1e-3)
-    np.testing.assert_allclose(table.table[0, :, 1, 2], np.array([0.5, 0.25, 0.1]) / np.sqrt(np.pi) / 2, rtol=1e-3)
+    row = np.asarray(table.table)[0, :, :, 2]
+    np.testing.assert_allclose(row[:, 0], 0.5 / np.sqrt(np.pi) / 2 * np.ones(3), rtol=1e-3)
+    np.testing.assert_allclose(row[:, 1], np.array([0.5, 0.25, 0.1]) / np.sqrt(np.pi) / 2, rtol=1e-3)
 
 
 def test_any_function_is_tabulated_as_the_model_that_it_is(tables, close):
     model = SHARPNESS["matte"]
     plain = tabulate(lambda wi, wo: model(wi, wo), degree=1, resolution=RESOLUTION)
-    close(plain.table, tables("matte").truncate(degree=1).table)
+    close(plain.table, np.asarray(tables("matte").table)[:4])
 
 
 def test_a_quarter_turn_about_the_normal_exchanges_the_exponents(table, random):
     other = AshikhminShirley(diffuse=COLORED.diffuse, specular=COLORED.specular, nu=100.0, nv=10.0)
-    quarter = jnp.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], jnp.float32)
+    quarter = np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     turned = tabulate(other, resolution=RESOLUTION)
     wi, wo = upper(random, 40), upper(random, 40, least=0.1)
-    np.testing.assert_allclose(turned(wi @ quarter.T, wo @ quarter.T), table(wi, wo), atol=2e-3)
+    np.testing.assert_allclose(value(turned, wi @ quarter.T, wo @ quarter.T), value(table, wi, wo), atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -375,4 +398,4 @@ def test_bands_that_are_not_there_are_refused(table, degree):
 def test_a_table_whose_rows_are_no_square_is_refused(random):
     broken = HarmonicBrdf(jnp.zeros((8, 1, 4, 4)), (), jnp.zeros(()))
     with pytest.raises(ValueError, match="must be a square number, got 8"):
-        broken(upper(random, 2), upper(random, 2))
+        value(broken, upper(random, 2), upper(random, 2))
