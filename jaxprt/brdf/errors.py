@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,6 +112,11 @@ def sample_error(
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
+    return _sample_error(brdf, factored, samples)
+
+
+@eqx.filter_jit
+def _sample_error(brdf: Callable, factored: Callable, samples: int) -> tuple[Array, Array]:
     height, turn = jax.random.uniform(jax.random.key(0), (2, 2, samples), jnp.result_type(float))
     height = 1 - height  # In (0, 1]: above the horizon.
     radius, angle = jnp.sqrt(1 - height**2), 2 * jnp.pi * turn

@@ -113,7 +113,8 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
     if brdf.lobe is not None or not brdf.core.size:
         found = "those of what its lobes leave" if brdf.core.size else "none"
         raise ValueError(f"light paths need terms of whole BRDFs, from ranks and without lobes, got {found}")
-    return SeparableBrdf(*_functions(brdf.core, brdf.view_map, brdf.light_map), brdf.error, brdf.coordinates)
+    light, view = _functions(brdf.core, brdf.view_map, brdf.light_map)
+    return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
 
 
 @jax.jit
