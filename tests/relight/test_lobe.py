@@ -1,11 +1,12 @@
 """Relighting by lobes against the sum over all texels."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf import AshikhminShirley, CookTorrance
 from jaxprt.brdf import lobe as lobes
 from jaxprt.linalg import mixture
 from jaxprt.relight import direct as texels
@@ -16,27 +17,35 @@ from jaxprt.sphere import cubemap
 from jaxprt.transport import direct
 from jaxprt.transport import lobe as transports
 
+pytestmark = pytest.mark.usefixtures("few_samples")
 SIZE = 16
 EYE = jnp.array([1.2, 1.5, 2.5])
 # Errors of total radiance; what was measured, and half as much again.
-COARSE = {"matte": 0.01, "glossy": 0.03, "sharp": 0.06, "brushed": 0.013}
+COARSE = {"matte": 0.01, "glossy": 0.03, "sharp": 0.021, "brushed": 0.013}
 FURNACE = 0.0125  # Of all vertices together, measured .0083: pyramids and lookups blur the horizon.
 GRAZING = 0.085  # Of the worst vertex, measured .056.
 BLUR = 0.08  # Measured .077 at the finest scale that texels resolve: the lookup's tent is taken out of the blur.
 COVARIANCE = 0.05  # Of the covariance, what terms of higher order leave: measured .034.
 BRDFS = {
-    "matte": Lambert([0.8, 0.5, 0.2]),
-    "glossy": CookTorrance(diffuse=0.0, roughness=0.3),
+    "matte": CookTorrance(diffuse=[0.8, 0.5, 0.2], specular=0.0),  # Lambert, by programs that the next two share.
+    "glossy": CookTorrance(diffuse=[0.0, 0.0, 0.0], roughness=0.3),
     "sharp": CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.1),
     "brushed": AshikhminShirley(nu=8, nv=60),
 }
 
 
+def seen_from(depth):
+    """The visibility of a ball and of the ground that far below it."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    ground = ground_plane(ball, vertices=36)
+    below = eqx.tree_at(lambda mesh: mesh.position, ground, ground.position - jnp.array([0, depth, 0]))
+    return direct.precompute(join([ball, below]), size=SIZE, progress=False)
+
+
 @pytest.fixture(scope="module")
 def visible():
-    """A ball over the ground."""
-    ball = builtin.sphere(rings=8, sectors=10)
-    return direct.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE, progress=False)
+    """A ball on the ground."""
+    return seen_from(0.0)
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +105,12 @@ def test_light_that_grows_towards_the_open_side_counts_more():
 
 def test_a_furnace_gives_back_its_albedo(tables):
     """An open vertex under constant light: the lobes' energy, cut by the horizon."""
-    mesh = builtin.sphere(rings=8, sectors=10)
-    frames = direct.precompute(mesh, size=SIZE, progress=False)
+    frames = seen_from(1e4)
     open_above = transports.compress(frames)
-    white = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
     color = np.asarray(lobe.radiance(open_above, tables["glossy"], white, eye=EYE))
     expected = all_texels(frames, BRDFS["glossy"], white)
-    seen = facing(frames)
+    seen = facing(frames) & (frames.position[:, 1] > -10)  # the ball
     np.testing.assert_allclose(color[seen], expected[seen], rtol=GRAZING)
     assert abs(color[seen].sum() / expected[seen].sum() - 1) < FURNACE
 
@@ -139,7 +147,7 @@ def test_radiance_is_linear_in_the_light(transport, tables, light, close):
 def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, tables, light, close):
     gray = Environment(jnp.mean(light.radiance, -1, keepdims=True))
     colored = Environment(jnp.repeat(gray.radiance, 3, -1))
-    for name in ("sharp", "glossy"):
+    for name in ("sharp", "brushed"):
         color = lobe.radiance(transport, tables[name], gray, eye=EYE)
         expected = lobe.radiance(transport, tables[name], colored, eye=EYE)
         close(np.broadcast_to(color, expected.shape), expected)
@@ -175,7 +183,7 @@ def test_gradients_by_light_eye_and_table_are_finite_differences(transport, tabl
 
 def test_a_light_of_another_size_is_refused(transport, tables):
     with pytest.raises(ValueError, match=r"must have the transport's 16 texels, got 32"):
-        lobe.radiance(transport, tables["matte"], builtin.daylight(size=32), eye=EYE)
+        lobe.radiance(transport, tables["matte"], Environment(np.ones((6, 32, 32, 3), np.float32)), eye=EYE)
 
 
 def test_a_batch_of_lights_is_refused(light, unchecked):
@@ -183,8 +191,15 @@ def test_a_batch_of_lights_is_refused(light, unchecked):
         lobe.prefilter(Environment(jnp.stack([light.radiance] * 2)))
 
 
-def test_a_table_with_parameters_is_refused(transport, light):
-    table = lobes.tabulate(lambda m: CookTorrance(roughness=m), lobes=2, resolution=6, knot=[np.array([0.2, 0.4])])
+def test_a_table_with_parameters_is_refused(transport, tables, light):
+    both = jax.tree.map(np.asarray, (tables["sharp"], tables["glossy"]))
+    mean, scale, weight, diffuse = (
+        np.stack([getattr(each, part) for each in both], axis)
+        for part, axis in (("mean", 2), ("scale", 1), ("weight", 2), ("diffuse", 1))
+    )
+    table = lobes.LobeBrdf(
+        *map(jnp.asarray, (mean, scale, weight, diffuse)), (jnp.log(jnp.array([0.1, 0.3])),), tables["sharp"].error
+    )
     with pytest.raises(ValueError, match=r"has 1 parameters, which `at` must choose first"):
         lobe.radiance(transport, table, light, eye=EYE)
-    assert np.isfinite(lobe.radiance(transport, table.at(jnp.asarray(0.3)), light, eye=EYE)).all()
+    assert np.isfinite(lobe.radiance(transport, table.at(jnp.asarray(-1.7)), light, eye=EYE)).all()
