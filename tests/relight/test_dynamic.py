@@ -13,14 +13,15 @@ from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.transport import dynamic as transports
 
-SIZE = 16
+pytestmark = pytest.mark.usefixtures("few_samples")
+SIZE = 8
 EYE = jnp.array([1.2, 1.5, 2.5])
 ROUGH = [0.25, 0.4, 0.6]
 ALBEDO = jnp.array([0.5, 0.4, 0.3])
-# Relative errors: half as much again as measured, which was .0122 at the sharpest, .0069 and .0083.
+# Relative errors: half as much again as measured, which was .0125, .0056 and .0071.
 GLOSSY = 0.018
-GROUND = 0.0105
-TENSOR = 0.0125
+GROUND = 0.0085
+TENSOR = 0.0105
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def family():
 
 @pytest.fixture(scope="module")
 def fixed():
-    return separable.factor(Lambert(ALBEDO), terms=1, resolution=8)
+    return separable.factor(Lambert(ALBEDO), terms=1, resolution=4)
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +83,11 @@ def test_radiance_is_the_sum_over_all_texels(mesh, transport, family, fixed, lin
     model = CookTorrance(
         diffuse=jnp.array([0.3, 0.2, 0.1]), specular=jnp.array([0.5, 0.5, 0.4]), roughness=roughness, f0=0.3
     )
+    matte = CookTorrance(diffuse=ALBEDO, specular=jnp.zeros(3), roughness=roughness, f0=0.3)  # shares its program
     exact = by_region(
         mesh,
         reference.radiance(mesh, model, light, eye=EYE),
-        reference.radiance(mesh, Lambert(ALBEDO), light, eye=EYE),
+        reference.radiance(mesh, matte, light, eye=EYE),
     )
     ball, ground = ball_in_view(mesh), np.asarray(mesh.region) == 1
     assert relative(np.asarray(color)[ball], exact[ball]) < GLOSSY
@@ -101,17 +103,19 @@ def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
     matter = dynamic.Material(jnp.array([1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
     color = dynamic.radiance(transport, [tensor, fixed], [matter, None], light, eye=EYE)
     ball = ball_in_view(mesh)
-    exact = np.asarray(reference.radiance(mesh, members[0], light, eye=EYE))
+    model = CookTorrance(diffuse=jnp.zeros(3), specular=jnp.ones(3), roughness=0.6, f0=0.9)
+    exact = np.asarray(reference.radiance(mesh, model, light, eye=EYE))
     assert relative(np.asarray(color)[ball], exact[ball]) < TENSOR
 
 
 def test_terms_of_the_remainder_change_little(mesh, transport, family, fixed, light):
-    """They are by a wavelet transport what lobes leave by their own: the error was 1.10 times that of lobes alone."""
+    """They are by a wavelet transport what lobes leave by their own: the error was 0.91 times that of lobes alone."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in ROUGH]
     more = brdfs.factor(members, family.lobe, ranks=(3, 12, 12), resolution=16)
     matter = dynamic.Material(jnp.array([0.0, 1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
     ball = ball_in_view(mesh)
-    exact = np.asarray(reference.radiance(mesh, members[1], light, eye=EYE))[ball]
+    model = CookTorrance(diffuse=jnp.zeros(3), specular=jnp.ones(3), roughness=ROUGH[1], f0=0.3)
+    exact = np.asarray(reference.radiance(mesh, model, light, eye=EYE))[ball]
     error = []
     for each, made in (
         (family, transport),
@@ -151,25 +155,27 @@ def test_staged_calls_equal_the_whole(transport, family, fixed, line, light):
     np.testing.assert_allclose(dynamic.combine(transport, lit, seen), whole, rtol=1e-6)
 
 
-def test_gradient_by_all_that_can_change(transport, family, fixed, line, light):
+def test_gradients_by_roughness_and_weight_add_up_to_differences(transport, family, fixed, line, light):
+    """`test_contract` holds those by the light, the eye and the shares to finite differences in float64."""
     there = [material(line, 0.6, 0.9 * np.ones(3)), None]
     target = dynamic.radiance(transport, [family, fixed], there, light, eye=EYE)
+    lit = dynamic.light_side(transport, light)
 
-    def loss(roughness, weight, radiance):
-        matter = material(line, roughness, weight * jnp.ones(3))
-        color = dynamic.radiance(transport, [family, fixed], [matter, None], Environment(radiance), eye=EYE)
+    def loss(roughness, weight):
+        now = [material(line, roughness, weight * jnp.ones(3)), None]
+        color = dynamic.combine(transport, lit, dynamic.view_side(transport, [family, fixed], now, eye=EYE))
         return jnp.mean((color - target) ** 2)
 
-    at = (jnp.array(0.33), jnp.array(0.4), light.radiance)
-    gradient = jax.grad(loss, (0, 1, 2))  # One for all, whose parts compile once.
-    assert all(bool(jnp.isfinite(each).all()) for each in gradient(*at))
     # Lookups are linear from texel to texel: integrals of derivatives, and not single ones, are differences.
-    for number, end in ((0, (0.26, 0.39)), (1, (0.2, 0.6))):
-        way = np.linspace(*end, 15)
-        along = [tuple(jnp.array(x) if i == number else at[i] for i in range(3)) for x in way]
-        slope = [float(gradient(*each)[number]) for each in along]
-        whole = float(loss(*along[-1]) - loss(*along[0]))
-        np.testing.assert_allclose(np.trapezoid(slope, way), whole, rtol=0.05)
+    count = 15
+    rough, weight = np.full((2, 2 * count), [[0.33], [0.4]], np.float32)
+    rough[:count], weight[count:] = np.linspace(0.26, 0.39, count), np.linspace(0.2, 0.6, count)
+    both = jax.value_and_grad(loss, (0, 1))
+    found = jax.jit(lambda *way: jax.lax.map(lambda at: both(*at), way))(rough, weight)
+    value, slope = jax.tree.map(np.asarray, found)
+    for way, along, part in ((rough, slope[0], slice(count)), (weight, slope[1], slice(count, None))):
+        whole = value[part][-1] - value[part][0]
+        np.testing.assert_allclose(np.trapezoid(along[part], way[part]), whole, rtol=0.05)
 
 
 def test_a_region_that_does_not_change_has_no_machinery(transport):
@@ -252,8 +258,8 @@ def test_shares_of_a_navigation_and_traced_materials_pass(unchecked):
 
 
 def test_a_light_of_another_size_is_refused(transport):
-    with pytest.raises(ValueError, match=r"one environment \[6, 16, 16, c\]"):
-        dynamic.light_side(transport, builtin.daylight(size=8))
+    with pytest.raises(ValueError, match=r"one environment \[6, 8, 8, c\]"):
+        dynamic.light_side(transport, Environment(jnp.ones((6, 16, 16, 3))))
 
 
 def test_arguments_of_other_kinds_are_refused(transport, family, fixed, line, light, unchecked):
