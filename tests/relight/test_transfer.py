@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxprt.brdf import CookTorrance, Lambert, dynamic, paths, separable
+from jaxprt.brdf import CookTorrance, Lambert, dynamic, lobe, paths, separable
 from jaxprt.relight import dynamic as direct
 from jaxprt.relight import transfer as relight
 from jaxprt.relight.dynamic import Material
@@ -17,7 +17,8 @@ from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.transport import dynamic as transports
 from jaxprt.transport import harmonic, interreflection, transfer
 
-SIZE = 16
+pytestmark = pytest.mark.usefixtures("few_samples")
+SIZE = 8
 EYE = jnp.array([1.0, 2.5, 3.0])
 MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.3, 0.5)]
 
@@ -31,8 +32,10 @@ def mesh():
 @pytest.fixture(scope="module")
 def brdfs():
     """A set with lobes, and one BRDF for good."""
-    glossy = dynamic.factor(MEMBERS, dynamic.separate(MEMBERS, lobes=2))
-    return [glossy, separable.factor(Lambert([0.6, 0.4, 0.2]), terms=1, resolution=8)]
+    glossy = dynamic.factor(
+        MEMBERS, dynamic.separate(MEMBERS, separator=lambda each: lobe.tabulate(each, lobes=2, resolution=16))
+    )
+    return [glossy, separable.factor(Lambert([0.6, 0.4, 0.2]), terms=1, resolution=4)]
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +112,9 @@ def test_what_a_factored_brdf_sends_of_harmonics_is_its_integral(mesh):
 
 def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible(mesh):
     """White surfaces under constant light: what two bounces leave of radiance one is little."""
-    white = separable.factor(Lambert(1.0), terms=1, resolution=8)
+    white = separable.factor(Lambert(1.0), terms=1, resolution=4)
     transport = transports.precompute(mesh, [white, white], size=SIZE, progress=False)
-    tensor = transfer.precompute(mesh, [white, white], edge=4, components=136, modes=96, progress=False)
+    tensor = transfer.precompute(mesh, [white, white], edge=4, components=136, modes=96, size=8, progress=False)
     ones = Environment(jnp.ones((6, SIZE, SIZE, 1)))
     eye = jnp.array([0.0, 50.0, 0.0])
     facing = np.asarray(mesh.normal)[:, 1] > 0.1
@@ -172,12 +175,12 @@ def test_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, 
 
 
 def test_reflected_radiance_by_light_and_material_is_finite_differences(transport, tensor, brdfs):
-    """That of direct light is differentiated beside it in `test_dynamic` and, with this, in `test_contract`."""
+    """What the view and the direct light add is differentiated in `test_dynamic` and, with this, in `test_contract`."""
     lamp, direction = light(), light(1).radiance - 0.5
+    view = relight.view_side(transport, direct.view_side(transport, brdfs, [material(), None], eye=EYE))
 
     def mean(step, color, share):
         now, lights = [Material(share, color, 0.6), None], Environment(lamp.radiance + step * direction)
-        view = relight.view_side(transport, direct.view_side(transport, brdfs, now, eye=EYE))
         arrived = relight.arriving(transport, tensor, relight.light_side(tensor, lights), now)
         return jnp.mean(relight.combine(transport, arrived, view))
 
