@@ -5,6 +5,7 @@ entered. A block counts only if its checksum is there and right, so a process ma
 be lost or cut off, and what is read back is either what was written or reported missing.
 """
 
+import functools
 import os
 import shutil
 import zlib
@@ -125,7 +126,7 @@ def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
         The tolerance, the norm and the sums.
     """
     flat = np.asarray(array).reshape(-1)
-    sign = np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
+    sign = _signs()
     total, square = np.zeros(_SUMS), 0.0
     for number, first in enumerate(range(0, len(flat), _PART)):
         part = flat[first : first + _PART].astype(np.float64)
@@ -134,6 +135,12 @@ def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
         total += np.pad(signed, (0, -len(part) % _SUMS)).reshape(-1, _SUMS).sum(0)
         square += float(part @ part)
     return [tolerance, float(np.sqrt(square)), *total.tolist()]
+
+
+@functools.cache
+def _signs() -> np.ndarray:
+    """The signs of all sketches; making them takes longer than most sums."""
+    return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
 
 
 def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:
