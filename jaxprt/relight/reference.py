@@ -65,7 +65,7 @@ def radiance(
     start = visibility.start_points(mesh, rays)
     vertex = visibility.chosen(mesh, vertex)
     normal = np.asarray(mesh.normal, np.float32)
-    frame = directions.frame(mesh.normal, mesh.tangent)
+    position, upright, tangent = (np.asarray(each) for each in (mesh.position, mesh.normal, mesh.tangent))
     size = light.radiance.shape[-2]
     brdf = grid.as_argument(brdf)
     if not vertex.size:
@@ -74,7 +74,8 @@ def radiance(
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
         seen, _ = visibility.fractional(rays, start[part], normal[part], size=size)
-        block = integrate(seen, mesh.position[part], frame[part], brdf, light, eye, error=error)
+        frame = directions.frame(upright[part], tangent[part])
+        block = integrate(seen, position[part], frame, brdf, light, eye, error=error)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
 

@@ -204,8 +204,10 @@ class VisibilityJob(blocks.Job):
         shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
-        normal, tangent = (jnp.asarray(np.asarray(each)[vertex]) for each in (mesh.normal, mesh.tangent))
-        frame = np.asarray(directions.frame(normal, tangent), np.float32)
+        # Padded to a power of two, so that few shapes are compiled.
+        padded = np.pad(vertex, (0, (1 << max(6, (len(vertex) - 1).bit_length())) - len(vertex)))
+        normal, tangent = (np.asarray(each)[padded] for each in (mesh.normal, mesh.tangent))
+        frame = np.asarray(directions.frame(normal, tangent), np.float32)[: len(vertex)]
         # By what is given, not by what is traced or computed of it, which other kinds of processors round otherwise.
         key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}

@@ -327,8 +327,8 @@ def test_vmap_over_cameras_equals_a_loop():
 
 
 def test_jit_equals_eager():
-    position, face = _torus(6, 5)
-    mesh, camera = _mesh(position, face), _camera(eye=(0, 2, 2), width=12, height=10)
+    position, face = _torus(3, 3)
+    mesh, camera = _mesh(position, face), _camera(eye=(0, 2, 2), width=6, height=5)
     compiled = raster.render(mesh, mesh.position, camera)
     with jax.disable_jit():
         eager = raster.render(mesh, mesh.position, camera)
