@@ -25,17 +25,17 @@ FURNACE = 0.01  # Bilinear lookup, and rays that the horizon cuts.
 
 @pytest.fixture(scope="module")
 def lambert():
-    return tabulate(Lambert(1.0), resolution=16)
+    return tabulate(Lambert(1.0), resolution=8)
 
 
 @pytest.fixture(scope="module")
 def mirror():
     """Three degrees wide."""
-    return tabulate(CookTorrance(diffuse=0.0, specular=0.7, roughness=0.03, f0=1.0), resolution=16)
+    return tabulate(CookTorrance(diffuse=0.0, specular=0.7, roughness=0.03, f0=1.0), resolution=8)
 
 
 def sphere():
-    return builtin.sphere(rings=6, sectors=10)
+    return builtin.sphere(rings=6, sectors=10)  # 52 vertices
 
 
 def box():

@@ -82,7 +82,9 @@ def test_bounces_between_diffuse_regions_are_those_of_the_harmonic_system(mesh, 
 
 def test_what_arrives_is_a_loop_over_rays(mesh, seen, frame, met):
     """Of a glossy BRDF in three colors, one of which is a multiple of another."""
-    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3, nu=5, nv=9), terms=6, resolution=12)
+    glossy = separable.factor(
+        AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.3, nu=5, nv=9), terms=6, resolution=12
+    )
     basis, weight = paths.basis(glossy), paths.fixed_weights(glossy)
     response = bounce.respond(seen, frame, basis, edge=EDGE)
     rays, basis_2 = met[1], shining(2)

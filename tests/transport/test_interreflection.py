@@ -15,13 +15,13 @@ from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.transport.harmonic import TransferVector, precompute, precompute_diffuse
 from jaxprt.transport.interreflection import interreflect, interreflect_diffuse
 
-SIZE = 16
+SIZE = 8
 EYE = jnp.array([1.0, 3.0, 4.0])
 WHITE = jnp.zeros((25, 1)).at[0].set(np.sqrt(4 * np.pi))
 # One ray through the center of each texel: edges of what it meets are told to a texel's width.
 TEXELS = 0.02
 # Transport by sixteenths of texels and bounces by whole ones do not add to exactly one.
-FURNACE = 0.015
+FURNACE = 0.015  # of 167 vertices and faces of 16 x 16
 # What of a bounce's light, which one side of a vertex may see and not the other, lies above degree 4.
 CARRIED = 0.03
 
@@ -48,12 +48,15 @@ def bounce(mesh, value, albedo, *, size=64, bounces=1):
     return np.asarray(total.vector - transport.vector)[0, 0]
 
 
+def ball_and_ground(rings, sectors, cells):
+    """A sphere above a ground, each a region."""
+    return join([builtin.sphere(rings=rings, sectors=sectors), sheet([-3, -1.3, -3], [0, 0, 6], [6, 0, 0], cells)])
+
+
 @pytest.fixture(scope="module")
 def mesh():
-    """A sphere above a ground, each a region."""
-    ball = builtin.sphere(rings=8, sectors=12)
-    ground = sheet([-3, -1.3, -3], [0, 0, 6], [6, 0, 0], 8)
-    return join([ball, ground])
+    """One block of vertices."""
+    return ball_and_ground(5, 8, 4)
 
 
 @pytest.fixture(scope="module")
@@ -149,10 +152,11 @@ def grid_faces(rows, columns):
     return np.concatenate([np.concatenate([a, b, c], 1), np.concatenate([a, c, d], 1)])
 
 
-def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow(mesh, vector):
-    before = None
+def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow():
+    mesh, size, before = ball_and_ground(8, 12, 8), 16, None
+    vector = precompute_diffuse(mesh, size=size, progress=False)
     for bounces in (0, 1, 2, 15):
-        total = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=bounces, size=SIZE, progress=False)
+        total = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=bounces, size=size, progress=False)
         color = np.asarray(relight.diffuse_radiance(total, jnp.ones(()), WHITE))[:, 0]
         assert color.max() < 1 + FURNACE
         if before is not None:
@@ -169,7 +173,7 @@ def test_a_white_furnace_is_as_white_through_matrices(mesh, matrix, vector):
     expected = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=3, size=SIZE, progress=False)
     expected = np.asarray(relight.diffuse_radiance(expected, jnp.ones(()), WHITE))[:, 0]
     seen = first > 0
-    assert seen.sum() > 50
+    assert seen.sum() > 30
     assert (color[seen] >= first[seen]).all()
     assert color.max() < 1 + CARRIED
     np.testing.assert_allclose(color[seen], expected[seen], atol=2 * CARRIED)
