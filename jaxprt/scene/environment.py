@@ -25,6 +25,7 @@ _CUBES = {
     "horizontal-strip": ((1, 6), tuple((0, i) for i in range(6)), _PLAIN),
     "openexr-cube": ((6, 1), tuple((i, 0) for i in range(6)), _OPENEXR_STEP),
 }
+_AROUND = 4096  # least number of parts around the horizon
 _PARTS = 8  # A pixel is dealt out in at most as many parts in each direction; larger pixels are first divided.
 _CHUNK = 2**20  # Parts of pixels that are dealt out at a time.
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
@@ -301,7 +302,7 @@ def _resample_cube(face: np.ndarray, edge: np.ndarray, size: int) -> np.ndarray:
 def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
     """Deals out small parts of the pixels to texels, given the edges of the pixels' rows and columns."""
     # A texel is at least 2 / (3 size) wide, in the corners of a face: let some eight parts fall across it.
-    around = max(12 * size * 2 * np.pi, 4096)
+    around = max(12 * size * 2 * np.pi, _AROUND)
     parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
     repeat = [-(-count // _PARTS) for count in parts]
     image = image.repeat(repeat[0], axis=0).repeat(repeat[1], axis=1)

@@ -111,6 +111,13 @@ def turn(vector):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
+@pytest.fixture
+def few_parts(monkeypatch):
+    """Pictures are dealt out in as many parts as their texels need, where users get at least 4096 around."""
+    monkeypatch.setattr(environment, "_AROUND", 512)
+
+
+@pytest.mark.usefixtures("few_parts")
 @pytest.mark.parametrize("layout", environment.LAYOUTS)
 def test_every_layout_puts_each_color_on_its_axis_and_mirrors_nothing(layout):
     light = environment.environment_from_image(picture(layout, 128), layout=layout, size=32)
@@ -123,6 +130,7 @@ def test_every_layout_puts_each_color_on_its_axis_and_mirrors_nothing(layout):
     assert wrong.mean() < 0.03
 
 
+@pytest.mark.usefixtures("few_parts")
 def test_layouts_are_told_from_the_shape_and_the_envmap_attribute(tmp_path):
     expected = np.asarray(environment.environment_from_image(picture("vertical-cross", 64), size=16).radiance)
     for layout in environment.LAYOUTS:
@@ -139,6 +147,7 @@ def test_layouts_are_told_from_the_shape_and_the_envmap_attribute(tmp_path):
         assert (np.abs(found - expected).max(-1) > 0.3).mean() < 0.08
 
 
+@pytest.mark.usefixtures("few_parts")
 @pytest.mark.parametrize("size", [1, 3, 64])
 @pytest.mark.parametrize(
     ("layout", "height", "width"),
@@ -205,11 +214,13 @@ def test_a_texel_of_a_coarse_latlong_picture_holds_the_pixel_it_lies_in():
     assert (np.abs(result - expected).max(-1) > 1e-3).mean() < 0.1  # Texels across a border of pixels.
 
 
+@pytest.mark.usefixtures("few_parts")
 def test_a_single_pixel_is_constant_light():
     light = environment.environment_from_image(np.full((1, 1, 3), 0.3, np.float32), size=4)
     np.testing.assert_array_equal(light.radiance, np.full((6, 4, 4, 3), np.float32(0.3)))
 
 
+@pytest.mark.usefixtures("few_parts")
 def test_black_stays_black():
     light = environment.environment_from_image(np.zeros((8, 16, 3), np.float32), size=16)
     assert not np.asarray(light.radiance).any()
@@ -218,6 +229,7 @@ def test_black_stays_black():
     ).any()
 
 
+@pytest.mark.usefixtures("few_parts")
 def test_gray_and_alpha_become_three_colors():
     gray = np.random.default_rng(0).random((8, 16, 1)).astype(np.float32)
     alpha = np.full_like(gray, 0.25)
@@ -234,6 +246,7 @@ def test_values_that_are_not_finite_are_refused_with_the_first_place(tmp_path):
         environment.load_environment(tmp_path / "sky.exr")
 
 
+@pytest.mark.usefixtures("few_parts")
 def test_negative_values_are_set_to_zero_with_one_warning():
     image = np.ones((8, 16, 3), np.float32)
     image[3, 5] = [-0.25, -0.1, 1]
