@@ -247,9 +247,9 @@ def test_the_gradient_by_the_coefficients_is_the_rotation_back(x64, close):
 
 def test_gradients_of_many_at_once_are_those_of_each_alone_in_either_precision(x64, close):
     coefficient, weight = normal(22, 16, 2), normal(23, 16, 2, len(EVERY))
-    gradient = jax.grad(lambda r, c, g: jnp.sum(g * rotation.rotate_each(c, r)))
+    gradient = jax.jit(jax.grad(lambda r, c, g: jnp.sum(g * rotation.rotate_each(c, r))))
     expected = gradient(jnp.asarray(EVERY), coefficient, weight)
-    alone = jax.vmap(jax.grad(lambda r, g: jnp.sum(g * rotation.rotate(coefficient, r))), (0, -1))
+    alone = jax.jit(jax.vmap(jax.grad(lambda r, g: jnp.sum(g * rotation.rotate(coefficient, r))), (0, -1)))
     close(expected, alone(jnp.asarray(EVERY), weight))
     single = (jnp.asarray(array, jnp.float32) for array in (EVERY, coefficient, weight))
     close(gradient(*single), expected)
