@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -154,6 +153,21 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     return Fit(unravel(found), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
+_solver: Any = jaxopt.LevenbergMarquardt(
+    lambda u, residual, jac: residual,
+    materialize_jac=True,
+    solver="cholesky",
+    damping_parameter=1e-3,
+    implicit_diff=False,
+    jit=False,
+)
+# jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
+_solver._jac_fun = lambda u, residual, jac: jac
+# Residual and derivatives are arguments of the solver's own programs, so that fits of the same shapes share these.
+_begin, _update = jax.jit(_solver.init_state), jax.jit(_solver.update)
+_direction = jax.jit(lambda free, state: _solver.update(free, state, state.residual, state.jac).state.delta)
+
+
 def marquardt(
     function: Callable,
     free: Array,
@@ -165,24 +179,17 @@ def marquardt(
     held: int = 0,
 ) -> Fit:
     """By steps of Levenberg and Marquardt in free numbers, which others follow from; the last residuals are held."""
-    # Not compiled as a whole, jaxopt asks for the same place two or three times: what was made last is kept.
-    both = lru_cache(maxsize=1)(lambda place: evaluate(jnp.asarray(np.frombuffer(place, free.dtype))))
     evaluate = _with_slopes(function)
-    solver = jaxopt.LevenbergMarquardt(
-        lambda u: both(np.asarray(u).tobytes())[0],
-        materialize_jac=True,
-        solver="cholesky",
-        damping_parameter=1e-3,
-        implicit_diff=False,
-        jit=False,
-    )
-    # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
-    solver._jac_fun = lambda u: both(np.asarray(u).tobytes())[1].T
-    state = solver.init_state(free)
+
+    def both(place):
+        residual, slope = evaluate(place)
+        return residual, slope.T
+
+    state = _begin(free, *both(free))
     _finite(state.residual, state.jac)
     history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
     for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
-        moved, tried = solver.update(free, state)
+        moved, tried = _update(free, state, *both(free + _direction(free, state)))
         if not all(np.isfinite(each).all() for each in (moved, tried.residual, tried.jac)):
             grow = state.increase_factor
             tried = state._replace(
@@ -202,10 +209,10 @@ def marquardt(
     axis, value = _told(rows)
     deviation = _deviation(axis, _scores(axis, value, rows, left))
     told = axis if not held else _told(rows[:, :-held])[0]
-    rate = np.abs(np.asarray(jax.jvp(bounded, (free,), (jnp.ones_like(free),))[1]))
+    value, rate = jax.jit(lambda u: jax.jvp(bounded, (u,), (jnp.ones_like(u),)))(free)
     known = np.isfinite(deviation)
-    deviation = jnp.asarray(np.where(known, np.where(known, deviation, 0) * rate, np.inf), free.dtype)
-    return Fit(unravel(bounded(free)), np.array(history), unravel(deviation), told.T)
+    deviation = np.where(known, np.where(known, deviation, 0) * np.abs(rate), np.inf)
+    return Fit(unravel(value), np.array(history), unravel(jnp.asarray(deviation, free.dtype)), told.T)
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
@@ -215,56 +222,78 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
 
     Reference: O'Donoghue and Candes 2015, "Adaptive restart for accelerated gradient schemes".
     """
-
-    def pull(x, back):
-        return jax.vjp(function, x)[1](back)[0]
-
     count = len(jax.eval_shape(function, first))
-    probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), first.dtype)
-    square = jax.jit(lambda x: jnp.mean(jax.lax.map(lambda each: pull(x, each) ** 2, probe), 0))(first)
-    numbers.outside(square)
-    whole = float(jnp.max(square))
-    size = 1 / jnp.sqrt(square + _LEAST * (whole if whole > 0 else 1.0))
-
-    def value(y):
-        extra = 0.0 if prior is None else prior(unravel(size * y))
-        return jnp.sum(function(size * y) ** 2) / 2 + extra
-
-    limit = tuple(jnp.asarray(each, first.dtype) / size for each in bound)
     bounded = any(np.isfinite(each).any() for each in bound)
-    y = first / size
-    if bounded:
-        curved = jax.jit(lambda y, along: jax.jvp(jax.grad(value), (y,), (along,))[1])
-        along = jax.random.normal(jax.random.key(1), y.shape, y.dtype)
-        for _ in range(_POWER):
-            along = along / jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)
-            along = curved(y, along)
-        length = float(1 / (_SAFETY * jnp.maximum(jnp.linalg.norm(along), jnp.finfo(y.dtype).tiny)))
+
+    def extra(x):
+        return jnp.zeros((), x.dtype) if prior is None else prior(unravel(x))
+
+    def solved(size, length) -> tuple[Any, Callable]:
+        """The solver for numbers in units of their sizes, and the residual's norm with the objective."""
+
+        def both(y):
+            left = function(size * y)
+            return jnp.linalg.norm(left), jnp.sum(left**2) / 2 + extra(size * y)
+
+        options = {"maxiter": steps, "implicit_diff": False}
+        if not bounded:
+            return jaxopt.LBFGS(lambda y: both(y)[1], **options), both
         box = jaxopt.projection.projection_box
-        solver: Any = jaxopt.ProjectedGradient(value, box, stepsize=length, maxiter=steps, implicit_diff=False)
-        state, update = solver.init_state(y, limit), jax.jit(lambda y, state: solver.update(y, state, limit))
-    else:
-        solver = jaxopt.LBFGS(value, maxiter=steps, implicit_diff=False)
-        state, update = solver.init_state(y), jax.jit(solver.update)
-    far = jax.jit(lambda y: (jnp.linalg.norm(function(size * y)), value(y)))
-    norm, now = far(y)
+        return jaxopt.ProjectedGradient(lambda y: both(y)[1], box, stepsize=lambda _: length, **options), both
+
+    @jax.jit
+    def begin(x, bound):
+        along = jax.linearize(function, x)[1]
+        back = jax.linear_transpose(along, x)
+        probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), x.dtype)
+        square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
+        whole = jnp.max(square)
+        size = 1 / jnp.sqrt(square + _LEAST * jnp.where(whole > 0, whole, 1))
+        limit = [tuple(each / size for each in bound)] if bounded else []
+
+        def curved(_, towards):
+            towards = towards / jnp.maximum(jnp.linalg.norm(towards), tiny)
+            bent = size * back(along(size * towards))[0]
+            slope = jax.grad(lambda y: extra(size * y))
+            return bent + jax.jvp(slope, (x / size,), (towards,))[1]
+
+        length, tiny = 0.0, jnp.finfo(x.dtype).tiny
+        if bounded:
+            towards = jax.random.normal(jax.random.key(1), x.shape, x.dtype)
+            largest = jnp.linalg.norm(jax.lax.fori_loop(0, _POWER, curved, towards))
+            length = 1 / (_SAFETY * jnp.maximum(largest, tiny))
+        solver, both = solved(size, length)
+        return square, (size, length), limit, x / size, solver.init_state(x / size, *limit), both(x / size)
+
+    @jax.jit
+    def update(y, state, limit, scales):
+        solver, both = solved(*scales)
+        moved, state = solver.update(y, state, *limit)
+        return moved, state, both(moved)
+
+    bound = tuple(jnp.asarray(each, first.dtype) for each in bound)
+    square, scales, limit, y, start, (norm, now) = begin(first, bound)
     _finite(square, norm, now)
+    state = start
     history, last, still = [float(norm)], float(now), 0
     for step in range(steps):
-        moved, state = update(y, state)
+        moved, state, (norm, now) = update(y, state, limit, scales)
         if not np.isfinite(moved).all():
             _finite(*([] if step else [moved]))  # The prior's derivatives: the others are checked.
             break
-        norm, now = map(float, far(moved))
+        norm, now = float(norm), float(now)
         still = still + 1 if last - now <= _SETTLED * abs(last) else 0
         if bounded and now > last:  # Momentum went too far: it starts anew from the place before.
-            state = solver.init_state(y, limit)
+            state = start._replace(velocity=y)
             norm, now, moved = history[-1], last, y
         y, last = moved, now
         history.append(norm)
         if still == _PATIENT:
             break
     noise = history[-1] ** 2 / max(1, count)
-    known = (square > _KNOWN**2 * whole) & (limit[0] < y) & (y < limit[1])
-    deviation = jnp.where(known, jnp.sqrt(noise / jnp.where(square > 0, square, 1)), jnp.inf)
-    return Fit(unravel(size * y), np.array(history), unravel(deviation), None)
+    square, place = np.asarray(square), np.asarray(y)
+    known = square > _KNOWN**2 * square.max()
+    for low, high in limit:
+        known &= (np.asarray(low) < place) & (place < np.asarray(high))
+    deviation = np.where(known, np.sqrt(noise / np.where(square > 0, square, 1)), np.inf)
+    return Fit(unravel(scales[0] * y), np.array(history), unravel(jnp.asarray(deviation, first.dtype)), None)
