@@ -228,22 +228,25 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
     def extra(x):
         return jnp.zeros((), x.dtype) if prior is None else prior(unravel(x))
 
-    def solved(size, length) -> tuple[Any, Callable]:
-        """The solver for numbers in units of their sizes, and the residual's norm with the objective."""
+    def both(left, x):
+        """The residual's norm, and the objective."""
+        return jnp.linalg.norm(left), jnp.sum(left**2) / 2 + extra(x)
 
-        def both(y):
-            left = function(size * y)
-            return jnp.linalg.norm(left), jnp.sum(left**2) / 2 + extra(size * y)
+    def solver(size, length) -> Any:
+        """For numbers in units of their sizes."""
+
+        def value(y):
+            return both(function(size * y), size * y)[1]
 
         options = {"maxiter": steps, "implicit_diff": False}
         if not bounded:
-            return jaxopt.LBFGS(lambda y: both(y)[1], **options), both
+            return jaxopt.LBFGS(value, **options)
         box = jaxopt.projection.projection_box
-        return jaxopt.ProjectedGradient(lambda y: both(y)[1], box, stepsize=lambda _: length, **options), both
+        return jaxopt.ProjectedGradient(value, box, stepsize=lambda _: length, **options)
 
     @jax.jit
     def begin(x, bound):
-        along = jax.linearize(function, x)[1]
+        left, along = jax.linearize(function, x)
         back = jax.linear_transpose(along, x)
         probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), x.dtype)
         square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
@@ -262,14 +265,13 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
             towards = jax.random.normal(jax.random.key(1), x.shape, x.dtype)
             largest = jnp.linalg.norm(jax.lax.fori_loop(0, _POWER, curved, towards))
             length = 1 / (_SAFETY * jnp.maximum(largest, tiny))
-        solver, both = solved(size, length)
-        return square, (size, length), limit, x / size, solver.init_state(x / size, *limit), both(x / size)
+        state = solver(size, length).init_state(x / size, *limit)
+        return square, (size, length), limit, x / size, state, both(left, x)
 
     @jax.jit
     def update(y, state, limit, scales):
-        solver, both = solved(*scales)
-        moved, state = solver.update(y, state, *limit)
-        return moved, state, both(moved)
+        moved, state = solver(*scales).update(y, state, *limit)
+        return moved, state, both(function(scales[0] * moved), scales[0] * moved)
 
     bound = tuple(jnp.asarray(each, first.dtype) for each in bound)
     square, scales, limit, y, start, (norm, now) = begin(first, bound)
