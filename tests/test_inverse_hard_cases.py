@@ -34,7 +34,7 @@ def view(mesh):
 
 @pytest.fixture(scope="module")
 def sky():
-    return relight.project(builtin.daylight(size=16), degree=4)
+    return relight.project(builtin.daylight(size=8), degree=4)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_what_a_diffuse_ball_does_not_reflect_is_reported_and_not_invented(mesh,
 
 
 def test_a_sharp_material_tells_all_of_it(mesh, sky, view):
-    table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=16)
+    table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=8)
 
     def shiny(light, eye):
         return relight.unshadowed_radiance(mesh, table, light, eye=eye)
@@ -221,11 +221,11 @@ def test_a_region_that_no_picture_shows_is_unknown_and_the_other_is_found(mesh, 
 def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypatch):
     """Its lobes are finer than the light's texels are wide, and the start's as wide as a window."""
     monkeypatch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)  # Not asked for here, and slow.
-    light, seen = builtin.studio(size=16), lobe_transport.precompute(mesh, size=16, progress=False)
+    light, seen = builtin.studio(size=8), lobe_transport.precompute(mesh, size=8, progress=False)
     table = lobe.tabulate(
         lambda m: CookTorrance(diffuse=0.0, specular=1.0, roughness=jnp.exp(m), f0=0.5),
-        lobes=2,
-        resolution=12,
+        lobes=1,
+        resolution=8,
         knot=[np.log([0.02, 0.06, 0.2, 0.6])],
     )
 

@@ -15,12 +15,12 @@ from jaxprt.scene import Environment, builtin, camera
 from jaxprt.sphere import cubemap, harmonics
 
 DEGREE = 3
-EDGE = 48
+EDGE = 32
 
 
 @pytest.fixture(scope="module")
 def mesh():
-    return builtin.sphere(rings=20, sectors=40)
+    return builtin.sphere(rings=12, sectors=24)
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,12 @@ def cameras(mesh):
 
 @pytest.fixture(scope="module")
 def glossy():
-    return harmonic.tabulate(AshikhminShirley(nu=12.0, nv=4.0), degree=DEGREE, resolution=16)
+    return harmonic.tabulate(AshikhminShirley(nu=12.0, nv=4.0), degree=DEGREE, resolution=8)
 
 
 @pytest.fixture(scope="module")
 def sky():
-    return relight.project(builtin.daylight(size=16), degree=DEGREE)
+    return relight.project(builtin.daylight(size=8), degree=DEGREE)
 
 
 def lit_by(mesh, table):
