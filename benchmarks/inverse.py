@@ -162,7 +162,7 @@ def base(wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b
 def tabulated(quick: bool) -> LobeBrdf:
     """Over logarithms of the exponents, powers of which lobes narrow with."""
     knot = np.log(KNOTS[::2] if quick else KNOTS)
-    lobes = 4 if quick else 8
+    lobes = 3 if quick else 8
     nodes = 12 if quick else 32
     return brdf.lobe.tabulate(
         lambda u, v: Shares(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot]
@@ -230,7 +230,7 @@ def materials(case: Case):
 def together(case: Case):
     """Light and material from three pictures, beside a ground of known color."""
     mesh, sky, views, lobes, exact, store, quick = case
-    ground = scene.mesh.ground_plane(mesh, vertices=200 if quick else 4000, extent=1.5)
+    ground = scene.mesh.ground_plane(mesh, vertices=64 if quick else 4000, extent=1.5)
     whole = scene.mesh.join([mesh, ground])
     light, size = band_limited(sky), sky.radiance.shape[1]
     coated = Coated(whole, lobes, size, DEGREE, store and store / "ground")
@@ -249,7 +249,9 @@ def together(case: Case):
     true = relight.harmonic.project(light, degree=DEGREE)
     start = time.perf_counter()
     first = (jnp.zeros_like(true).at[0].set(norm(true) / np.sqrt(3)), arrays(START))
-    found = inverse.jointly(radiance, first, pixels, lower=LOWER, upper=UPPER, scale=False)
+    found = inverse.jointly(
+        radiance, first, pixels, lower=LOWER, upper=UPPER, scale=False, steps=12 if quick else 50
+    )
     seconds = time.perf_counter() - start
     errors = away(found.value[1], BROAD) | {"light_error": norm(found.value[0] - true) / norm(true)}
     return {
