@@ -95,7 +95,7 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     family = navigation.cook_torrance(point=point)
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
     start = time.perf_counter()
-    sizes: dict = {"functions": 2, "terms": 6, "resolution": 12} if quick else {}
+    sizes: dict = {"functions": 2, "terms": 4, "resolution": 8} if quick else {}
     along = paths.factor(family.brdf, **sizes)
     functions, terms = along.factor.shape[-1], len(along.light_map)
     yield {
@@ -117,7 +117,7 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
     """Lines of one scene."""
     data = harness.data() / "meshes"
     real = data.is_dir() and not quick
-    glossy = load_mesh(data / f"{published.mesh}.ply") if real else builtin.sphere(rings=10, sectors=12)
+    glossy = load_mesh(data / f"{published.mesh}.ply") if real else builtin.sphere(rings=8, sectors=12)
     mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 100)])
     size = 64 if real else 16
     path = store and store / published.mesh

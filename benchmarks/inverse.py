@@ -249,9 +249,7 @@ def together(case: Case):
     true = relight.harmonic.project(light, degree=DEGREE)
     start = time.perf_counter()
     first = (jnp.zeros_like(true).at[0].set(norm(true) / np.sqrt(3)), arrays(START))
-    found = inverse.jointly(
-        radiance, first, pixels, lower=LOWER, upper=UPPER, scale=False, steps=12 if quick else 50
-    )
+    found = inverse.jointly(radiance, first, pixels, lower=LOWER, upper=UPPER, scale=False, steps=12 if quick else 50)
     seconds = time.perf_counter() - start
     errors = away(found.value[1], BROAD) | {"light_error": norm(found.value[0] - true) / norm(true)}
     return {

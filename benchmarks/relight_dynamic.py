@@ -102,7 +102,7 @@ def measure_scene(scene: Published, sets: list, fitted: list, plane, quick: bool
     """Frames and errors of one scene."""
     data = harness.data() / "meshes"
     real = data.is_dir() and not quick
-    glossy = load_mesh(data / f"{scene.mesh}.ply") if real else builtin.sphere(rings=10, sectors=12)
+    glossy = load_mesh(data / f"{scene.mesh}.ply") if real else builtin.sphere(rings=8, sectors=12)
     ground = ground_plane(glossy, vertices=scene.ground if real else 100)
     mesh = join([glossy, ground])
     fixed = separable.factor(Lambert(0.5), terms=1, resolution=8)
@@ -232,7 +232,7 @@ def gradient(
     mesh: Mesh, transport, brdfs, plane, triple: Triple, error: float, common: dict, repeats: int, quick: bool
 ) -> dict:
     """An image's loss and its gradient in light, weights and coordinates, beside the loss alone."""
-    edge = 64 if quick else 256
+    edge = 32 if quick else 256
     view = camera.orbit(mesh, width=edge, height=edge)
     fragments = raster.rasterize(mesh, view)
     fixed = materials(plane, triple, common["adjustable"])
@@ -253,7 +253,7 @@ def figure_5(quick: bool):
     path = harness.data() / "brdf" / "ngan2005_cooktorrance.csv"
     family = navigation.cook_torrance(path=path if path.is_file() and not quick else None)
     brdfs = family.brdf[:: 20 if quick else 1]
-    tables: dict[str, tuple] = {"free lobes": (dynamic.separate(brdfs, lobes=3 if quick else 8), [(2, 4), (4, 8)])}
+    tables: dict[str, tuple] = {"free lobes": (dynamic.separate(brdfs, lobes=2 if quick else 8), [(2, 4), (4, 8)])}
     if not quick:
         mirror = dynamic.separate(brdfs, separator=published.mirror_lobes)
         more = [(1, 4), (2, 4), (4, 8), (6, 32)]
