@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,7 +118,7 @@ def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(mesh, 
 
 def test_a_brdf_that_is_not_finite_has_no_plan(mesh, sky):
     """It had one of error 0."""
-    broken = AshikhminShirley(diffuse=np.nan)
+    broken = eqx.tree_at(lambda brdf: brdf.diffuse, AshikhminShirley(), jnp.array([jnp.nan]))
     with pytest.raises(ValueError, match=r"what the BRDF makes of the lights, .* must be finite, got"):
         plan.separable(mesh, broken, [sky], error=ASKED, progress=False)
 

@@ -9,7 +9,16 @@ from jaxtyping import Array, Float, Int
 
 
 def as_argument(brdf: Callable) -> Callable:
-    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped."""
+    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped.
+
+    Raises:
+        TypeError: It is a table whose values hold the cosine of the light's direction too.
+    """
+    if getattr(brdf, "holds_cosine", False):
+        raise TypeError(
+            f"the BRDF must give values in 1/sr; those of {type(brdf).__name__} hold the cosine of the light's "
+            "direction too: give the BRDF that the table was made from"
+        )
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 
 

@@ -11,6 +11,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -45,6 +46,8 @@ class HarmonicBrdf(eqx.Module):
             height and not nodes of the table; of a BRDF that varies the largest, at the knots and halfway between
             them. NaN where it is not known. Views that graze the surface may have several times it.
     """
+
+    holds_cosine: ClassVar = True  # in the values
 
     table: Float[Array, "lm c *q"]
     knot: tuple[Float[Array, " _"], ...]

@@ -10,6 +10,7 @@ fixed widths around the mirror direction, is `jaxprt.brdf.published.mirror_lobes
 import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -66,6 +67,8 @@ class LobeBrdf(eqx.Module):
         error: Relative L2 error of the radiance without shadows under light of natural spectrum, over some views
             between the nodes.
     """
+
+    holds_cosine: ClassVar = True  # in the values
 
     mean: Float[Array, "3 l *q"]
     scale: Float[Array, "l *q"]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
+from jaxprt.brdf import grid
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
 
@@ -101,11 +102,13 @@ def radiance(
         Differentiable in the BRDF's parameters, the excess and the eye.
 
     Raises:
+        TypeError: The BRDF is a table whose values hold the cosine of the light's direction.
         ValueError: No samples, the eye is not one position, or it or the excess is not finite. Inside `jax.jit` values
             are not known, and NaN reaches the vertices.
 
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
+    brdf = grid.as_argument(brdf)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)

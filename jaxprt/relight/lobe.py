@@ -128,7 +128,7 @@ def prefilter(light: Environment) -> LobeLight:
 def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) -> LobeView:
     """Where each vertex reads the light for a view, and what it sees there.
 
-    Arguments as of `radiance`.
+    The first half of `radiance`, with its arguments.
     """
     require.position("the eye", eye)
     lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye)

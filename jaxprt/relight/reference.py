@@ -52,12 +52,13 @@ def radiance(
         Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
 
     Raises:
-        TypeError: The light is no Environment.
+        TypeError: The light is no Environment, or the BRDF a table whose values hold the cosine.
         ValueError: No such vertices, an error that is not positive, the BRDF's values have no axis for colors, or the
             light or the eye is not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices.
     """
     if not error > 0:
         raise ValueError(f"error must be positive, got {error}")
+    brdf = grid.as_argument(brdf)
     require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     require.finite("the light", light.radiance)
     require.position("the eye", eye)
@@ -67,7 +68,6 @@ def radiance(
     normal = np.asarray(mesh.normal, np.float32)
     position, upright, tangent = (np.asarray(each) for each in (mesh.position, mesh.normal, mesh.tangent))
     size = light.radiance.shape[-2]
-    brdf = grid.as_argument(brdf)
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []

@@ -174,7 +174,7 @@ def hits(
 ) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " h"], Int[np.ndarray, "h 3"], Float[np.ndarray, "h 3"], int]:
     """Where rays through the texels above some points' horizons meet a scene.
 
-    Arguments as of `rays`.
+    The arguments are those of `rays`.
 
     Returns:
         Of each hit the point, the texel, the triangle's corners and the weights of these; and the number of rays.

@@ -155,7 +155,7 @@ def compress(
 ) -> RegionTransport:
     """The same of one region whose visibility is known; `vertex` then counts the vertices of that.
 
-    Arguments as of `precompute`.
+    The arguments are those of `precompute`.
     """
     count = len(visible.position)
     factors = light_factors(brdf)

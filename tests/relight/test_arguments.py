@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxprt.brdf import HarmonicBrdf, Lambert
+from jaxprt.brdf import lobe as lobes
 from jaxprt.relight import direct, dynamic, harmonic, lobe, reference, separable
 from jaxprt.scene import Environment
 from jaxprt.transport import TransferMatrix, TransferVector
@@ -57,6 +58,20 @@ def test_what_is_of_another_kind_is_refused_by_the_function_that_makes_what_is_n
     for refused in WANTED[source]:
         with pytest.raises(TypeError, match=f"must be .*{source}.* makes, got"):
             refused()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda: reference.radiance(None, TABLE, LIGHT, eye=EYE),
+        lambda: direct.radiance(None, TABLE, None, None, eye=EYE),
+        lambda: lobes.tabulate(TABLE, lobes=1),
+    ],
+)
+def test_tables_whose_values_hold_the_cosine_do_not_pass_for_brdfs(refused):
+    with pytest.raises(TypeError, match="those of HarmonicBrdf hold the cosine"):
+        refused()
 
 
 BROKEN = jnp.ones((9, 3)).at[4, 1].set(jnp.nan)
