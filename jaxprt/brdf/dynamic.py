@@ -136,7 +136,7 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
         every = [np.asarray(getattr(each, name)) for each in tables]
         if colored:
             every = [np.broadcast_to(each, (colors, *each.shape[1:])) for each in every]
-        return jnp.asarray(np.stack(every, axis))
+        return jax.device_put(np.stack(every, axis))
 
     number = jnp.asarray(np.arange(len(tables)), tables[0].scale.dtype)
     error = jnp.asarray(np.max([each.error for each in tables]))

@@ -249,7 +249,7 @@ def _table(
     every = np.stack([np.broadcast_to(each, (len(each), colors, each.shape[2])) for each in tables], 2)
     value = every.reshape(len(every), colors, *map(len, knots), *wo.shape[:-1])
     knot = tuple(jnp.asarray(each, dtype) for each in knots)
-    return HarmonicBrdf(jnp.asarray(value), knot, jnp.asarray(jnp.nan, dtype))
+    return HarmonicBrdf(jax.device_put(value), knot, jax.device_put(np.asarray(jnp.nan, dtype)))
 
 
 def _missed(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequence[np.ndarray]) -> float:

@@ -255,7 +255,7 @@ def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> 
     wo = _nodes(resolution, isotropic)
     result = lobe_em.samples(brdf, wo.reshape(-1, 3))
     _check(result[0], result[1], wo.reshape(-1, 3), point)
-    return jnp.asarray(wo), result
+    return jax.device_put(wo), result
 
 
 def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
@@ -267,7 +267,7 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
         every = [np.asarray(table[index]) for table in tables]
         every = [np.broadcast_to(each, (colors, *each.shape[1:])) if index > 1 else each for each in every]
         whole = np.stack(every, lead)
-        return jnp.asarray(whole.reshape(*whole.shape[:lead], *size, *nodes))
+        return jax.device_put(whole.reshape(*whole.shape[:lead], *size, *nodes))
 
     dtype = tables[0][0].dtype
     knot = tuple(jnp.asarray(each, dtype) for each in knots)

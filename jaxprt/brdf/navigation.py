@@ -233,12 +233,13 @@ def triangulate(
         raise ValueError(f"points must not all lie on one line, got {len(point)} that do")
     side = np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]])
     outer = ~np.isin(side @ [len(point), 1], side @ [1, len(point)])
-    return Plane(jnp.asarray(point), jnp.asarray(triangle, jnp.int32), jnp.asarray(side[outer], jnp.int32), chart)
+    triangle, side = (jax.device_put(each.astype(np.int32)) for each in (triangle, side[outer]))
+    return Plane(jax.device_put(point), triangle, side, chart)
 
 
 def _family(brdf: tuple, navigation: Line | Plane, name: tuple[str, ...], weight: np.ndarray) -> Family:
     diffuse, specular = np.broadcast_to(weight, (2, len(brdf), 3)).astype(jnp.result_type(float))
-    return Family(brdf, navigation, name, jnp.asarray(diffuse), jnp.asarray(specular))
+    return Family(brdf, navigation, name, jax.device_put(diffuse), jax.device_put(specular))
 
 
 def _grid() -> np.ndarray:

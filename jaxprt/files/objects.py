@@ -223,7 +223,7 @@ def _array(path: Path, arrays: list[Any], number: int, kind: str) -> Any:
             raise ValueError(
                 f"{path} holds arrays of {value.dtype}, which JAX has only with jax_enable_x64: enable it to load them"
             )
-        arrays[number] = value = jnp.asarray(value)
+        arrays[number] = value = jax.device_put(value)
     return value
 
 

@@ -109,7 +109,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     if not np.any(value):
         raise ValueError("pictures must not be black wherever they count")
     eye = jnp.stack([each.camera.eye for each in pictures])
-    return Pixels(eye, jnp.asarray(vertex), jnp.asarray(weight), jnp.asarray(value), len(mesh.position))
+    return Pixels(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
 
 
 def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -254,5 +254,5 @@ def oriented(decomposition: Tucker) -> Tucker:
         unfolded = np.moveaxis(core, mode, 0).reshape(core.shape[mode], -1)
         turn = eigen.orientation(np.sum(unfolded**2, 1), each).astype(core.dtype)
         core = np.moveaxis(np.tensordot(turn, core, (0, mode)), 0, mode)
-        factor.append(jnp.asarray(each @ turn))
-    return Tucker(jnp.asarray(core), tuple(factor))
+        factor.append(jax.device_put(each @ turn))
+    return Tucker(jax.device_put(core), tuple(factor))

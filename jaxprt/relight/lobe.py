@@ -271,7 +271,7 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
         away = 1 - np.einsum("toi,tmi->tom", place, center[index])
         weight = known[:, None] * np.exp(-concentration * away)
         weight /= weight.sum(-1, keepdims=True)
-        result.append((jnp.asarray(_on_faces(source)[index]), jnp.asarray(weight, dtype)))
+        result.append((jax.device_put(_on_faces(source)[index]), jax.device_put(np.asarray(weight, dtype))))
     return result
 
 

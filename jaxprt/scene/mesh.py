@@ -4,6 +4,7 @@ import pathlib
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -130,14 +131,14 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
         first_vertex += len(mesh.position)
     # In NumPy, so that new shapes do not compile; likewise below.
     position, normal, tangent = (
-        jnp.asarray(np.concatenate([getattr(mesh, field) for mesh in meshes]))
+        jax.device_put(np.concatenate([getattr(mesh, field) for mesh in meshes]))
         for field in ("position", "normal", "tangent")
     )
-    face, region = (jnp.asarray(np.concatenate(field), jnp.int32) for field in (face, region))
+    face, region = (jax.device_put(np.concatenate(field).astype(np.int32)) for field in (face, region))
     texture = None
     if any(mesh.texture is not None for mesh in meshes):
         each = [np.zeros((len(mesh.position), 2)) if mesh.texture is None else mesh.texture for mesh in meshes]
-        texture = jnp.asarray(np.concatenate(each), position.dtype)
+        texture = jax.device_put(np.concatenate(each).astype(position.dtype))
     return Mesh(position, face, normal, tangent, region, texture)
 
 
@@ -162,10 +163,11 @@ def split(mesh: Mesh) -> list[Mesh]:
         index[own] = np.arange(len(own))
         own_face = index[face[corner[:, 0] == number]]
         position, normal, tangent = (
-            jnp.asarray(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
+            jax.device_put(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
         )
-        texture = None if mesh.texture is None else jnp.asarray(np.asarray(mesh.texture)[own])
-        parts.append(Mesh(position, jnp.asarray(own_face), normal, tangent, jnp.zeros(len(own), jnp.int32), texture))
+        texture = None if mesh.texture is None else jax.device_put(np.asarray(mesh.texture)[own])
+        own_face, zero = (jax.device_put(each) for each in (own_face, np.zeros(len(own), np.int32)))
+        parts.append(Mesh(position, own_face, normal, tangent, zero, texture))
     return parts
 
 
@@ -261,7 +263,8 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     face = _array(face, "face", (None, 3), name, whole=True)
     region = np.zeros(count, np.int32) if region is None else _array(region, "region", (count,), name, whole=True)
     _check(position, face, region, name)
-    texture = None if texture is None else jnp.asarray(_finite(texture, "texture", (count, 2), name), jnp.float32)
+    if texture is not None:
+        texture = jax.device_put(_finite(texture, "texture", (count, 2), name).astype(np.float32))
     given = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
     length = np.linalg.norm(given, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
@@ -272,8 +275,8 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     brought = brought.astype(np.float64)
     brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
     normal, tangent = _frame(given, brought)
-    face, region = (jnp.asarray(each, jnp.int32) for each in (face, region))
-    return Mesh(jnp.asarray(position), face, normal, tangent, region, texture)
+    face, region = (jax.device_put(each.astype(np.int32)) for each in (face, region))
+    return Mesh(jax.device_put(position), face, normal, tangent, region, texture)
 
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
@@ -325,7 +328,7 @@ def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
     normal, tangent = (np.pad(field.astype(np.float32), pad).reshape(-1, _BLOCK, 3) for field in (normal, tangent))
     unit = [directions.normalize(block) for block in normal]
     across = [directions.frame(n, t)[:, 0] for n, t in zip(unit, tangent, strict=True)]
-    return tuple(jnp.asarray(np.concatenate(block)[:count]) for block in (unit, across))
+    return tuple(jax.device_put(np.concatenate(block)[:count]) for block in (unit, across))
 
 
 def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.ndarray:

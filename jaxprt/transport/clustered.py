@@ -221,12 +221,12 @@ def precompute(
         )
     job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, vectors, modes, keep)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
-    index, mode, core = (jnp.asarray(result[name]) for name in ("index", "mode", "core"))
-    weight = jnp.asarray(result["weight"]).reshape(*member.shape, vectors)
+    index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
+    weight = jax.device_put(result["weight"]).reshape(*member.shape, vectors)
     row, place = member.ravel(), places(member)
     rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
-    same = (direct.position, direct.frame, jnp.asarray(row, jnp.int32), jnp.asarray(place))
-    return ClusteredTransport(index, mode, core, weight, *same, rms, jnp.asarray(marked(brdf.light_map)))
+    same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
+    return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(marked(brdf.light_map)))
 
 
 def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
@@ -101,7 +102,7 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = visibility.place(mesh, vertex)
-    return DirectTransport(jnp.asarray(result["level"]), position, jnp.asarray(job.frame))
+    return DirectTransport(jax.device_put(result["level"]), position, jax.device_put(job.frame))
 
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:

@@ -99,7 +99,7 @@ def precompute(
     job = _MatrixJob.make(mesh, occluder, vertex, size, degree=degree)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.place(mesh, vertex)
-    return TransferMatrix(jnp.asarray(result["matrix"]), position, jnp.asarray(job.frame))
+    return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
 
 
 def precompute_diffuse(
@@ -117,7 +117,7 @@ def precompute_diffuse(
     check(degree, size)
     job = _VectorJob.make(mesh, occluder, vertex, size, degree=degree)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
-    return TransferVector(jnp.asarray(result["vector"]), visibility.place(mesh, vertex))
+    return TransferVector(jax.device_put(result["vector"]), visibility.place(mesh, vertex))
 
 
 @partial(jax.jit, static_argnames="degree")

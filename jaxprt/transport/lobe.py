@@ -214,8 +214,8 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = visibility.place(mesh, vertex)
-    level, vector = jnp.asarray(result["level"]), jnp.asarray(result["vector"])
-    return LobeTransport(level, vector, position, jnp.asarray(job.frame), size)
+    level, vector = jax.device_put(result["level"]), jax.device_put(result["vector"])
+    return LobeTransport(level, vector, position, jax.device_put(job.frame), size)
 
 
 def compress(direct: DirectTransport) -> LobeTransport:
@@ -229,10 +229,10 @@ def compress(direct: DirectTransport) -> LobeTransport:
     level, vector = [], []
     for first in range(0, len(frame), _BLOCK):
         part = np.arange(first, min(first + _BLOCK, len(frame)))
-        seen = jnp.asarray(direct.seen(part))
+        seen = jax.device_put(direct.seen(part))
         level.append(np.asarray(pyramid(seen)))
         vector.append(np.asarray(harmonic.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
-    level, vector = jnp.asarray(np.concatenate(level)), jnp.asarray(np.concatenate(vector, 1))
+    level, vector = jax.device_put(np.concatenate(level)), jax.device_put(np.concatenate(vector, 1))
     return LobeTransport(level, vector, direct.position, direct.frame, direct.size)
 
 

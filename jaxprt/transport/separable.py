@@ -68,9 +68,9 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size, brdf=jax.tree.map(np.asarray, brdf), keep=keep)
     result = blocks.compute(job, path=path, executor=executor, progress=progress)
     rms = sparse.rms(result["index"], result["value"], 6 * size * size)
-    index, value = jnp.asarray(result["index"]), jnp.asarray(result["value"])
-    position, frame = visibility.place(mesh, vertex), jnp.asarray(job.frame)
-    return SparseTransport(index, value, position, frame, rms, mark=jnp.asarray(marked(brdf.light_map)))
+    index, value = jax.device_put(result["index"]), jax.device_put(result["value"])
+    position, frame = visibility.place(mesh, vertex), jax.device_put(job.frame)
+    return SparseTransport(index, value, position, frame, rms, mark=jax.device_put(marked(brdf.light_map)))
 
 
 @jax.jit

@@ -262,11 +262,11 @@ def precompute(
             twice = blocks.compute(again, path=store, label="bounce 2", **options)
             worth[1] = _rms(twice["white"])
             parts = (twice["weight"].reshape(*member.shape, -1), twice["core"], twice["error"])
-            second = SecondBounce(*map(jnp.asarray, parts))
+            second = SecondBounce(*map(jax.device_put, parts))
     if progress:
         _tell(share, function, worth, second, bounces)
     rows = (clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
-    arrays = [jnp.asarray(each) for each in (weight, core, found["mode"], *rows, function)]
+    arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
     told = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
     return TransferTensor(*arrays, factor=factor, second=second, **told, mesh=blocks.scene_key(mesh))
 

@@ -112,7 +112,7 @@ class _PathJob(clustered.ClusterJob, visibility.VisibilityJob):
             spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
             owner, corner, weight, texel = (np.pad(x, ((0, spare), *[(0, 0)] * (x.ndim - 1))) for x in rays)
             fixed = (owner, local[corner], weight, way[texel], measure[texel])
-            arrived = bounce.arrive(response, self.frame[own], basis, *map(jnp.asarray, fixed), points=len(part))
+            arrived = bounce.arrive(response, self.frame[own], basis, *map(jax.device_put, fixed), points=len(part))
             result.append(np.asarray(arrived))
         return np.concatenate(result, 2)
 
@@ -156,7 +156,7 @@ class TransferJob(_PathJob):
         """One block."""
         tensor = self.tensor(self.member[block])
         count, light, harmonic, functions = tensor.shape
-        flat = jnp.asarray((tensor * self.scale).reshape(count, light, -1))
+        flat = jax.device_put((tensor * self.scale).reshape(count, light, -1))
         weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
         core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions) / self.scale
         white = self.brought(tensor, self.member[block], self.white)
@@ -183,7 +183,7 @@ class TransferJob(_PathJob):
         for number, each in enumerate(counts):
             local[self.region == number] = np.arange(each)
         for member, *parts in zip(self.member, weight, core, coarse, strict=True):
-            arriving = _expand(*map(jnp.asarray, parts))
+            arriving = _expand(*map(jax.device_put, parts))
             for number, basis in enumerate(self.bases):
                 own = self.region[member] == number
                 if own.any():
@@ -223,7 +223,7 @@ class AgainJob(_PathJob):
         tensor = self.tensor(self.member[block])
         scale = self.scale[self.function]
         both = scale[:, None] * scale
-        weight, core, error = _along_vertices(jnp.asarray(tensor * both), components=self.components)
+        weight, core, error = _along_vertices(jax.device_put(tensor * both), components=self.components)
         rows = {"weight": weight, "core": (np.asarray(core) / both)[None], "error": error[None]}
         white = self.brought(tensor, self.member[block], self.white[self.function])
         return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0

@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -175,7 +174,7 @@ def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
 
 def place(mesh: Mesh, vertex: np.ndarray | None) -> Float[Array, "v 3"]:
     """Positions of the vertices to light; see `chosen`."""
-    return jnp.asarray(np.asarray(mesh.position)[chosen(mesh, vertex)])
+    return jax.device_put(np.asarray(mesh.position)[chosen(mesh, vertex)])
 
 
 @dataclass(frozen=True)

@@ -326,15 +326,6 @@ def test_vmap_over_cameras_equals_a_loop():
         np.testing.assert_allclose(images[i], image(eyes[i]), atol=1e-5)
 
 
-def test_jit_equals_eager():
-    position, face = _torus(3, 3)
-    mesh, camera = _mesh(position, face), _camera(eye=(0, 2, 2), width=6, height=5)
-    compiled = raster.render(mesh, mesh.position, camera)
-    with jax.disable_jit():
-        eager = raster.render(mesh, mesh.position, camera)
-    np.testing.assert_allclose(eager, compiled, atol=1e-5)
-
-
 def test_an_attribute_may_have_any_trailing_shape():
     mesh, color, camera = _scene()
     fragments = raster.rasterize(mesh, camera)
