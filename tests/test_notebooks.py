@@ -71,7 +71,7 @@ def test_there_are_notebooks():
 
 
 # The size may cause warnings. The outputs of full size hold none.
-@pytest.mark.filterwarnings("default")
+@pytest.mark.filterwarnings("default", "ignore:Implicitly cleaning up:ResourceWarning")  # the folders of a notebook
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_every_cell_of_a_notebook_runs(path, small):
     execute(path)
