@@ -88,6 +88,8 @@ HOST = {
     "brdf.measured.load_merl": "reads a file",
     "brdf.measured.load_npf": "reads a file",
     "brdf.measured.load_lafortune": "reads a file",
+    "brdf.models.color": "converts a parameter where it enters",
+    "brdf.models.scalar": "the same",
     "brdf.grid": "gives indices beside shares; tested through the tables that are read by it",
     "brdf.harmonic.tabulate": "checks values, and chooses the quadrature by them",
     "brdf.separable.marked": "NumPy on the host",

@@ -28,21 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf.models import Model
+from jaxprt.brdf.models import Model, color, scalar
 
 _GRAZING = 1e-4  # least cosine
 _DIFFUSE_NODES = 8  # The integrand is a trigonometric polynomial of degree 2: exact to 1e-9 over pi.
 _LOBE_NODES = 24  # exact to 1e-10 over twice _LOBE_WIDTH
 _LOBE_WIDTH = 6.0  # in 1 / sqrt(exponent): beyond, less than exp(-18) of the lobe's height is left
-
-
-def _color(value) -> Array:
-    """A scalar or a color as an array [1] or [3]."""
-    return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
-
-
-def _scalar(value) -> Array:
-    return jnp.asarray(value, jnp.result_type(float))
 
 
 def _inside(cosine: Array) -> Array:
@@ -130,11 +121,11 @@ class PoulinFournier(Model):
 
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
-    diffuse: Float[Array, " c"] = eqx.field(converter=_color, default=0.3)
-    specular: Float[Array, " c"] = eqx.field(converter=_color, default=0.5)
-    exponent: Float[Array, ""] = eqx.field(converter=_scalar, default=100.0)
-    distance: Float[Array, ""] = eqx.field(converter=_scalar, default=2.0)
-    height: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
+    specular: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
+    exponent: Float[Array, ""] = eqx.field(converter=scalar, default=100.0)
+    distance: Float[Array, ""] = eqx.field(converter=scalar, default=2.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
@@ -176,11 +167,11 @@ class PoulinFournierGrooves(Model):
 
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
-    diffuse: Float[Array, " c"] = eqx.field(converter=_color, default=0.3)
-    specular: Float[Array, " c"] = eqx.field(converter=_color, default=0.5)
-    exponent: Float[Array, ""] = eqx.field(converter=_scalar, default=100.0)
-    distance: Float[Array, ""] = eqx.field(converter=_scalar, default=2.0)
-    height: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
+    specular: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
+    exponent: Float[Array, ""] = eqx.field(converter=scalar, default=100.0)
+    distance: Float[Array, ""] = eqx.field(converter=scalar, default=2.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""

@@ -47,7 +47,7 @@ class HarmonicBrdf(eqx.Module):
             them. NaN where it is not known. Views that graze the surface may have several times it.
     """
 
-    holds_cosine: ClassVar = True  # in the values
+    holds_cosine: ClassVar = True  # Values are the BRDF times the cosine.
 
     table: Float[Array, "lm c *q"]
     knot: tuple[Float[Array, " _"], ...]
@@ -249,7 +249,7 @@ def _table(
     every = np.stack([np.broadcast_to(each, (len(each), colors, each.shape[2])) for each in tables], 2)
     value = every.reshape(len(every), colors, *map(len, knots), *wo.shape[:-1])
     knot = tuple(jnp.asarray(each, dtype) for each in knots)
-    return HarmonicBrdf(jax.device_put(value), knot, jax.device_put(np.asarray(jnp.nan, dtype)))
+    return HarmonicBrdf(jax.device_put(value), knot, jax.device_put(np.asarray(np.nan, dtype)))
 
 
 def _missed(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequence[np.ndarray]) -> float:

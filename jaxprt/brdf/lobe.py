@@ -68,7 +68,7 @@ class LobeBrdf(eqx.Module):
             between the nodes.
     """
 
-    holds_cosine: ClassVar = True  # in the values
+    holds_cosine: ClassVar = True  # Values are the BRDF times the cosine.
 
     mean: Float[Array, "3 l *q"]
     scale: Float[Array, "l *q"]

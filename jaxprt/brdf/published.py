@@ -193,7 +193,7 @@ def mirror_lobes(
     width = np.radians(np.asarray(angles, np.float64)) / 3
     concentration = (1 / np.maximum(width**2, 1 / lobe_em.FINEST)).astype(wo.dtype)
     mean, scale, weight, diffuse = _mirror_lobes(wo, sample, mass, extent, concentration)
-    return lobe.LobeBrdf(mean, scale, weight, diffuse, (), jnp.asarray(np.asarray(np.nan, wo.dtype)))
+    return lobe.LobeBrdf(mean, scale, weight, diffuse, (), jax.device_put(np.asarray(np.nan, wo.dtype)))
 
 
 @jax.jit

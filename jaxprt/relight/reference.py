@@ -129,8 +129,8 @@ def _centers(given: refine.Integrand, seen: Array, error: Array) -> tuple[Array,
     mean = jax.lax.stop_gradient(jnp.swapaxes(jnp.mean(light, -1), 0, 1))
     light = jnp.moveaxis(light, -1, 1)
 
-    # One vertex after the other, whose arrays stay in the processor's cache. What several others are made of is the
-    # result of a loop, or enters one: the compiler would else compute it once for each element that it goes into.
+    # Vertices come one after another, so that the arrays of each stay in the processor's cache. `brightest` and the
+    # sum over texels are loops for a reason: XLA computes a value again for each of its uses, except across loops.
     def one(argument):
         axes, wo, level = argument
         value = refine.value(given.brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
@@ -166,7 +166,7 @@ def _sums(light: Array, value: Array) -> Array:
 
 
 def _blocks(texel: Array) -> Array:
-    """Texels [6 n n *c] as [e t *c]: those at each place in the first cells next to each other."""
+    """Texels [6 n n *c] as [e t *c], by their place e in the first cell and the number t of that cell."""
     edge = refine.root(texel.shape[1])
     count = texel.shape[1] // edge
     block = texel.reshape(6, count, edge, count, edge, *texel.shape[3:])
@@ -174,25 +174,29 @@ def _blocks(texel: Array) -> Array:
 
 
 def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, error: Array) -> Array:
-    """First cells of whose texels the BRDF at the center tells too little.
+    """Chooses the first cells in which the BRDF at texel centers is not exact enough.
 
-    The middle of an interval errs by f'' / 24, and of a product by f' g' / 12 too; the horizon adds an eighth of a
-    texel's edge at most. A peak between centers shows in the mirror direction.
+    The midpoint rule errs by f'' / 24 for one function f, and by another f' g' / 12 for a product f g. The horizon
+    adds at most an eighth of a texel's edge. The mirror direction shows a peak between the centers.
 
     Args:
-        gray: The BRDF at centers of texels, places in the first cell before the cells, as all of [e t].
-        lean: Integrals of the cosine over texels, negative below the horizon.
-        scale: Light in units of the vertex's radiance.
-        away: From the mirror direction to the middle of each first cell.
-        height: BRDF times cosine in the mirror direction.
+        gray: BRDF at the centers of the texels [e t], in 1/sr, mean over colors. The first axis is the place of a
+            texel in its cell, the second the number of the cell.
+        lean: Integral of the cosine over each texel [e t], in sr; negative below the horizon.
+        scale: Visible light of each texel [e t] over the radiance of the vertex, the largest over lights.
+        away: Vector from the mirror direction to the middle of each cell [t 3].
+        height: BRDF times cosine in the mirror direction, in 1/sr.
         error: Relative error that is allowed.
+
+    Returns:
+        Whether each cell [t] must be divided.
     """
     if len(gray) == 1:
         return jnp.broadcast_to(error < jnp.inf, gray[0].shape)
     side, edge = refine.SIDE, 2 / haar.face_edge(gray.size)
     flux = jnp.maximum(lean, 0)
     miss, size, top, hidden, cut = (jnp.zeros_like(gray[0]) for _ in range(5))
-    # Written out texel by texel, which the compiler makes one loop over cells.
+    # Texels are written out one by one, so that XLA makes one loop over cells of all that follows.
     for here in range(side**2):
         much, sent = scale[here], gray[here] * flux[here]
         for step, place in ((side, here // side), (1, here % side)):

@@ -404,7 +404,7 @@ def test_three_parameters_are_refused():
 
 
 def flat(albedo):
-    """Of any albedo, also one that models refuse."""
+    """A Lambert BRDF with any albedo, even one that the model refuses."""
     return eqx.tree_at(lambda brdf: brdf.albedo, Lambert(0.5), jnp.array([albedo]))
 
 

@@ -14,7 +14,7 @@ from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
 from jaxprt.transport import bounce, direct, harmonic, interreflection, transfer, visibility
 
-# Of the light's faces, of those through whose texels rays are sent, and of those by which surfaces see light.
+# Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
 EDGE, SIZE, SEEN = 4, 8, 16
 BLOCK = 512
 ALL = 10**6
