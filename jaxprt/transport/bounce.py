@@ -15,12 +15,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt.brdf import paths
 from jaxprt.brdf.separable import SeparableBrdf
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
-from jaxprt.transport import visibility
+from jaxprt.transport import hits, visibility
 
 _HITS = 64  # in a group: their responses should stay in the cache
 _GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
@@ -151,9 +151,9 @@ def rays(
     Returns:
         The rays that meet each region that is met; where a triangle has corners of several, each region has its own.
     """
-    point, texel, corner, share, _ = hits(occluder, start, normal, size=size)
+    point, texel, corner, share, _ = hits.hits(occluder, start, normal, size=size)
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
-    seen = front(occluder, frame[:, 2], corner, way)
+    seen = hits.front(occluder, frame[:, 2], corner, way)
     result = {}
     for number in np.unique(region[corner[seen]]).tolist():
         inside = region[corner] == number
@@ -167,40 +167,6 @@ def rays(
             whole[group, place % _HITS] = each
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
-
-
-def hits(
-    occluder: visibility.Occluder, start: Float[np.ndarray, "b 3"], normal: Float[np.ndarray, "b 3"], *, size: int
-) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " h"], Int[np.ndarray, "h 3"], Float[np.ndarray, "h 3"], int]:
-    """Where rays through the texels above some points' horizons meet a scene.
-
-    The arguments are those of `rays`.
-
-    Returns:
-        Of each hit the point, the texel, the triangle's corners and the weights of these; and the number of rays.
-    """
-    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
-    direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
-    point, texel = np.nonzero(normal @ area.T > 0)
-    triangle, _, share = occluder.hit(start[point], direction[texel])
-    met = np.flatnonzero(triangle >= 0)
-    return point[met], texel[met], occluder.face[triangle[met]], share[met], len(point)
-
-
-def front(
-    occluder: visibility.Occluder,
-    normal: Float[np.ndarray, "v 3"],
-    corner: Int[np.ndarray, "h 3"],
-    direction: Float[np.ndarray, "h 3"],
-) -> Bool[np.ndarray, " h"]:
-    """Whether rays meet the fronts of triangles, which alone send light.
-
-    That is the side of the corners' normals together, since one of these may look away where the others are seen.
-    """
-    at = occluder.position[corner]
-    across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
-    side = np.sum(across * np.sum(normal[corner], 1), -1)
-    return side * np.sum(across * direction, -1) < 0
 
 
 def _met(axes: Array, basis: SeparableBrdf, size: int) -> Array:

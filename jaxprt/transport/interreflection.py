@@ -20,7 +20,7 @@ from jaxprt.brdf.harmonic import HarmonicBrdf
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
-from jaxprt.transport import blocks, bounce, visibility
+from jaxprt.transport import blocks, hits, visibility
 from jaxprt.transport.harmonic import TransferMatrix, TransferVector, check
 
 # Versions of what makes the results; a release that changes them raises one.
@@ -191,7 +191,7 @@ class _BounceJob(visibility.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = bounce.hits(
+        vertex, texel, corner, weight, count = hits.hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
@@ -227,12 +227,12 @@ class _DiffuseBounceJob(visibility.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = bounce.hits(
+        vertex, texel, corner, weight, count = hits.hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
         flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
-        seen = bounce.front(self.rays, self.frame[:, 2], corner, area[texel])
+        seen = hits.front(self.rays, self.frame[:, 2], corner, area[texel])
         leaving = np.einsum("mk,mkli->mli", weight * (seen * flux)[:, None], self.rows[corner])
         total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
         np.add.at(total, vertex, leaving)

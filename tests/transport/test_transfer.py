@@ -12,7 +12,7 @@ from jaxprt.relight.transfer import LitTransfer
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
-from jaxprt.transport import bounce, direct, harmonic, interreflection, transfer, visibility
+from jaxprt.transport import bounce, direct, harmonic, hits, interreflection, transfer, visibility
 
 # Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
 EDGE, SIZE, SEEN = 4, 8, 16
@@ -89,8 +89,8 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
     occluder = visibility.Occluder(mesh)
     start, normal, region = visibility.start_points(mesh, occluder), np.asarray(mesh.normal), np.asarray(mesh.region)
     way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
-    point, through, corner, share, _ = bounce.hits(occluder, start, normal, size=SIZE)
-    front = bounce.front(occluder, normal, corner, way[through])
+    point, through, corner, share, _ = hits.hits(occluder, start, normal, size=SIZE)
+    front = hits.front(occluder, normal, corner, way[through])
     point, through, corner, share = (each[front] for each in (point, through, corner, share))
     wo = np.einsum("hkij,hj->hki", frame[corner], -way[through])
     wo[..., 2] = np.maximum(wo[..., 2], 1e-3)
