@@ -23,16 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness, path_tracing
-from jaxprt.brdf import AshikhminShirley, Lambert, published, separable
-from jaxprt.brdf import lobe as lobes
-from jaxprt.relight import direct as texels
-from jaxprt.relight import lobe, reference
-from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt import bright_texels, lobe, reference, separable, visibility
+from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
-from jaxprt.transport import ClusteredTransport, DirectTransport, LobeTransport, clustered, direct
-from jaxprt.transport import lobe as pyramids
-from jaxprt.transport import separable as transports
+from jaxprt.systems.lobe import LobeTransport
+from jaxprt.systems.separable import ClusteredTransport, combine, light_tuple, view_tuple
+from jaxprt.visibility import DirectTransport
 
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
 BRDF = AshikhminShirley()
@@ -84,13 +81,13 @@ def measure(quick: bool, store: pathlib.Path | None):
 
     start = time.perf_counter()
     visible = [
-        direct.precompute(whole, size=size, vertex=vertex, path=store and store / f"{name}.prt", progress=False)
+        visibility.precompute(whole, size=size, vertex=vertex, path=store and store / f"{name}.prt", progress=False)
         for name, vertex in (("glossy", np.arange(count)), ("ground", np.arange(count, len(whole.position))))
     ]
     rays = time.perf_counter() - start
     exact = [exact_radiance(part, brdf, lights, views) for part, brdf in zip(visible, (BRDF, GROUND), strict=True)]
     start = time.perf_counter()
-    seen = [pyramids.compress(each) for each in visible]  # Its bits serve single texels as well, in half the bytes.
+    seen = [lobe.compress(each) for each in visible]  # Its bits serve single texels as well, in half the bytes.
     rays += time.perf_counter() - start
 
     start = time.perf_counter()
@@ -175,7 +172,7 @@ def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, in
     vectors, modes, keep = limit
     vectors = min(vectors, -(-len(visible.position) // clusters))
     modes = min(modes, vectors * factored.terms, keep)
-    transport = clustered.precompute(
+    transport = separable.clustered.precompute(
         visible, factored, clusters=clusters, vectors=vectors, modes=modes, keep=keep, path=path, progress=False
     )
     return Part(visible, brdf, factored, transport)
@@ -185,21 +182,21 @@ def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, in
 def change_light(transport, visible, brdf, rest, texel, excess, view, eye):
     """Radiance of one object after a change of light: the view tuple is kept."""
     smooth = combine(light_tuple(transport, rest), view)
-    return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
+    return smooth + bright_texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 
 @jax.jit
 def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
     """Radiance of one object after a change of view: the light tuple is kept."""
     smooth = combine(lit, view_tuple(transport, factored, eye))
-    return smooth + texels.radiance(visible, brdf, texel, excess, eye=eye)
+    return smooth + bright_texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 
 def report_case(name, parts: list[Part], sun, exact, lights, views, stored, precompute, repeats, peer):
     """One line for each light."""
     vertices, named = sum(part.visible.position.shape[0] for part in parts), names(lights)
     for number, light in enumerate(lights):
-        texel, excess, rest = texels.split(light, count=sun)
+        texel, excess, rest = bright_texels.split(light, count=sun)
         lit = [light_tuple(part.transport, rest) for part in parts]
         square = np.zeros(2)
         for place, eye in enumerate(jnp.asarray(views)):
@@ -210,7 +207,7 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
         view = [view_tuple(part.transport, part.factored, eye) for part in parts]
 
         def lighten(light=light, view=view, eye=eye):
-            texel, excess, rest = texels.split(light, count=sun)
+            texel, excess, rest = bright_texels.split(light, count=sun)
             return [
                 change_light(part.transport, part.visible, part.brdf, rest, texel, excess, each, eye)
                 for part, each in zip(parts, view, strict=True)
@@ -239,21 +236,21 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: bool):
     """Lines of lobes, for the glossy object and for the ground."""
     stored, named = sum(each.nbytes for each in seen), names(lights)
-    plain = lobes.tabulate(GROUND, lobes=1, resolution=8)
+    plain = lobe.tabulate(GROUND, lobes=1, resolution=8)
     for count, sun in [(1, 4)] if quick else LOBES:
         start = time.perf_counter()
-        tables = [lobes.tabulate(BRDF, lobes=count, resolution=24 if quick else 32), plain]
+        tables = [lobe.tabulate(BRDF, lobes=count, resolution=24 if quick else 32), plain]
         fitted = time.perf_counter() - start
         parts = list(zip(seen, tables, (BRDF, GROUND), strict=True))
         for number, light in enumerate(lights):
-            texel, excess, rest = texels.split(light, count=sun)
+            texel, excess, rest = bright_texels.split(light, count=sun)
             blurred = lobe.prefilter(rest)
 
             def turn(eye=views[0], blurred=blurred, texel=texel, excess=excess, parts=parts):
                 eye = jnp.asarray(eye)
                 return [
                     lobe.combine(blurred, lobe.look(each, table, eye=eye))
-                    + texels.radiance(each, brdf, texel, excess, eye=eye)
+                    + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
                     for each, table, brdf in parts
                 ]
 
@@ -265,10 +262,10 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
             view = [lobe.look(each, table, eye=eye) for each, table, _ in parts]
 
             def lighten(light=light, view=view, eye=eye, parts=parts, sun=sun):
-                texel, excess, rest = texels.split(light, count=sun)
+                texel, excess, rest = bright_texels.split(light, count=sun)
                 blurred = lobe.prefilter(rest)
                 return [
-                    lobe.combine(blurred, look) + texels.radiance(each, brdf, texel, excess, eye=eye)
+                    lobe.combine(blurred, look) + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
                     for look, (each, _, brdf) in zip(view, parts, strict=True)
                 ]
 
@@ -293,11 +290,11 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
     count = len(glossy.position)
     size = lights[0].radiance.shape[-2]
     start = time.perf_counter()
-    factored = [published.factor_symmetric(BRDF, terms=4, resolution=24 if quick else 48)]
+    factored = [separable.published.factor_symmetric(BRDF, terms=4, resolution=24 if quick else 48)]
     factored.append(separable.factor(GROUND, terms=1, resolution=8))
     vertex = [np.arange(count), np.arange(count, len(whole.position))]
     parts = [
-        transports.precompute(whole, brdf, size=size, vertex=part, progress=False)
+        separable.precompute(whole, brdf, size=size, vertex=part, progress=False)
         for brdf, part in zip(factored, vertex, strict=True)
     ]
     seconds = time.perf_counter() - start

@@ -18,10 +18,11 @@ import numpy as np
 import scipy.sparse.linalg
 
 from benchmarks import harness
-from jaxprt.brdf import AshikhminShirley, load_lafortune, published, separable
-from jaxprt.brdf.errors import sample_error
-from jaxprt.linalg import eigen
+from jaxprt import separable
+from jaxprt.brdf import AshikhminShirley, load_lafortune
+from jaxprt.decompose import eigen
 from jaxprt.sphere import hemisphere
+from jaxprt.systems.separable import sample_error
 
 TERMS = (4, 8, 16, 32, 64)
 QUICK = (8,)
@@ -48,7 +49,7 @@ def brdf_matrix(resolution: int) -> jax.Array:
     """The published BRDF at all pairs of texels inside the disk."""
     direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
     inside = np.flatnonzero(hemisphere.texel_area(resolution=resolution).ravel())
-    return separable.tabulate(AshikhminShirley(), direction[inside])[0]
+    return separable.factorization.tabulate(AshikhminShirley(), direction[inside])[0]
 
 
 def measure(matrix: jax.Array, exact: np.ndarray, square: np.ndarray, terms: int, repeats: int) -> list[dict]:
@@ -99,8 +100,8 @@ def figure() -> None:
     path = harness.data() / "brdf/lafortune_measured.json"
     brdfs = {
         "Ashikhmin-Shirley (10, 100)": AshikhminShirley(),
-        "red plastic": published.red_plastic(),
-        "light brown plastic": published.brown_plastic(),
+        "red plastic": separable.published.red_plastic(),
+        "light brown plastic": separable.published.brown_plastic(),
         "Lafortune, clay": load_lafortune(path, "clay"),
         "Lafortune, skin": load_lafortune(path, "skin"),
     }
@@ -108,7 +109,7 @@ def figure() -> None:
         print(f"{name}: terms down, texels along an edge across")
         print("     " + "".join(f"{resolution:>8}" for resolution in RESOLUTIONS))
         factored = [
-            published.factor_symmetric(brdf, terms=max(FIGURE_TERMS), resolution=resolution)
+            separable.published.factor_symmetric(brdf, terms=max(FIGURE_TERMS), resolution=resolution)
             for resolution in RESOLUTIONS
         ]
         for terms in FIGURE_TERMS:

@@ -22,16 +22,19 @@ import numpy as np
 from jaxtyping import PyTree
 
 from benchmarks import harness, relight_separable
-from jaxprt import brdf, relight
+from jaxprt import bounces, brdf, bright_texels
+from jaxprt import dynamic as dynamic_system
+from jaxprt import harmonic as harmonic_system
+from jaxprt import lobe as lobe_system
+from jaxprt import separable as separable_system
 from jaxprt.brdf import AshikhminShirley
-from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.relight.dynamic import Material
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions
-from jaxprt.transport import ClusteredTransport, DynamicTransport, LobeTransport, TransferMatrix, TransferTensor
-from jaxprt.transport import lobe as pyramids
-from jaxprt.transport.dynamic import RegionTransport
-from jaxprt.transport.transfer import SecondBounce
+from jaxprt.systems.bounces import SecondBounce, TransferTensor
+from jaxprt.systems.dynamic import DynamicTransport, Material, RegionTransport
+from jaxprt.systems.harmonic import TransferMatrix
+from jaxprt.systems.lobe import LobeTransport
+from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 
 VERTICES = 36_000
 MEMBERS = 225
@@ -141,13 +144,13 @@ def clustered(vertices: int) -> Case:
 def harmonic(vertices: int) -> Case:
     """Transfer matrices of 25 coefficients."""
     position, frame = points(vertices)
-    table = brdf.harmonic.tabulate(AshikhminShirley(nu=12.0, nv=4.0), degree=4)
+    table = harmonic_system.tabulate(AshikhminShirley(nu=12.0, nv=4.0), degree=4)
     matrix = jax.random.normal(jax.random.key(1), (vertices, 1, 25, 25))
     transport = TransferMatrix(matrix, position, frame)
     leaf, structure = jax.tree.flatten(table)
 
     def radiance(light, material, eye):
-        return relight.harmonic.radiance(transport, structure.unflatten(material), light, eye=eye)
+        return harmonic_system.radiance(transport, structure.unflatten(material), light, eye=eye)
 
     light = jax.random.normal(jax.random.key(0), (25, 3))
     return Case(radiance, {"light": light, "material": leaf, "eye": EYE}, matrix.nbytes)
@@ -156,13 +159,13 @@ def harmonic(vertices: int) -> Case:
 def lobe(vertices: int) -> Case:
     """Eight lobes, tabulated over roughness, and sixteen texels."""
     transport = _seen(vertices)
-    table = brdf.lobe.tabulate(lambda m: brdf.CookTorrance(roughness=m), lobes=8, knot=[np.array([0.15, 0.2, 0.3])])
+    table = lobe_system.tabulate(lambda m: brdf.CookTorrance(roughness=m), lobes=8, knot=[np.array([0.15, 0.2, 0.3])])
 
     def radiance(light, material, eye):
-        texel, excess, rest = relight.direct.split(Environment(light), count=TEXELS)
-        color = relight.lobe.radiance(transport, table.at(material), rest, eye=eye)
+        texel, excess, rest = bright_texels.split(Environment(light), count=TEXELS)
+        color = lobe_system.radiance(transport, table.at(material), rest, eye=eye)
         model = brdf.CookTorrance(roughness=material)
-        return color + relight.direct.radiance(transport, model, texel, excess, eye=eye)
+        return color + bright_texels.radiance(transport, model, texel, excess, eye=eye)
 
     return Case(radiance, {"light": sky(), "material": jnp.array(0.22), "eye": EYE}, transport.nbytes)
 
@@ -174,7 +177,7 @@ def dynamic(vertices: int) -> Case:
 
     def radiance(light, material, eye):
         made = [mixed(family, material)]
-        return relight.dynamic.radiance(transport, [members], made, Environment(light), eye=eye, texels=TEXELS)
+        return dynamic_system.radiance(transport, [members], made, Environment(light), eye=eye, texels=TEXELS)
 
     return Case(radiance, arguments(), transport.nbytes)
 
@@ -183,12 +186,12 @@ def transfer(vertices: int) -> Case:
     """The same with one bounce and two."""
     family, members = changing()
     transport = _region(vertices)
-    tensor = _bounces(vertices, brdf.paths.factor(family.brdf).factor)
+    tensor = _bounces(vertices, bounces.factor(family.brdf).factor)
 
     def radiance(light, material, eye):
         made = [mixed(family, material)]
         direct_and_bounces = (transport, tensor, [members], made, Environment(light))
-        return relight.transfer.radiance(*direct_and_bounces, eye=eye, texels=TEXELS)
+        return bounces.radiance(*direct_and_bounces, eye=eye, texels=TEXELS)
 
     return Case(radiance, arguments(), transport.nbytes + tensor.nbytes)
 
@@ -196,7 +199,7 @@ def transfer(vertices: int) -> Case:
 def changing():
     """Cook-Torrance's model over Fresnel reflectance and roughness, and its lobes."""
     family = brdf.navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), (0.1, 0.2, 0.4)))))
-    return family, brdf.dynamic.factor(family.brdf, brdf.dynamic.separate(family.brdf, lobes=4))
+    return family, dynamic_system.factor(family.brdf, dynamic_system.separate(family.brdf, lobes=4))
 
 
 def mixed(family, material) -> Material:
@@ -223,11 +226,11 @@ def sky() -> jax.Array:
 
 
 def _terms(transport, terms: int) -> Case:
-    factored = brdf.separable.factor(AshikhminShirley(), terms=terms)
+    factored = separable_system.factor(AshikhminShirley(), terms=terms)
 
     def radiance(light, material, eye):
         own = SeparableBrdf(factored.light_map, material, factored.error, factored.coordinates)
-        return relight.separable.radiance(transport, own, Environment(light), eye=eye)
+        return separable_system.radiance(transport, own, Environment(light), eye=eye)
 
     return Case(radiance, {"light": sky(), "material": factored.view_map, "eye": EYE}, transport.nbytes)
 
@@ -248,9 +251,9 @@ def _clustered(vertices: int, *, terms: int, vectors: int, modes: int, keep: int
 
 def _seen(vertices: int) -> LobeTransport:
     position, frame = points(vertices)
-    count = pyramids.scales(SIZE).total
+    count = lobe_system.pyramid.scales(SIZE).total
     level = np.random.default_rng(1).integers(0, 256, (vertices, count), dtype=np.uint8)
-    vector = jax.random.normal(jax.random.key(2), ((pyramids.DEGREE + 1) ** 2, vertices))
+    vector = jax.random.normal(jax.random.key(2), ((lobe_system.pyramid.DEGREE + 1) ** 2, vertices))
     return LobeTransport(jnp.asarray(level), vector, position, frame, SIZE)
 
 

@@ -34,14 +34,10 @@ import numpy as np
 
 from benchmarks import harness, path_tracing, relight_dynamic
 from benchmarks.relight_dynamic import Triple
-from jaxprt import files, image
-from jaxprt.brdf import CookTorrance, dynamic, navigation, paths
-from jaxprt.relight import dynamic as direct
-from jaxprt.relight import transfer as relight
+from jaxprt import bounces, dynamic, files, image
+from jaxprt.brdf import CookTorrance, navigation
 from jaxprt.scene import Camera, Environment, Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.transport import dynamic as transports
-from jaxprt.transport import transfer
 
 LOBES = 4
 TEXELS = 16
@@ -73,8 +69,8 @@ class Scene(NamedTuple):
     """What is relit."""
 
     mesh: Mesh
-    transport: transports.DynamicTransport
-    tensor: transfer.TransferTensor
+    transport: dynamic.DynamicTransport
+    tensor: bounces.TransferTensor
     brdfs: list
     triples: list[Triple]
     materials: list[list]
@@ -96,7 +92,7 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
     start = time.perf_counter()
     sizes: dict = {"functions": 2, "terms": 4, "resolution": 8} if quick else {}
-    along = paths.factor(family.brdf, **sizes)
+    along = bounces.factor(family.brdf, **sizes)
     functions, terms = along.factor.shape[-1], len(along.light_map)
     yield {
         **{"benchmark": "interreflection", "case": f"basis: Cook-Torrance, {functions} functions of {terms} terms"},
@@ -121,12 +117,12 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
     mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 100)])
     size = 64 if real else 16
     path = store and store / published.mesh
-    transport = transports.precompute(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)
+    transport = dynamic.precompute(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)
     start = time.perf_counter()
     longest = (8, 8) if quick else LONGEST
     options: dict = {"components": longest[0], "modes": longest[1], "edge": 8 if real else 4, "size": 16 if real else 8}
     options |= {"path": path and path / "bounces", "progress": False}
-    full = transfer.precompute(mesh, [along] * 2, **options)
+    full = bounces.precompute(mesh, [along] * 2, **options)
     seconds = time.perf_counter() - start
     tensor = full.keep(4, modes=4) if quick else full.keep(DEFAULT[0], modes=DEFAULT[1])
     triples = relight_dynamic.draw(glossy, size, quick)[: 2 if quick else 10]
@@ -166,38 +162,38 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
 def frames(scene: Scene, published: Published):
     """Name, function and the paper's rate of each kind of frame."""
     transport, tensor, brdfs = scene.transport, scene.tensor, scene.brdfs
-    lit = direct.light_side(transport, scene.triples[0].light, texels=TEXELS)
-    bounced = relight.light_side(tensor, scene.triples[0].light)
-    arrived = relight.arriving(transport, tensor, bounced, scene.materials[0])
+    lit = dynamic.light_side(transport, scene.triples[0].light, texels=TEXELS)
+    bounced = bounces.light_side(tensor, scene.triples[0].light)
+    arrived = bounces.arriving(transport, tensor, bounced, scene.materials[0])
     samples = [relight_dynamic.samples_for(triple, transport.size) for triple in scene.triples]
     turn = itertools.count()
 
     def frame(matter: bool, light: bool):
         number = next(turn) % len(scene.triples)
         triple, now = scene.triples[number], scene.materials[number if matter else 0]
-        view = direct.view_side(transport, brdfs, now, eye=jnp.asarray(triple.eye))
+        view = dynamic.view_side(transport, brdfs, now, eye=jnp.asarray(triple.eye))
         sun, bounce, comes = lit, bounced, arrived
         if light:
-            sun = direct.light_side(transport, triple.light, texels=TEXELS)
-            bounce = relight.light_side(tensor, triple.light)
+            sun = dynamic.light_side(transport, triple.light, texels=TEXELS)
+            bounce = bounces.light_side(tensor, triple.light)
         if matter:
-            comes = relight.arriving(transport, tensor, bounce, now)
-        reflected = relight.combine(transport, comes, relight.view_side(transport, view))
-        return direct.combine(transport, sun, view, samples=samples[number if matter else 0]) + reflected
+            comes = bounces.arriving(transport, tensor, bounce, now)
+        reflected = bounces.combine(transport, comes, bounces.view_side(transport, view))
+        return dynamic.combine(transport, sun, view, samples=samples[number if matter else 0]) + reflected
 
     yield "V", lambda: frame(False, False), published.fps[0]
     yield "V&B", lambda: frame(True, False), published.fps[1]
     yield "V&B&L", lambda: frame(True, True), published.fps[2]
 
 
-def reflected(scene: Scene, tensor: transfer.TransferTensor, number: int) -> tuple[np.ndarray, np.ndarray]:
+def reflected(scene: Scene, tensor: bounces.TransferTensor, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of one bounce and of two bounces, in one triple."""
     triple, now = scene.triples[number], scene.materials[number]
-    view = direct.view_side(scene.transport, scene.brdfs, now, eye=jnp.asarray(triple.eye))
-    seen, lit = relight.view_side(scene.transport, view), relight.light_side(tensor, triple.light)
+    view = dynamic.view_side(scene.transport, scene.brdfs, now, eye=jnp.asarray(triple.eye))
+    seen, lit = bounces.view_side(scene.transport, view), bounces.light_side(tensor, triple.light)
     both, once = (
-        relight.combine(scene.transport, relight.arriving(scene.transport, tensor, each, now), seen)
-        for each in (lit, relight.LitTransfer(lit.first, None))
+        bounces.combine(scene.transport, bounces.arriving(scene.transport, tensor, each, now), seen)
+        for each in (lit, bounces.relight.LitTransfer(lit.first, None))
     )
     return np.asarray(once), np.asarray(both - once)
 
@@ -209,7 +205,7 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
         camera = camera_of(scene, triple)
         eye = camera.eye
         samples = relight_dynamic.samples_for(triple, scene.transport.size)
-        color = direct.radiance(
+        color = dynamic.radiance(
             scene.transport,
             scene.brdfs,
             scene.materials[number],
@@ -228,7 +224,7 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
                 (0.8 * triple.specular, triple.diffuse),
             )
         ]
-        rough = relight.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
+        rough = bounces.relight.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
         rough = Environment(jnp.broadcast_to(rough, (6, 8, 8, 8, 8, 3)).reshape(6, 64, 64, 3))
         exact, blurred = [], []
         for seed in (0, 1):
@@ -282,7 +278,7 @@ def norm(value, one: np.ndarray, other: np.ndarray) -> float:
     return float(np.sqrt(max(np.sum((value - one) * (value - other), dtype=np.float64), 0)))
 
 
-def figure_9(scene: Scene, full: transfer.TransferTensor, common: dict, quick: bool):
+def figure_9(scene: Scene, full: bounces.TransferTensor, common: dict, quick: bool):
     """Lines of shorter decompositions."""
     numbers = range(len(scene.triples))
     exact = [reflected(scene, full, number)[0] for number in numbers]
@@ -299,7 +295,7 @@ def figure_9(scene: Scene, full: transfer.TransferTensor, common: dict, quick: b
         }
 
 
-def figure_10(scene: Scene, full: transfer.TransferTensor, pictures: pathlib.Path) -> None:
+def figure_10(scene: Scene, full: bounces.TransferTensor, pictures: pathlib.Path) -> None:
     """Reflected light by shorter decompositions, and by the longest one last."""
     camera = camera_of(scene, scene.triples[PICTURED])
     tiles = []

@@ -17,7 +17,7 @@ Grace, without noise and with 2 % of the picture's root mean square. `peer` is p
 
 Line `jointly`: the same of a broader lobe, and 25 harmonics of a light of as many, beside a ground of known color.
 
-With --quick, or where LLVM 17 is missing, which Mitsuba needs, pictures are of `jaxprt.relight.reference` instead.
+With --quick, or where LLVM 17 is missing, which Mitsuba needs, pictures are of `jaxprt.reference` instead.
 """
 
 import pathlib
@@ -31,13 +31,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks import harness, path_tracing, prb
-from jaxprt import brdf, inverse, relight, scene, transport
+from jaxprt import bright_texels, harmonic, inverse, lobe, reference, scene
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.brdf.lobe import LobeBrdf
 from jaxprt.image import raster
-from jaxprt.relight import reference
 from jaxprt.scene import Camera, Environment, Mesh, builtin, camera, load_environment, load_mesh
 from jaxprt.sphere import cubemap, harmonics
+from jaxprt.systems.lobe import LobeBrdf
 
 DEGREE = 4
 TEXELS = 16
@@ -87,15 +86,15 @@ def measure(quick: bool, store: pathlib.Path | None):
 def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathlib.Path | None, quick: bool):
     """From one picture."""
     start = time.perf_counter()
-    table = brdf.harmonic.tabulate(Lambert(ALBEDO), degree=DEGREE, resolution=16)
-    vectors = transport.harmonic.precompute(mesh, degree=DEGREE, path=store and store / "harmonic", progress=False)
+    table = harmonic.tabulate(Lambert(ALBEDO), degree=DEGREE, resolution=16)
+    vectors = harmonic.precompute(mesh, degree=DEGREE, path=store and store / "harmonic", progress=False)
     ready = time.perf_counter() - start
 
     def radiance(light, eye):
-        return relight.harmonic.radiance(vectors, table, light, eye=eye)
+        return harmonic.radiance(vectors, table, light, eye=eye)
 
     for name, light in list({"of degree 4": band_limited(sky), "Grace": sky}.items())[: 1 if quick else None]:
-        true = relight.harmonic.project(light, degree=DEGREE)
+        true = harmonic.project(light, degree=DEGREE)
         image = drawn(mesh, [Lambert(ALBEDO)], light, view, exact, seed=0)
         pixels = inverse.observe(mesh, [inverse.Picture(image, view)])
         start = time.perf_counter()
@@ -164,9 +163,7 @@ def tabulated(quick: bool) -> LobeBrdf:
     knot = np.log(KNOTS[::2] if quick else KNOTS)
     lobes = 3 if quick else 8
     nodes = 12 if quick else 32
-    return brdf.lobe.tabulate(
-        lambda u, v: Shares(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot]
-    )
+    return lobe.tabulate(lambda u, v: Shares(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot])
 
 
 class Coated:
@@ -175,19 +172,19 @@ class Coated:
     def __init__(self, mesh: Mesh, lobes: LobeBrdf, size: int, degree: int, store: pathlib.Path | None):
         start = time.perf_counter()
         self.lobes = lobes
-        self.seen = transport.lobe.precompute(mesh, size=size, path=store and store / "lobe", progress=False)
+        self.seen = lobe.precompute(mesh, size=size, path=store and store / "lobe", progress=False)
         name = store and store / f"harmonic{degree}"
-        self.shadows = transport.harmonic.precompute(mesh, degree=degree, path=name, progress=False)
-        self.base = brdf.harmonic.tabulate(base, degree=degree, resolution=16)
+        self.shadows = harmonic.precompute(mesh, degree=degree, path=name, progress=False)
+        self.base = harmonic.tabulate(base, degree=degree, resolution=16)
         self.seconds = time.perf_counter() - start
 
-    def radiance(self, material, light: relight.lobe.LobeLight, coefficient, eye):
+    def radiance(self, material, light: lobe.LobeLight, coefficient, eye):
         """Under a light, prefiltered and as harmonics."""
         table, s = self.lobes.at(jnp.log(material["nu"]), jnp.log(material["nv"])), material["specular"]
         weight, diffuse = (s * each[:1] + (1 - s) * each[1:] for each in (table.weight, table.diffuse))
         table = eqx.tree_at(lambda each: (each.weight, each.diffuse), table, (weight, diffuse))
-        glossy = relight.lobe.combine(light, relight.lobe.look(self.seen, table, eye=eye))
-        under = relight.harmonic.radiance(self.shadows, self.base, coefficient, eye=eye)
+        glossy = lobe.combine(light, lobe.look(self.seen, table, eye=eye))
+        under = harmonic.radiance(self.shadows, self.base, coefficient, eye=eye)
         return glossy + material["diffuse"] * (1 - s) * under
 
 
@@ -195,11 +192,11 @@ def materials(case: Case):
     """From three pictures under known light."""
     mesh, sky, views, lobes, exact, store, quick = case
     coated = Coated(mesh, lobes, sky.radiance.shape[1], FINE, store)
-    texel, excess, rest = relight.direct.split(sky, count=TEXELS)
-    blurred, coefficient = relight.lobe.prefilter(rest), relight.harmonic.project(rest, degree=FINE)
+    texel, excess, rest = bright_texels.split(sky, count=TEXELS)
+    blurred, coefficient = lobe.prefilter(rest), harmonic.project(rest, degree=FINE)
 
     def radiance(material, eye):
-        single = relight.direct.radiance(coated.seen, AshikhminShirley(**material), texel, excess, eye=eye)
+        single = bright_texels.radiance(coated.seen, AshikhminShirley(**material), texel, excess, eye=eye)
         return single + coated.radiance(material, blurred, coefficient, eye)
 
     images = [drawn(mesh, [AshikhminShirley(**TRUE)], sky, view, exact, seed=n) for n, view in enumerate(views)]
@@ -234,19 +231,19 @@ def together(case: Case):
     whole = scene.mesh.join([mesh, ground])
     light, size = band_limited(sky), sky.radiance.shape[1]
     coated = Coated(whole, lobes, size, DEGREE, store and store / "ground")
-    plain = brdf.harmonic.tabulate(Lambert(PATCH), degree=DEGREE, resolution=16)
+    plain = harmonic.tabulate(Lambert(PATCH), degree=DEGREE, resolution=16)
     value = harmonics.evaluate(cubemap.direction(size=size), degree=DEGREE)
     known = (whole.region == 1)[:, None]
 
     def radiance(coefficient, material, eye):
-        blurred = relight.lobe.prefilter(Environment(value @ coefficient))
+        blurred = lobe.prefilter(Environment(value @ coefficient))
         own = coated.radiance(material, blurred, coefficient, eye)
-        return jnp.where(known, relight.harmonic.radiance(coated.shadows, plain, coefficient, eye=eye), own)
+        return jnp.where(known, harmonic.radiance(coated.shadows, plain, coefficient, eye=eye), own)
 
     models = [AshikhminShirley(**BROAD), Lambert(PATCH)]
     images = [drawn(whole, models, light, view, exact, seed=n) for n, view in enumerate(views)]
     pixels = observed(whole, images, views)
-    true = relight.harmonic.project(light, degree=DEGREE)
+    true = harmonic.project(light, degree=DEGREE)
     start = time.perf_counter()
     first = (jnp.zeros_like(true).at[0].set(norm(true) / np.sqrt(3)), arrays(START))
     found = inverse.jointly(radiance, first, pixels, lower=LOWER, upper=UPPER, scale=False, steps=12 if quick else 50)

@@ -18,15 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compression, harness
-from jaxprt.brdf import AshikhminShirley, CookTorrance, separable
-from jaxprt.brdf import lobe as lobes
-from jaxprt.relight import direct as texels
-from jaxprt.relight import lobe, reference
+from jaxprt import bright_texels, lobe, reference, separable, visibility
+from jaxprt.brdf import AshikhminShirley, CookTorrance
 from jaxprt.scene import Environment
 from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions
-from jaxprt.transport import direct
-from jaxprt.transport import lobe as pyramids
 
 SUN = 16
 TERMS_ERROR = np.inf  # Texel centers serve terms: their maps are smooth but for a bend at each texel.
@@ -52,34 +48,34 @@ def measure(quick: bool):
     glossy, ground, lights = compression.scene(quick)
     vertex = np.random.default_rng(0).permutation(len(glossy.position))[: 60 if quick else 300]
     size = lights[0].radiance.shape[-2]
-    visible = direct.precompute(join([glossy, ground]), size=size, vertex=np.sort(vertex), progress=False)
-    transport = pyramids.compress(visible)
+    visible = visibility.precompute(join([glossy, ground]), size=size, vertex=np.sort(vertex), progress=False)
+    transport = lobe.compress(visible)
     seen = jnp.asarray(visible.seen(np.arange(len(vertex))))
     views = jnp.asarray(compression.eyes(glossy, 2 if quick else 20))
     names = compression.names(lights)
     batch = Environment(jnp.stack([light.radiance for light in lights]))
     for material, brdf in list(MATERIALS.items())[2:3] if quick else MATERIALS.items():
         exact = radiance(brdf, seen, visible, batch, views)
-        samples = texels.samples_for(brdf)
+        samples = bright_texels.samples_for(brdf)
         factored = separable.factor(brdf, terms=16, resolution=12 if quick else 64)
         peer = radiance(factored, seen, visible, batch, views, error=TERMS_ERROR)
         for count in (1,) if quick else COUNTS:
             start = time.perf_counter()
-            table = lobes.tabulate(brdf, lobes=count, resolution=12 if quick else 32)
+            table = lobe.tabulate(brdf, lobes=count, resolution=12 if quick else 32)
             fitted = time.perf_counter() - start
             more = []
             if quick or count == 8:
                 terms = (2,) if quick else REMAINDER
-                rest = Environment(jnp.stack([texels.split(light, count=SUN)[2].radiance for light in lights]))
-                left = lobes.Remainder(brdf, table)
+                rest = Environment(jnp.stack([bright_texels.split(light, count=SUN)[2].radiance for light in lights]))
+                left = lobe.Remainder(brdf, table)
                 most = separable.factor(left, terms=max(terms), resolution=12 if quick else 64)
                 more = [radiance(most.keep(number), seen, visible, rest, views, error=TERMS_ERROR) for number in terms]
             for number, (name, light) in enumerate(zip(names, lights, strict=True)):
 
                 def frame(eye=views[0], table=table, light=light, brdf=brdf, samples=samples):
-                    texel, excess, rest = texels.split(light, count=SUN)
+                    texel, excess, rest = bright_texels.split(light, count=SUN)
                     color = lobe.radiance(transport, table, rest, eye=eye)
-                    return color + texels.radiance(transport, brdf, texel, excess, eye=eye, samples=samples)
+                    return color + bright_texels.radiance(transport, brdf, texel, excess, eye=eye, samples=samples)
 
                 color = np.stack([frame(eye) for eye in views])
                 known = np.stack([height(visible, eye) > 0 for eye in views])

@@ -17,12 +17,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks import harness
-from jaxprt.brdf import AshikhminShirley, Lambert, separable
+from jaxprt import separable, visibility
+from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import ground_plane, join, split
 from jaxprt.sphere import cubemap
-from jaxprt.transport import separable as transport
-from jaxprt.transport import visibility
 
 SIZE = 64
 EVERY = 8
@@ -53,12 +52,12 @@ def main(options: Sequence[str] | None = None) -> None:
     normal = np.asarray(whole.normal)
     # One block of each part compiles.
     for (mesh, _, _), brdf in zip(parts, factored, strict=True):
-        transport.precompute(mesh, brdf, size=size, occluder=whole, vertex=np.arange(1), progress=False)
-    chosen = np.arange(0, len(start), visibility.BLOCK)[:: 2 if arguments.quick else EVERY]
+        separable.precompute(mesh, brdf, size=size, occluder=whole, vertex=np.arange(1), progress=False)
+    chosen = np.arange(0, len(start), visibility.rays.BLOCK)[:: 2 if arguments.quick else EVERY]
     counts = [embree_alone(recorder, start, normal, chosen[0::2], size)]
     began = time.perf_counter()
     result = [
-        transport.precompute(mesh, brdf, keep=96, size=size, occluder=whole, progress=not arguments.quick)
+        separable.precompute(mesh, brdf, keep=96, size=size, occluder=whole, progress=not arguments.quick)
         for (mesh, _, _), brdf in zip(parts, factored, strict=True)
     ]
     seconds = time.perf_counter() - began
@@ -107,13 +106,13 @@ def scene(quick: bool) -> tuple[str, list]:
 def embree_alone(recorder: Recorder, start: np.ndarray, normal: np.ndarray, first: np.ndarray, size: int):
     """Rays of some blocks, the seconds that Embree takes for them on all threads, and the vertices in them."""
     threads = os.cpu_count() or 1
-    count, seconds, vertices = visibility.RayCount(0, 0, 0), 0.0, 0
+    count, seconds, vertices = visibility.rays.RayCount(0, 0, 0), 0.0, 0
     plain = super(Recorder, recorder).blocked
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:
         for group in np.array_split(first, max(1, len(first) // threads)):
             batches = []
             for begin in group:
-                part = slice(begin, begin + visibility.BLOCK)
+                part = slice(begin, begin + visibility.rays.BLOCK)
                 recorder.rays.clear()
                 count += visibility.fractional(recorder, start[part], normal[part], size=size)[1]
                 batches.append(list(recorder.rays))

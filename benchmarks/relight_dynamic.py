@@ -29,16 +29,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compression, harness
-from jaxprt.brdf import CookTorrance, Lambert, dynamic, navigation, published, separable
+from jaxprt import bright_texels, dynamic, lobe, reference, separable, visibility
+from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.image import raster
-from jaxprt.relight import direct as direct_light
-from jaxprt.relight import dynamic as relight
-from jaxprt.relight import reference
 from jaxprt.scene import Environment, Mesh, builtin, camera, environment, load_mesh
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import hemisphere
-from jaxprt.transport import direct
-from jaxprt.transport import dynamic as transports
 
 ROUGHNESS = (0.2, 0.05, 0.35, 0.1, 0.5)  # in turn; a quick run has the first three
 LOBES = (4, 8)
@@ -111,7 +107,7 @@ def measure_scene(scene: Published, sets: list, fitted: list, plane, quick: bool
     # One for any number of lobes.
     both = [sets[0], sets[0] if scene.adjustable == 2 else fixed]
     path = store and store / scene.mesh
-    transport = transports.precompute(mesh, both, size=size, path=path, progress=False)
+    transport = dynamic.precompute(mesh, both, size=size, path=path, progress=False)
     seconds = time.perf_counter() - start
     triples = draw(glossy, size, quick)
     for members, took in zip(sets, fitted, strict=True):
@@ -122,7 +118,7 @@ def measure_scene(scene: Published, sets: list, fitted: list, plane, quick: bool
 
 def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: list[Triple], more: dict, quick: bool):
     """Frames and errors by one set."""
-    first = relight.light_side(transport, triples[0].light, texels=TEXELS)
+    first = dynamic.light_side(transport, triples[0].light, texels=TEXELS)
     samples = [samples_for(triple, transport.size) for triple in triples]
     material = [materials(plane, triple, scene.adjustable) for triple in triples]
     turn = itertools.count()
@@ -130,9 +126,9 @@ def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: 
     def frame(view: bool, matter: bool, light: bool):
         number = next(turn) % len(triples)
         eye = jnp.asarray(triples[number if view else 0].eye)
-        lit = relight.light_side(transport, triples[number].light, texels=TEXELS) if light else first
-        seen = relight.view_side(transport, brdfs, material[number if matter else 0], eye=eye)
-        return relight.combine(transport, lit, seen, samples=samples[number if matter else 0])
+        lit = dynamic.light_side(transport, triples[number].light, texels=TEXELS) if light else first
+        seen = dynamic.view_side(transport, brdfs, material[number if matter else 0], eye=eye)
+        return dynamic.combine(transport, lit, seen, samples=samples[number if matter else 0])
 
     found = errors(mesh, transport, brdfs, triples, material, quick)
     count = brdfs[0].lobe.lobes
@@ -177,22 +173,22 @@ def draw(mesh: Mesh, size: int, quick: bool) -> list[Triple]:
 def materials(plane, triple: Triple, adjustable: int) -> list:
     """Those of a triple; a second region has the roles of its weights exchanged."""
     share = plane.share(jnp.asarray(triple.coordinate))
-    first = relight.Material(share, jnp.asarray(triple.diffuse), jnp.asarray(triple.specular))
-    second = relight.Material(share, jnp.asarray(0.8 * triple.specular), jnp.asarray(triple.diffuse))
+    first = dynamic.Material(share, jnp.asarray(triple.diffuse), jnp.asarray(triple.specular))
+    second = dynamic.Material(share, jnp.asarray(0.8 * triple.specular), jnp.asarray(triple.diffuse))
     return [first, second if adjustable == 2 else None]
 
 
 def samples_for(triple: Triple, size: int) -> int:
     """Points along the edge of the single texels that a triple's BRDF needs."""
     f0, roughness = triple.coordinate.tolist()
-    return direct_light.samples_for(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), size=size)
+    return bright_texels.samples_for(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), size=size)
 
 
 def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict[float, list]:
     """Of the triples of each roughness the error, the part of the BRDF, and that of the diffuse part."""
     number = np.random.default_rng(1).permutation(len(mesh.position))[: 40 if quick else 600]
     vertex = np.sort(number)
-    visible = direct.precompute(mesh, size=transport.size, vertex=vertex, progress=False)
+    visible = visibility.precompute(mesh, size=transport.size, vertex=vertex, progress=False)
     seen = jnp.asarray(visible.seen(np.arange(len(vertex))))
     region = np.asarray(mesh.region)[vertex]
 
@@ -207,9 +203,9 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
         f0, roughness = triple.coordinate.tolist()
         eye = jnp.asarray(triple.eye)
         options = {"eye": eye, "texels": TEXELS, "samples": samples_for(triple, transport.size)}
-        color = relight.radiance(transport, brdfs, matter, triple.light, **options)
-        dull = [each and relight.Material(each.share, each.diffuse, 0 * each.specular) for each in matter]
-        matte = relight.radiance(transport, brdfs, dull, triple.light, **options)
+        color = dynamic.radiance(transport, brdfs, matter, triple.light, **options)
+        dull = [each and dynamic.Material(each.share, each.diffuse, 0 * each.specular) for each in matter]
+        matte = dynamic.radiance(transport, brdfs, dull, triple.light, **options)
         white = exact(Lambert(1.0), triple)
         glossy = exact(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), triple)
         fitted = exact(brdfs[0].at(matter[0].share), triple)
@@ -238,8 +234,8 @@ def gradient(
     fixed = materials(plane, triple, common["adjustable"])
 
     def loss(light, diffuse, specular, coordinate):
-        first = relight.Material(plane.share(coordinate), diffuse, specular)
-        color = relight.radiance(transport, brdfs, [first, fixed[1]], Environment(light), eye=view.eye, texels=TEXELS)
+        first = dynamic.Material(plane.share(coordinate), diffuse, specular)
+        color = dynamic.radiance(transport, brdfs, [first, fixed[1]], Environment(light), eye=view.eye, texels=TEXELS)
         return jnp.mean(raster.interpolate(fragments, mesh.face, color) ** 2)
 
     each = (triple.light.radiance, *map(jnp.asarray, (triple.diffuse, triple.specular, triple.coordinate)))
@@ -255,7 +251,7 @@ def figure_5(quick: bool):
     brdfs = family.brdf[:: 20 if quick else 1]
     tables: dict[str, tuple] = {"free lobes": (dynamic.separate(brdfs, lobes=2 if quick else 8), [(2, 4), (4, 8)])}
     if not quick:
-        mirror = dynamic.separate(brdfs, separator=published.mirror_lobes)
+        mirror = dynamic.separate(brdfs, separator=lobe.published.mirror_lobes)
         more = [(1, 4), (2, 4), (4, 8), (6, 32)]
         tables |= {"no lobes": (None, more), "published lobes": (mirror, more)}
     for name, (lobes, ranks) in tables.items():
@@ -275,7 +271,9 @@ def principal(brdfs, *, functions: int) -> dict:
     start = time.perf_counter()
     direction = hemisphere.texel_direction(resolution=24).reshape(-1, 3)
     area = jnp.sqrt(hemisphere.texel_area(resolution=24).ravel())
-    rows = np.stack([np.ravel(separable.tabulate(each, direction) * area * area[:, None]) for each in brdfs])
+    rows = np.stack(
+        [np.ravel(separable.factorization.tabulate(each, direction) * area * area[:, None]) for each in brdfs]
+    )
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     value = np.linalg.eigvalsh(rows @ rows.T)
     left = float(np.sum(np.maximum(value[:-functions], 0)) / np.sum(value))

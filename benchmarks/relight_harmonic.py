@@ -21,14 +21,12 @@ import numpy as np
 
 from benchmarks import harness
 from benchmarks.precompute_separable import Recorder, embree_alone
-from jaxprt import brdf, report, scene
+from jaxprt import harmonic, reference, scene, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.relight import harmonic as relight
-from jaxprt.relight import reference
+from jaxprt.cli import report
 from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.sphere import directions, rotation
-from jaxprt.transport import TransferMatrix, visibility
-from jaxprt.transport import harmonic as transport
+from jaxprt.systems.harmonic import TransferMatrix
 
 DEGREE = 4
 # Frames per second of the paper: no transfer, transfer, fixed light, fixed view (2.2 GHz Pentium 4, Radeon 8500).
@@ -66,7 +64,7 @@ def meshes(quick: bool) -> dict[str, Mesh]:
 
 def frames(quick: bool) -> list[dict]:
     """The paper's Table 1."""
-    table = brdf.harmonic.tabulate(BRDFS["glossy (12, 4)"], degree=DEGREE, resolution=32 if quick else 128)
+    table = harmonic.tabulate(BRDFS["glossy (12, 4)"], degree=DEGREE, resolution=32 if quick else 128)
     light = jax.random.normal(jax.random.key(0), ((DEGREE + 1) ** 2, 3))
     return [
         line for name, mesh in meshes(quick).items() for line in frame(name, mesh, table, light, 3 if quick else 15)
@@ -80,22 +78,22 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
     eye = mesh.position.mean(0) + 3 * (mesh.position.max(0) - mesh.position.min(0))
     matrix = jax.random.normal(jax.random.key(1), (count, 1, terms, terms))
     shadowed = TransferMatrix(matrix, mesh.position, axes)
-    view = relight.view_coefficients(table, mesh.position, axes, eye=eye)
-    turned, through = relight.world_view(axes, view), relight.transferred_view(shadowed, view)
-    arriving = relight.local_light(axes, light)
+    view = harmonic.view_coefficients(table, mesh.position, axes, eye=eye)
+    turned, through = harmonic.world_view(axes, view), harmonic.transferred_view(shadowed, view)
+    arriving = harmonic.local_light(axes, light)
     cases = {
-        "general": (lambda: relight.unshadowed_radiance(mesh, table, light, eye=eye), "rotation", table.nbytes),
-        "transfer": (lambda: relight.radiance(shadowed, table, light, eye=eye), matrix, shadowed.nbytes),
+        "general": (lambda: harmonic.unshadowed_radiance(mesh, table, light, eye=eye), "rotation", table.nbytes),
+        "transfer": (lambda: harmonic.radiance(shadowed, table, light, eye=eye), matrix, shadowed.nbytes),
         "fixed light": (
-            lambda: relight.combine(arriving, relight.view_coefficients(table, mesh.position, axes, eye=eye)),
+            lambda: harmonic.combine(arriving, harmonic.view_coefficients(table, mesh.position, axes, eye=eye)),
             arriving,
             arriving.nbytes,
         ),
-        "fixed view": (lambda: relight.combine(light, turned), turned, turned.nbytes),
-        "fixed view, transfer": (lambda: relight.combine(light, through), through, through.nbytes),
+        "fixed view": (lambda: harmonic.combine(light, turned), turned, turned.nbytes),
+        "fixed view, transfer": (lambda: harmonic.combine(light, through), through, through.nbytes),
     }
     # Another order of the same products tells the rounding.
-    exact = {"transfer": relight.combine(relight.transferred_light(shadowed, light), view)}
+    exact = {"transfer": harmonic.combine(harmonic.transferred_light(shadowed, light), view)}
     exact["fixed view, transfer"] = exact["transfer"]
     lines = []
     paper = dict(zip(("general", "transfer", "fixed light", "fixed view"), PAPER.get(name, ()), strict=False))
@@ -103,7 +101,7 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
         rotating = isinstance(array, str)
         peer = (lambda: rotation.rotate_each(light, axes)) if rotating else harness.reader([np.asarray(array)])
         mine, theirs = harness.compare(function, peer, repeats=repeats)
-        expected = exact.get(case, relight.combine(arriving, view))
+        expected = exact.get(case, harmonic.combine(arriving, view))
         lines.append(
             {
                 "benchmark": "relight_harmonic",
@@ -134,10 +132,10 @@ def errors(quick: bool) -> list[dict]:
     eye = mesh.position.mean(0) + jnp.array([0.5, 0.7, 2.0]) * jnp.linalg.norm(jnp.ptp(mesh.position, 0))
     facing = np.flatnonzero(np.sum(np.asarray(mesh.normal * (eye - mesh.position)), 1) > 0)
     vertex = np.random.default_rng(0).permutation(facing)[: 50 if quick else 400]
-    full = transport.precompute(mesh, degree=degree, vertex=vertex, progress=False)
+    full = harmonic.precompute(mesh, degree=degree, vertex=vertex, progress=False)
     lines = []
     for name, model in list(BRDFS.items())[1:2] if quick else BRDFS.items():
-        table = brdf.harmonic.tabulate(model, degree=degree, resolution=32 if quick else 128)
+        table = harmonic.tabulate(model, degree=degree, resolution=32 if quick else 128)
         for sky, light in lights.items():
             truth = reference.radiance(mesh, model, light, eye=eye, vertex=vertex)
             for order in orders:
@@ -145,7 +143,7 @@ def errors(quick: bool) -> list[dict]:
                 short, few = TransferMatrix(matrix, full.position, full.frame), table.truncate(degree=order - 1)
                 for window in report.WINDOWS:
                     coefficient = report.harmonic_light(light, order=order, window=window)
-                    call = lambda s=short, f=few, c=coefficient: relight.radiance(s, f, c, eye=eye)  # noqa: E731
+                    call = lambda s=short, f=few, c=coefficient: harmonic.radiance(s, f, c, eye=eye)  # noqa: E731
                     color = call()
                     lines.append(
                         {
@@ -171,16 +169,16 @@ def precomputation(quick: bool) -> dict:
     name, mesh = next(iter(meshes(quick).items()))
     recorder, size = Recorder(mesh), 32
     start, normal = visibility.start_points(mesh, recorder), np.asarray(mesh.normal)
-    transport.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), progress=False)
-    chosen = np.arange(0, len(start), visibility.BLOCK)[:: 2 if quick else 8]
+    harmonic.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), progress=False)
+    chosen = np.arange(0, len(start), visibility.rays.BLOCK)[:: 2 if quick else 8]
     before = embree_alone(recorder, start, normal, chosen[0::2], size)
     began = time.perf_counter()
-    made = transport.precompute(mesh, degree=DEGREE, size=size, progress=not quick)
+    made = harmonic.precompute(mesh, degree=DEGREE, size=size, progress=not quick)
     seconds = time.perf_counter() - began
     after = embree_alone(recorder, start, normal, chosen[1::2], size)
     embree = (before[1] + after[1]) / (before[2] + after[2]) * len(start)
     few = np.random.default_rng(0).choice(len(start), 64, replace=False)
-    fine = transport.precompute(mesh, degree=DEGREE, size=2 * size, vertex=few, progress=False).matrix
+    fine = harmonic.precompute(mesh, degree=DEGREE, size=2 * size, vertex=few, progress=False).matrix
     return {
         "benchmark": "relight_harmonic",
         "case": f"precomputed transfer, {name}, {len(start)} vertices, 25 x 25",

@@ -16,11 +16,11 @@ import numpy as np
 import scipy.sparse
 
 from benchmarks import harness
-from jaxprt.brdf import AshikhminShirley, separable
-from jaxprt.relight.separable import combine, view_tuple
+from jaxprt import separable
+from jaxprt.brdf import AshikhminShirley
 from jaxprt.sphere import directions
-from jaxprt.transport import SparseTransport
-from jaxprt.transport.quantized import quantize
+from jaxprt.systems.separable import SparseTransport, combine, view_tuple
+from jaxprt.systems.separable.quantized import quantize
 
 SIZE = 64
 TERMS = 4

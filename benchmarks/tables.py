@@ -20,13 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness
-from jaxprt.brdf import AshikhminShirley, Lambert, separable
-from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt import separable
+from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Mesh, builtin, camera, load_mesh, occluder
 from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.transport import separable as transport
-from jaxprt.transport.quantized import QuantizedTransport, quantize
+from jaxprt.systems.separable import QuantizedTransport, SeparableBrdf, combine, light_tuple, view_tuple
+from jaxprt.systems.separable.quantized import quantize
 
 KEEP = 96
 SIZE = 64
@@ -85,7 +84,7 @@ def measure(
     shadows = occluder.simplify(whole, faces=faces)
     one_term = separable.factor(Lambert(0.5), terms=1)
     # One vertex compiles and does not count.
-    transport.precompute(ground, one_term, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
+    separable.precompute(ground, one_term, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
     began = time.perf_counter()
     below = precompute(ground, one_term, shadows, size)
     ground_seconds = time.perf_counter() - began
@@ -93,7 +92,7 @@ def measure(
     for column, terms in enumerate((1, 4)):
         glossy = separable.factor(AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100), terms=terms)
         began = time.perf_counter()
-        transport.precompute(mesh, glossy, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
+        separable.precompute(mesh, glossy, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
         compiled = time.perf_counter() - began
         began = time.perf_counter()
         upon = precompute(mesh, glossy, shadows, size)
@@ -121,7 +120,7 @@ def measure(
 
 def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh, size: int):
     """Transport in floating point and in whole numbers."""
-    result = transport.precompute(mesh, brdf, keep=KEEP, size=size, occluder=shadows, progress=False)
+    result = separable.precompute(mesh, brdf, keep=KEEP, size=size, occluder=shadows, progress=False)
     return result, jax.block_until_ready(quantize(result))
 
 

@@ -28,8 +28,8 @@ import numpy as np
 
 from benchmarks import harness
 from jaxprt.brdf import BlinnPhong, CookTorrance
-from jaxprt.linalg import tucker
-from jaxprt.linalg.tucker import Tucker
+from jaxprt.decompose import tucker
+from jaxprt.decompose.tucker import Tucker
 from jaxprt.sphere import hemisphere
 
 RANKS = (4, 8, 8)

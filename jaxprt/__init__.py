@@ -16,7 +16,25 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-from jaxprt import brdf, files, image, inverse, linalg, plan, relight, scene, sphere, transport
+from jaxprt import brdf, decompose, files, image, inverse, plan, scene, sphere, visibility
+from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
 
-__all__ = ["brdf", "files", "image", "inverse", "linalg", "plan", "relight", "scene", "sphere", "transport"]
+__all__ = [
+    "bounces",
+    "brdf",
+    "bright_texels",
+    "decompose",
+    "dynamic",
+    "files",
+    "harmonic",
+    "image",
+    "inverse",
+    "lobe",
+    "plan",
+    "reference",
+    "scene",
+    "separable",
+    "sphere",
+    "visibility",
+]
 __version__ = "0.1.0"

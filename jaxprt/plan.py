@@ -22,19 +22,15 @@ import numpy as np
 import tqdm
 from jaxtyping import Array, Float
 
-from jaxprt import require
-from jaxprt.brdf import lobe as lobes
-from jaxprt.brdf import separable as brdfs
-from jaxprt.brdf.lobe import LobeBrdf
-from jaxprt.brdf.separable import SeparableBrdf
-from jaxprt.relight import direct as texels
-from jaxprt.relight import lobe as blurred
-from jaxprt.relight import reference
-from jaxprt.relight.separable import combine, light_tuple, view_tuple
+from jaxprt import require, visibility
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, bounds
-from jaxprt.transport import ClusteredTransport, DirectTransport, LobeTransport, clustered, direct
-from jaxprt.transport import lobe as pyramids
+from jaxprt.systems import bright_texels, reference
+from jaxprt.systems import lobe as lobe_system
+from jaxprt.systems import separable as separable_system
+from jaxprt.systems.lobe import LobeBrdf, LobeTransport
+from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf, combine, light_tuple, view_tuple
+from jaxprt.visibility import DirectTransport
 
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
 _MEMBERS = 225  # vertices in a cluster
@@ -136,7 +132,7 @@ class Ready(eqx.Module):
         factored: Its terms, for the rest of the light.
         transport: Transport of the terms.
         texels: Number of single texels.
-        samples: Points along the edge of each, from `jaxprt.relight.direct.samples_for`.
+        samples: Points along the edge of each, from `jaxprt.bright_texels.samples_for`.
     """
 
     visible: DirectTransport
@@ -155,7 +151,7 @@ class LobeReady(eqx.Module):
         brdf: The BRDF itself, for single texels.
         table: Its lobes, for the rest of the light.
         texels: Number of single texels.
-        samples: Points along the edge of each, from `jaxprt.relight.direct.samples_for`.
+        samples: Points along the edge of each, from `jaxprt.bright_texels.samples_for`.
     """
 
     transport: LobeTransport
@@ -198,16 +194,16 @@ def separable(
     """
     size = _checked(environments, error)
     clusters = max(1, round(len(mesh.position) / _MEMBERS))
-    member = clustered.cluster(mesh.position, mesh.normal, clusters=clusters)
+    member = separable_system.clustered.cluster(mesh.position, mesh.normal, clusters=clusters)
     chosen = member[np.random.default_rng(0).permutation(clusters)[:_SAMPLE]]
     share, member = clusters / len(chosen), np.arange(chosen.size).reshape(chosen.shape)
     start = time.perf_counter()
-    visible = direct.precompute(mesh, size=size, occluder=occluder, vertex=chosen.ravel(), progress=False)
+    visible = visibility.precompute(mesh, size=size, occluder=occluder, vertex=chosen.ravel(), progress=False)
     rays = time.perf_counter() - start
     judged = np.sort(np.random.default_rng(1).permutation(chosen.size)[:_JUDGED])
     views = _views(mesh)
     exact = _exact(visible, judged, brdf, environments, views)
-    samples = texels.samples_for(brdf, size=size)
+    samples = bright_texels.samples_for(brdf, size=size)
     low, high, plan, wrong = 0, len(_LADDER), None, math.inf
     with tqdm.tqdm(total=high.bit_length(), desc="plan", disable=not progress) as bar:
         while low < high:  # The first step that is good enough lies in between: errors fall along the ladder.
@@ -250,22 +246,22 @@ def lobe(
     chosen = np.sort(np.random.default_rng(0).permutation(len(mesh.position))[:number])
     share = len(mesh.position) / number
     start = time.perf_counter()
-    visible = direct.precompute(mesh, size=size, occluder=occluder, vertex=chosen, progress=False)
-    transport = pyramids.compress(visible)
+    visible = visibility.precompute(mesh, size=size, occluder=occluder, vertex=chosen, progress=False)
+    transport = lobe_system.compress(visible)
     rays = share * (time.perf_counter() - start)
     views, judged = _views(mesh), np.arange(number)
     exact = _exact(visible, judged, brdf, environments, views)
-    reached, samples = math.inf, texels.samples_for(brdf, size=size)
+    reached, samples = math.inf, bright_texels.samples_for(brdf, size=size)
     for count, single in tqdm.tqdm(_LOBES, desc="plan", disable=not progress):
         start = time.perf_counter()
-        table = lobes.tabulate(brdf, lobes=count)
+        table = lobe_system.tabulate(brdf, lobes=count)
         seconds = rays + time.perf_counter() - start
         ready = LobeReady(transport, brdf, table, min(single, 6 * size * size - 1), samples)
         wrong = max(_error(ready, light, judged, views, at) for light, at in zip(environments, exact, strict=True))
         reached = min(reached, wrong)
         if wrong * MARGIN <= error:
             # What blurs the light does not grow with the mesh.
-            light = _seconds(lambda: blurred.prefilter(environments[0]))
+            light = _seconds(lambda: lobe_system.prefilter(environments[0]))
             once = _seconds(lambda ready=ready: radiance(ready, environments[0], eye=jnp.asarray(views[0])))
             once = light + share * max(once - light, 0)
             cost = wrong, once, int(share * transport.nbytes), seconds
@@ -306,13 +302,13 @@ def precompute(
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     run = {"executor": executor, "progress": progress}
-    samples = texels.samples_for(brdf, size=plan.size)
+    samples = bright_texels.samples_for(brdf, size=plan.size)
     if isinstance(plan, LobePlan):
         at = folder and folder / "lobes.prt"
-        transport = pyramids.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
-        return LobeReady(transport, brdf, lobes.tabulate(brdf, lobes=plan.lobes), plan.texels, samples)
+        transport = lobe_system.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
+        return LobeReady(transport, brdf, lobe_system.tabulate(brdf, lobes=plan.lobes), plan.texels, samples)
     at = folder and folder / "visibility.prt"
-    visible = direct.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
+    visible = visibility.precompute(mesh, size=plan.size, occluder=occluder, path=at, **run)
     at = folder and folder / "clusters.prt"
     return _ready(visible, brdf, plan, samples, clusters=plan.clusters, path=at, **run)
 
@@ -328,13 +324,13 @@ def radiance(ready: Ready | LobeReady, light: Environment, *, eye: Float[Array, 
     Returns:
         Linear radiance per vertex, in the light's units. Differentiable in the light and the eye.
     """
-    texel, excess, rest = texels.split(light, count=ready.texels)
+    texel, excess, rest = bright_texels.split(light, count=ready.texels)
     if isinstance(ready, Ready):
         view = view_tuple(ready.transport, ready.factored, eye)
         visible, smooth = ready.visible, combine(light_tuple(ready.transport, rest), view)
     else:
-        visible, smooth = ready.transport, blurred.radiance(ready.transport, ready.table, rest, eye=eye)
-    return smooth + texels.radiance(visible, ready.brdf, texel, excess, eye=eye, samples=ready.samples)
+        visible, smooth = ready.transport, lobe_system.radiance(ready.transport, ready.table, rest, eye=eye)
+    return smooth + bright_texels.radiance(visible, ready.brdf, texel, excess, eye=eye, samples=ready.samples)
 
 
 def _checked(environments: Sequence[Environment], error: float) -> int:
@@ -378,9 +374,9 @@ def _fitted(step: _Sizes, members: int, size: int) -> _Sizes:
 
 def _ready(visible: DirectTransport, brdf: Callable, sizes: Plan | _Sizes, samples: int, **options) -> Ready:
     """Transport in these sizes; the options are those of `clustered.precompute`."""
-    factored = brdfs.factor(brdf, terms=sizes.terms, resolution=sizes.resolution)
+    factored = separable_system.factor(brdf, terms=sizes.terms, resolution=sizes.resolution)
     limits = {name: getattr(sizes, name) for name in ("vectors", "modes", "keep")}
-    transport = clustered.precompute(visible, factored, **limits, **options)
+    transport = separable_system.clustered.precompute(visible, factored, **limits, **options)
     return Ready(visible, brdf, factored, transport, sizes.texels, samples)
 
 

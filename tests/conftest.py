@@ -51,12 +51,12 @@ def pytest_unconfigure() -> None:
 
 
 # These files take minutes each. One that came last would leave the other process idle.
-LONG = ("test_notebooks.py", "test_benchmarks.py", "test_command_line.py")
+LONG = ("test_notebooks.py", "test_benchmarks.py", "cli/test_main.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Puts the tests of the longest files first."""
-    items.sort(key=lambda item: item.path.name not in LONG)
+    items.sort(key=lambda item: not str(item.path).endswith(LONG))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -89,23 +89,29 @@ def data() -> pathlib.Path:
 @pytest.fixture(scope="module")
 def coarse() -> Iterator[None]:
     """For one file, BRDFs are fitted and tabulated at fewer directions; the code that does it is the same."""
-    from jaxprt.brdf import harmonic, lobe_em, paths, reflected
+    from jaxprt import bounces, dynamic, harmonic, lobe
 
     fewer = {
-        lobe_em: {"RINGS": 20, "SECTORS": 28},
-        reflected: {"_RINGS": 20, "_SECTORS": 28},
-        paths: {"_RINGS": 20, "_SECTORS": 28},
-        harmonic: {"_RULES": ((16, 48), (20, 64)), "_ANGLES": (48,), "_EDGES": (16,), "_PROBES": 8, "_ERROR": 0.5},
+        lobe.em: {"RINGS": 20, "SECTORS": 28},
+        dynamic.reflected: {"_RINGS": 20, "_SECTORS": 28},
+        bounces.functions: {"_RINGS": 20, "_SECTORS": 28},
+        harmonic.table: {
+            "_RULES": ((16, 48), (20, 64)),
+            "_ANGLES": (48,),
+            "_EDGES": (16,),
+            "_PROBES": 8,
+            "_ERROR": 0.5,
+        },
     }
     with pytest.MonkeyPatch.context() as patch:
         jax.clear_caches()  # Programs hold the numbers that they were compiled with.
-        reflected._dual.cache_clear()
+        dynamic.reflected._dual.cache_clear()
         for room, values in fewer.items():
             for name, value in values.items():
                 patch.setattr(room, name, value)
         yield
     jax.clear_caches()
-    reflected._dual.cache_clear()
+    dynamic.reflected._dual.cache_clear()
 
 
 @pytest.fixture

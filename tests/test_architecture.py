@@ -1,10 +1,11 @@
 """The layer table of the design: who may import whom, and the few rules on what a module may do.
 
-Rooms are folders; imports point down ``ROOMS``, never up. Inside a room, systems (files of the same name in each
-room) build on the room's helpers and never on each other, except where ``SIDEWAYS`` says so.
+Rooms are folders; imports point down ``ROOMS``, never up. In ``systems`` each system is a folder or file of its own,
+and imports point down ``LADDER``. Inside a folder modules may import each other. No imports form a circle.
 """
 
 import ast
+import graphlib
 import itertools
 import pathlib
 import re
@@ -18,85 +19,16 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "animation", "report", "inverse", "plan", "relight", "image", "transport", "brdf", "scene"]
-ROOMS += ["linalg", "sphere", "files", "staging", "require"]
-SYSTEMS = {"harmonic", "separable", "lobe", "dynamic", "direct", "reference"}
+ROOMS = ["__main__", "cli", "inverse", "plan", "systems", "image", "visibility", "scene", "brdf"]
+ROOMS += ["decompose", "sphere", "files", "compile", "require"]
 
-# Which module of a room may import which of the same room, besides systems their helpers; "*" is every room.
-SIDEWAYS = {
-    ("*", "dynamic", "lobe"),  # Sun's system is built on the lobes of its own section 4.1.
-    ("*", "dynamic", "separable"),  # Its terms are separable ones, with view maps that change.
-    ("brdf", "cylinders", "models"),
-    ("brdf", "measured", "models"),
-    ("brdf", "navigation", "models"),
-    ("brdf", "paths", "dynamic"),
-    ("brdf", "paths", "separable"),
-    ("brdf", "published", "dynamic"),
-    ("brdf", "published", "models"),
-    ("brdf", "published", "separable"),
-    ("brdf", "paths", "reflected"),
-    ("brdf", "published", "reflected"),
-    ("brdf", "reflected", "grid"),
-    ("brdf", "reflected", "lobe"),
-    ("brdf", "reflected", "lobe_em"),
-    ("brdf", "scattered", "measured"),
-    ("inverse", "fit", "numbers"),
-    ("inverse", "fit", "pictures"),
-    ("inverse", "fit", "solve"),
-    ("inverse", "pictures", "numbers"),
-    ("inverse", "solve", "numbers"),
-    ("linalg", "clustering", "eigen"),
-    ("linalg", "tucker", "eigen"),
-    ("scene", "builtin", "environment"),
-    ("scene", "builtin", "mesh"),
-    ("scene", "builtin", "shapes"),
-    ("scene", "camera", "mesh"),
-    ("scene", "interiors", "builtin"),
-    ("scene", "interiors", "mesh"),
-    ("scene", "interiors", "shapes"),
-    ("scene", "mesh", "mesh_file"),
-    ("brdf", "published", "lobe"),
-    ("brdf", "published", "lobe_em"),
-    ("relight", "dynamic", "direct"),
-    ("sphere", "harmonics", "cubemap"),
-    ("sphere", "hemisphere", "directions"),
-    ("sphere", "rotation", "harmonics"),
-    ("scene", "occluder", "mesh"),
-    ("scene", "shapes", "mesh"),
-    ("scene", "texture", "mesh"),
-    ("transport", "bounce", "visibility"),
-    ("transport", "bounce", "hits"),
-    ("transport", "hits", "visibility"),
-    ("transport", "interreflection", "hits"),
-    ("transport", "bounce", "paths"),
-    ("relight", "transfer", "dynamic"),
-    ("transport", "transfer", "blocks"),
-    ("transport", "transfer", "clustered"),
-    ("transport", "transfer", "transfer_job"),
-    ("transport", "transfer_job", "blocks"),
-    ("transport", "transfer_job", "bounce"),
-    ("transport", "transfer_job", "clustered"),
-    ("transport", "transfer_job", "visibility"),
-    ("transport", "clustered", "blocks"),
-    ("transport", "clustered", "direct"),
-    ("transport", "clustered", "separable"),
-    ("transport", "clustered", "visibility"),
-    ("transport", "direct", "blocks"),
-    ("transport", "direct", "visibility"),
-    ("transport", "dynamic", "direct"),
-    ("transport", "lobe", "direct"),
-    ("transport", "lobe", "harmonic"),
-    ("transport", "quantized", "sparse"),
-    ("transport", "sparse", "visibility"),
-    ("transport", "visibility", "blocks"),
-    ("transport", "interreflection", "blocks"),
-    ("transport", "interreflection", "harmonic"),
-    ("transport", "interreflection", "visibility"),
-}
+# The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.
+LADDER = [{"bounces"}, {"dynamic"}, {"separable", "lobe"}, {"harmonic"}, {"reference", "bright_texels"}, {"adaptive"}]
+RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 
 # Libraries that only some modules touch: everything that reads files, and the rays.
 ONLY_IN = {
-    "embreex": "jaxprt.transport.visibility",
+    "embreex": "jaxprt.visibility.rays",
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
     "zarr": "jaxprt.files",
@@ -135,27 +67,29 @@ def violation(importer: str, imported: str) -> str | None:
     if importer == "jaxprt":
         return None
     if imported == "jaxprt":
-        return None if importer == "jaxprt.__main__" else "imports the root package"
+        return None if importer == "jaxprt.cli.main" else "imports the root package"
     room, target = importer.split(".")[1], imported.split(".")[1]
     unknown = {room, target} - set(ROOMS)
     if unknown:
         return f"{unknown} is no room"
     if room == target:
-        return _sideways(room, importer.split(".")[2:], imported.split(".")[2:])
+        return _inside(importer.split("."), imported.split("."))
     if ROOMS.index(room) > ROOMS.index(target):
         return f"points up, from {room} to {target}"
     return None
 
 
-def _sideways(room: str, importer: list[str], imported: list[str]) -> str | None:
-    if not importer:  # The room's __init__.
+def _inside(importer: list[str], imported: list[str]) -> str | None:
+    """The same of two modules of one room."""
+    if len(importer) > len(imported) and importer[: len(imported)] == imported:
+        return "imports the __init__ of its own folder; name the module"
+    if importer[1] != "systems" or len(importer) < 3 or importer[2] == imported[2]:
         return None
-    if not imported:
-        return "imports its own room's __init__; name the module"
-    pair = (importer[0], imported[0])
-    allowed = (room, *pair) in SIDEWAYS or ("*", *pair) in SIDEWAYS
-    onto_helper = importer[0] in SYSTEMS and imported[0] not in SYSTEMS
-    return None if allowed or onto_helper else f"{pair[0]} on {pair[1]} is not listed in SIDEWAYS"
+    unknown = {importer[2], imported[2]} - set(RUNG)
+    if unknown:
+        return f"{unknown} has no place on the ladder"
+    same = RUNG[importer[2]] >= RUNG[imported[2]]
+    return f"points up the ladder, from {importer[2]} to {imported[2]}" if same else None
 
 
 @each_module
@@ -182,10 +116,10 @@ def test_a_library_is_imported_only_where_its_business_is(module):
 
 
 @each_module
-def test_linalg_and_sphere_know_no_brdf_and_no_scene(module):
-    if module.split(".")[1:2] in (["linalg"], ["sphere"]):
+def test_decompositions_and_the_sphere_know_no_brdf_and_no_scene(module):
+    if module.split(".")[1:2] in (["decompose"], ["sphere"]):
         known = {name.split(".")[1] for name in imports(TREES[module]) if name.startswith("jaxprt.")}
-        assert known <= {"linalg", "sphere"}
+        assert known <= {"decompose", "sphere"}
 
 
 @each_module
@@ -223,24 +157,26 @@ def test_rooms_hold_what_the_table_names():
     assert rooms <= set(ROOMS), f"{rooms - set(ROOMS)} must be given a place in ROOMS"
 
 
-def test_every_sideways_permission_of_one_room_is_used():
-    pairs = {
-        (*importer.split(".")[1:3], *name.split(".")[2:3]) for importer in PATHS for name in imports(TREES[importer])
-    }
-    assert {entry for entry in SIDEWAYS if entry[0] != "*"} <= pairs
+def test_no_imports_form_a_circle():
+    needs = {module: {name for name in imports(TREES[module]) if name in PATHS and name != module} for module in PATHS}
+    # Inside a folder its own __init__ does not count: what imports a module of it runs that first.
+    graphlib.TopologicalSorter(needs).prepare()
 
 
 @pytest.mark.parametrize(
     ("importer", "imported"),
     [
         ("jaxprt.sphere.haar", "jaxprt.scene.mesh"),
-        ("jaxprt.transport.separable", "jaxprt.relight.separable"),
-        ("jaxprt.brdf.separable", "jaxprt.brdf.harmonic"),
-        ("jaxprt.brdf.lobe", "jaxprt.brdf.dynamic"),
-        ("jaxprt.brdf.models", "jaxprt.brdf.separable"),
+        ("jaxprt.visibility.stored", "jaxprt.systems.lobe"),
+        ("jaxprt.systems.separable.wavelets", "jaxprt.systems.lobe"),
+        ("jaxprt.systems.lobe.table", "jaxprt.systems.dynamic.brdf_set"),
+        ("jaxprt.brdf.models", "jaxprt.systems.separable"),
+        ("jaxprt.systems.lobe.table", "jaxprt.systems.lobe"),
+        ("jaxprt.systems.lobe.table", "jaxprt.systems"),
         ("jaxprt.sphere.haar", "jaxprt.sphere"),
-        ("jaxprt.linalg.eigen", "jaxprt.brdf"),
+        ("jaxprt.decompose.eigen", "jaxprt.brdf"),
         ("jaxprt.image.raster", "jaxprt"),
+        ("jaxprt.systems.extra", "jaxprt.systems.lobe"),
         ("jaxprt.extra", "jaxprt.sphere"),
     ],
 )
@@ -251,15 +187,15 @@ def test_the_table_forbids(importer, imported):
 @pytest.mark.parametrize(
     ("importer", "imported"),
     [
-        ("jaxprt", "jaxprt.relight"),
+        ("jaxprt", "jaxprt.systems"),
         ("jaxprt.brdf", "jaxprt.brdf.models"),
-        ("jaxprt.brdf.separable", "jaxprt.brdf.models"),
-        ("jaxprt.brdf.dynamic", "jaxprt.brdf.lobe"),
-        ("jaxprt.relight.dynamic", "jaxprt.relight.lobe"),
-        ("jaxprt.relight.separable", "jaxprt.transport.separable"),
-        ("jaxprt.transport.separable", "jaxprt.transport.blocks"),
-        ("jaxprt.__main__", "jaxprt"),
-        ("jaxprt.__main__", "jaxprt.files"),
+        ("jaxprt.systems.lobe", "jaxprt.systems.lobe.table"),
+        ("jaxprt.systems.lobe.relight", "jaxprt.systems.lobe.table"),
+        ("jaxprt.systems.dynamic.relight", "jaxprt.systems.lobe"),
+        ("jaxprt.systems.bounces.relight", "jaxprt.systems.dynamic.relight"),
+        ("jaxprt.systems.separable.wavelets", "jaxprt.visibility.blocks"),
+        ("jaxprt.cli.main", "jaxprt"),
+        ("jaxprt.__main__", "jaxprt.cli.main"),
     ],
 )
 def test_the_table_allows(importer, imported):

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 import jaxprt as prt
+from jaxprt import lobe
 from jaxprt.image import raster
-from jaxprt.transport import lobe
 
 ROOT = pathlib.Path(__file__).parents[1]
 BENCHMARKS = sorted(
@@ -43,15 +43,15 @@ def small(coarse):
     """Coarse tables where a benchmark leaves their size open, and blocks so short that quick cases have several."""
     with pytest.MonkeyPatch.context() as patch:
         for room, name, options in (
-            (prt.brdf.separable, "factor", {"resolution": 12}),
-            (prt.brdf.harmonic, "tabulate", {"resolution": 8, "error": 1e-2}),
-            (prt.brdf.lobe, "tabulate", {"resolution": 12}),
-            (prt.brdf.paths, "factor", {"resolution": 12}),
+            (prt.separable.factorization, "factor", {"resolution": 12}),
+            (prt.harmonic.table, "tabulate", {"resolution": 8, "error": 1e-2}),
+            (prt.lobe.table, "tabulate", {"resolution": 12}),
+            (prt.bounces.functions, "factor", {"resolution": 12}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
         for room, name, value in (
-            (prt.brdf.separable, "_BLOCK", 64),
-            (lobe, "_BLOCK", 64),
+            (prt.separable.factorization, "_BLOCK", 64),
+            (lobe.pyramid, "_BLOCK", 64),
             (raster, "CHUNK", 1024),
         ):
             patch.setattr(room, name, value)

@@ -29,7 +29,11 @@ import numpy as np
 import pytest
 
 import jaxprt
-from jaxprt import brdf, linalg, relight, scene, transport
+from jaxprt import bounces, brdf, dynamic, scene, visibility
+from jaxprt import harmonic as harmonic_system
+from jaxprt import lobe as lobe_system
+from jaxprt import separable as separable_system
+from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import raster
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
@@ -39,47 +43,47 @@ JITTED = type(jax.jit(lambda: 0))
 
 HOST = {
     "require": "checks values",
-    "staging": "takes functions",
+    "compile": "takes functions",
     "inverse": "takes functions, and fits on the host",
-    "report": "measures, and writes files",
-    "animation": "the same",
+    "cli.report": "measures, and writes files",
+    "cli.animation": "the same",
     "files": "reads and writes files",
     "image.raster.front": "gives truth values",
-    "transport.visibility": "traces rays",
-    "transport.blocks": "runs workers and writes files",
-    "transport.separable.precompute": "traces rays",
-    "transport.direct.precompute": "traces rays",
-    "transport.lobe.precompute": "traces rays",
-    "transport.lobe.compress": "runs through blocks on the host",
-    "transport.lobe.pyramid": "gives bytes",
-    "transport.lobe.scales": "NumPy tables",
-    "transport.lobe.between": "indices, of a NumPy table",
-    "transport.lobe.corners": "indices beside the weights",
-    "relight.lobe.scales": "NumPy tables",
-    "relight.lobe.look": "gives indices beside shares, compiled in steps; relight.lobe.radiance has them all",
+    "visibility.rays": "traces rays",
+    "visibility.blocks": "runs workers and writes files",
+    "systems.separable.wavelets.precompute": "traces rays",
+    "visibility.stored.precompute": "traces rays",
+    "systems.lobe.pyramid.precompute": "traces rays",
+    "systems.lobe.pyramid.compress": "runs through blocks on the host",
+    "systems.lobe.pyramid.pyramid": "gives bytes",
+    "systems.lobe.pyramid.scales": "NumPy tables",
+    "systems.lobe.pyramid.between": "indices, of a NumPy table",
+    "systems.lobe.pyramid.corners": "indices beside the weights",
+    "systems.lobe.relight.scales": "NumPy tables",
+    "systems.lobe.relight.look": "gives indices beside shares, compiled in steps; lobe.radiance has them all",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
     "require.length": "checks a shape",
-    "transport.clustered.cluster": "sorts on the host, where data enters",
-    "transport.clustered.places": "a NumPy table of rows",
-    "transport.clustered.precompute": "runs workers and writes files",
-    "transport.clustered.compress": "gives half precision, and vectors of either sign: no one dtype, no one answer",
-    "transport.sparse.rms": "counts on the host, after precomputation",
-    "transport.interreflection": "traces rays",
-    "transport.harmonic.precompute": "traces rays",
-    "transport.harmonic.precompute_diffuse": "traces rays",
-    "transport.harmonic.check": "checks values",
-    "relight.direct.samples_for": "compares rules on the host",
-    "relight.refine": "integrates cells that a loop chooses; relight.reference.integrate has them all",
+    "systems.separable.clustered.cluster": "sorts on the host, where data enters",
+    "systems.separable.clustered.places": "a NumPy table of rows",
+    "systems.separable.clustered.precompute": "runs workers and writes files",
+    "systems.separable.clustered.compress": "gives half precision, and vectors of either sign: no one dtype or answer",
+    "systems.separable.sparse.rms": "counts on the host, after precomputation",
+    "systems.harmonic.interreflection": "traces rays",
+    "systems.harmonic.transfer.precompute": "traces rays",
+    "systems.harmonic.transfer.precompute_diffuse": "traces rays",
+    "systems.harmonic.transfer.check": "checks values",
+    "systems.bright_texels.samples_for": "compares rules on the host",
+    "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",
     "sphere.cubemap.axes": "a NumPy table of axes",
-    "relight.reference.radiance": "traces rays; its pure part is integrate",
-    "linalg.clustering": "sorts on the host, where data enters",
-    "linalg.eigen.orientation": "NumPy on the host",
-    "linalg.tucker.oriented": "the same",
-    "linalg.tucker.hosvd": "gives vectors of either sign, whose reconstruction alone has derivatives",
-    "linalg.tucker.truncated": "the same",
-    "linalg.tucker.hooi": "the same",
-    "linalg.tucker.ranks_for": "chooses by values, on the host",
+    "systems.reference.radiance": "traces rays; its pure part is integrate",
+    "decompose.clustering": "sorts on the host, where data enters",
+    "decompose.eigen.orientation": "NumPy on the host",
+    "decompose.tucker.oriented": "the same",
+    "decompose.tucker.hosvd": "gives vectors of either sign, whose reconstruction alone has derivatives",
+    "decompose.tucker.truncated": "the same",
+    "decompose.tucker.hooi": "the same",
+    "decompose.tucker.ranks_for": "chooses by values, on the host",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
@@ -91,50 +95,50 @@ HOST = {
     "brdf.models.color": "converts a parameter where it enters",
     "brdf.models.scalar": "the same",
     "brdf.grid": "gives indices beside shares; tested through the tables that are read by it",
-    "brdf.harmonic.tabulate": "checks values, and chooses the quadrature by them",
-    "brdf.separable.marked": "NumPy on the host",
-    "brdf.separable.check_mark": "checks values",
-    "brdf.separable.factor": "checks values, and chooses the number of terms by them",
-    "brdf.lobe.tabulate": "checks values, and chooses the number of lobes by them",
-    "brdf.lobe.sampled": "checks values",
-    "brdf.lobe.is_isotropic": "compares values",
-    "brdf.dynamic.separate": "checks values",
-    "brdf.dynamic.factor": "the same",
-    "brdf.dynamic.decompose": "the same",
-    "brdf.reflected.reflect": "the same",
-    "brdf.dynamic.check": "the same",
-    "brdf.reflected.check_values": "the same",
-    "brdf.dynamic.check_ranks": "the same",
-    "brdf.reflected.stacked": "looks at types",
-    "brdf.paths.basis": "counts colors by values",
-    "brdf.paths.factor": "checks values",
-    "brdf.paths.fixed_weights": "counts colors by values",
-    "transport.bounce.rays": "traces rays",
-    "transport.hits": "traces rays",
-    "transport.transfer.precompute": "traces rays",
-    "transport.transfer_job": "traces rays, and gives half precision and vectors of either sign",
+    "systems.harmonic.table.tabulate": "checks values, and chooses the quadrature by them",
+    "systems.separable.factorization.marked": "NumPy on the host",
+    "systems.separable.factorization.check_mark": "checks values",
+    "systems.separable.factorization.factor": "checks values, and chooses the number of terms by them",
+    "systems.lobe.table.tabulate": "checks values, and chooses the number of lobes by them",
+    "systems.lobe.table.sampled": "checks values",
+    "systems.lobe.table.is_isotropic": "compares values",
+    "systems.dynamic.brdf_set.separate": "checks values",
+    "systems.dynamic.brdf_set.factor": "the same",
+    "systems.dynamic.brdf_set.decompose": "the same",
+    "systems.dynamic.reflected.reflect": "the same",
+    "systems.dynamic.brdf_set.check": "the same",
+    "systems.dynamic.reflected.check_values": "the same",
+    "systems.dynamic.brdf_set.check_ranks": "the same",
+    "systems.dynamic.reflected.stacked": "looks at types",
+    "systems.bounces.functions.basis": "counts colors by values",
+    "systems.bounces.functions.factor": "checks values",
+    "systems.bounces.functions.fixed_weights": "counts colors by values",
+    "systems.bounces.gather.rays": "traces rays",
+    "visibility.hits": "traces rays",
+    "systems.bounces.tensor.precompute": "traces rays",
+    "systems.bounces.jobs": "traces rays, and gives half precision and vectors of either sign",
     "brdf.navigation.triangulate": "by SciPy, where data enters",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
-    "brdf.published.factor_tensor": "checks values",
-    "transport.dynamic.precompute": "traces rays",
-    "transport.dynamic.compress": "runs workers and writes files",
-    "relight.dynamic.check_material": "checks values",
-    "relight.dynamic.light_side": "gives indices; relight.dynamic.radiance has them all",
-    "relight.dynamic.view_side": "the same",
-    "relight.dynamic.combine": "takes indices; the same",
-    "relight.transfer.light_side": "takes half precision; relight.transfer.radiance has them all",
-    "relight.transfer.arriving": "takes indices; the same",
-    "relight.transfer.view_side": "takes indices; the same",
-    "relight.transfer.collect": "takes half precision; the same",
-    "relight.transfer.weights": "takes half precision; the same",
-    "relight.transfer.combine": "takes indices; the same",
-    "brdf.lobe_em": "the steps of brdf.lobe.tabulate, and tested through it",
-    "brdf.published": "checks values",
-    "brdf.errors": "draws its own directions",
-    "brdf.separable.tabulate": "checks values",
+    "systems.dynamic.published.factor_tensor": "checks values",
+    "systems.dynamic.transport.precompute": "traces rays",
+    "systems.dynamic.transport.compress": "runs workers and writes files",
+    "systems.dynamic.relight.check_material": "checks values",
+    "systems.dynamic.relight.light_side": "gives indices; dynamic.radiance has them all",
+    "systems.dynamic.relight.view_side": "the same",
+    "systems.dynamic.relight.combine": "takes indices; the same",
+    "systems.bounces.relight.light_side": "takes half precision; bounces.radiance has them all",
+    "systems.bounces.relight.arriving": "takes indices; the same",
+    "systems.bounces.relight.view_side": "takes indices; the same",
+    "systems.bounces.relight.collect": "takes half precision; the same",
+    "systems.bounces.relight.weights": "takes half precision; the same",
+    "systems.bounces.relight.combine": "takes indices; the same",
+    "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
+    "systems.separable.published": "checks values",
+    "systems.separable.errors": "draws its own directions",
+    "systems.separable.factorization.tabulate": "checks values",
     "plan": "measures",
-    "brdf.separable.join": "puts arrays side by side, and makes an error that is NaN",
+    "systems.separable.factorization.join": "puts arrays side by side, and makes an error that is NaN",
     "scene.mesh": "loads, checks and builds meshes",
     "scene.mesh_file": "reads files",
     "scene.texture.dpdu": "reads a mesh on the host",
@@ -224,37 +228,37 @@ class Draw:
     def separable(self, terms=2, size=4):
         """A factored BRDF."""
         maps = self.normal(terms, size, size, 1), self.normal(terms, size, size, 3)
-        return brdf.separable.SeparableBrdf(*maps, self.uniform())
+        return separable_system.SeparableBrdf(*maps, self.uniform())
 
     def sparse(self, size=4, *, kept=5, vertices=3, terms=2):
         """Transport for ``light`` and ``separable``."""
         index = self.integer(6 * size * size, kept, vertices, terms, dtype=jnp.uint16)
         value = self.normal(kept, vertices, terms, 1)
         position, frame = self.normal(vertices, 3), self.rotation(vertices)
-        return transport.SparseTransport(index, value, position, frame, self.uniform(6 * size * size))
+        return separable_system.SparseTransport(index, value, position, frame, self.uniform(6 * size * size))
 
     def direct(self, size=4, *, vertices=3):
         """Visibility for ``light``, in bytes for two vertices each."""
-        level = self.integer(256, 6 * size * size, transport.visibility.BLOCK // 2, dtype=jnp.uint8)
-        return transport.DirectTransport(level, self.normal(vertices, 3), self.rotation(vertices))
+        level = self.integer(256, 6 * size * size, visibility.rays.BLOCK // 2, dtype=jnp.uint8)
+        return visibility.DirectTransport(level, self.normal(vertices, 3), self.rotation(vertices))
 
     def pyramid(self, size=8, *, vertices=3):
         """Visibility at all scales, for ``light`` of the same size."""
-        level = self.integer(256, vertices, transport.lobe.scales(size).total, dtype=jnp.uint8)
-        vector = self.normal((transport.lobe.DEGREE + 1) ** 2, vertices)
-        return transport.LobeTransport(level, vector, self.normal(vertices, 3), self.rotation(vertices), size)
+        level = self.integer(256, vertices, lobe_system.pyramid.scales(size).total, dtype=jnp.uint8)
+        vector = self.normal((lobe_system.pyramid.DEGREE + 1) ** 2, vertices)
+        return lobe_system.LobeTransport(level, vector, self.normal(vertices, 3), self.rotation(vertices), size)
 
     def lobes(self, lobes=2):
         """Wide lobes at five nodes of the view angle, all above the horizon."""
         mean = self.array(np.moveaxis(np.asarray(self.upper(lobes, 5)), -1, 0))
         weight, diffuse = self.uniform(3, lobes, 5), self.uniform(3, 5)
-        return brdf.LobeBrdf(mean, self.uniform(lobes, 5, low=1, high=3), weight, diffuse, (), self.uniform())
+        return lobe_system.LobeBrdf(mean, self.uniform(lobes, 5, low=1, high=3), weight, diffuse, (), self.uniform())
 
     def changing(self, count=2):
         """A set of BRDFs with lobes and terms."""
         each = [self.lobes() for _ in range(count)]
         stack = lambda name, axis: self.array(np.stack([getattr(one, name) for one in each], axis))  # noqa: E731
-        lobe = brdf.LobeBrdf(
+        lobe = lobe_system.LobeBrdf(
             stack("mean", 2),
             stack("scale", 1),
             stack("weight", 2),
@@ -263,14 +267,14 @@ class Draw:
             self.uniform(),
         )
         maps = self.normal(2, 4, 4), self.normal(2, 4, 4)
-        return brdf.DynamicBrdf(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
+        return dynamic.DynamicBrdf(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
 
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
         seen = self.pyramid(size, vertices=vertices)
-        small = transport.LobeTransport(seen.level, self.normal(0, vertices), seen.position, seen.frame, size)
+        small = lobe_system.LobeTransport(seen.level, self.normal(0, vertices), seen.position, seen.frame, size)
         row = jax.device_put(np.arange(vertices, dtype=np.int32))
-        terms = transport.ClusteredTransport(
+        terms = separable_system.ClusteredTransport(
             self.integer(6 * size * size, 1, 5, dtype=jnp.uint16),
             jax.device_put(np.zeros((1, 5, 4), np.float16)),
             jax.device_put(np.zeros((1, 4, 2, 3), np.float16)),
@@ -284,12 +288,12 @@ class Draw:
         # Stored in half precision; here in the one under test.
         both = self.normal(1, 5, 4), self.normal(1, 4, 2, 3)
         terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
-        return transport.DynamicTransport((transport.dynamic.RegionTransport(terms, small, row),), row)
+        return dynamic.DynamicTransport((dynamic.RegionTransport(terms, small, row),), row)
 
     def material(self, vertices=3):
         """What ``regions`` is made of; the color of its lobes is a texture."""
         share = np.asarray(self.uniform(2))
-        return relight.dynamic.Material(self.array(share / share.sum()), self.uniform(3), self.uniform(vertices, 3))
+        return dynamic.Material(self.array(share / share.sum()), self.uniform(3), self.uniform(vertices, 3))
 
     def transfer(self, vertices):
         """Bounces of ``changing``, with what is stored in half precision in the one under test."""
@@ -297,8 +301,8 @@ class Draw:
             jax.device_put(each) for each in (np.arange(vertices, dtype=np.int32), np.zeros(vertices, np.int32))
         )
         core = jax.device_put(np.zeros((1, 6, 2, 16, 3, 3), np.float16))
-        second = transport.transfer.SecondBounce(self.normal(1, vertices, 2), core, self.uniform(1))
-        tensor = transport.TransferTensor(
+        second = bounces.SecondBounce(self.normal(1, vertices, 2), core, self.uniform(1))
+        tensor = bounces.TransferTensor(
             self.normal(1, vertices, 2),
             jax.device_put(np.zeros((1, 3, 2, 16, 3), np.float16)),
             self.normal(1, 24, 3),
@@ -316,15 +320,15 @@ class Draw:
 
     def mixture(self, lobes=2):
         """Wide lobes on the sphere."""
-        return linalg.mixture.Mixture(self.uniform(lobes), self.unit(lobes), self.uniform(lobes, low=1, high=9))
+        return mixture_system.Mixture(self.uniform(lobes), self.unit(lobes), self.uniform(lobes, low=1, high=9))
 
     def harmonic(self, *nodes):
         """A BRDF in four harmonics, over the view angle or on a map."""
-        return brdf.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
+        return harmonic_system.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
 
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
-        return transport.TransferMatrix(
+        return harmonic_system.TransferMatrix(
             self.normal(vertices, 1, 4, 4), self.normal(vertices, 3), self.rotation(vertices)
         )
 
@@ -425,31 +429,31 @@ EXAMPLES = {
     "sphere.haar.forward": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.area": example(nothing, size=4),
-    "linalg.tucker.multiply": example(lambda draw: call(draw.normal(3, 4, 5), draw.normal(4, 2)), mode=1),
-    "linalg.tucker.gram": example(lambda draw: call(draw.normal(3, 4, 5)), mode=1),
+    "decompose.tucker.multiply": example(lambda draw: call(draw.normal(3, 4, 5), draw.normal(4, 2)), mode=1),
+    "decompose.tucker.gram": example(lambda draw: call(draw.normal(3, 4, 5)), mode=1),
     # Gradients of eigenvectors are not promised: they do not exist where eigenvalues repeat.
-    "linalg.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
+    "decompose.eigen.symmetric": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=3, steps=12),
     # One vector at a time amplifies rounding where eigenvalues are alike.
-    "linalg.eigen.power": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=1, steps=40),
-    "linalg.eigen.left_singular": example(
+    "decompose.eigen.power": example(lambda draw: call(draw.symmetric(12)), gradient=(), terms=1, steps=40),
+    "decompose.eigen.left_singular": example(
         lambda draw: call(draw.array(np.asarray(draw.symmetric(12))[:9]), metric=draw.array(np.eye(12))),
         gradient=(),
         terms=3,
         steps=12,
     ),
-    "linalg.mixture.Mixture": example(lambda draw: call(draw.mixture(), draw.unit(5))),
-    "linalg.mixture.log_density": example(
+    "decompose.mixture.Mixture": example(lambda draw: call(draw.mixture(), draw.unit(5))),
+    "decompose.mixture.log_density": example(
         lambda draw: call(draw.unit(5), draw.unit(2), draw.uniform(2, low=0.5, high=9))
     ),
-    "linalg.mixture.log_peak": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
-    "linalg.mixture.drop": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
-    "linalg.mixture.bands": example(lambda draw: call(draw.uniform(5, low=0.5, high=9)), degree=3),
-    "linalg.mixture.concentration_of": example(lambda draw: call(draw.uniform(5))),
-    "linalg.mixture.fit": example(
+    "decompose.mixture.log_peak": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
+    "decompose.mixture.drop": example(lambda draw: call(draw.uniform(5, low=0.5, high=9))),
+    "decompose.mixture.bands": example(lambda draw: call(draw.uniform(5, low=0.5, high=9)), degree=3),
+    "decompose.mixture.concentration_of": example(lambda draw: call(draw.uniform(5))),
+    "decompose.mixture.fit": example(
         lambda draw: call(draw.unit(9), draw.uniform(9), draw.mixture(), extent=draw.uniform(9, low=0.01, high=0.02)),
         steps=3,
     ),
-    "linalg.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
+    "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
     "brdf.models.Lambert": example(
@@ -511,31 +515,31 @@ EXAMPLES = {
             brdf.PoulinFournierGrooves(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)
         )
     ),
-    "brdf.separable.SeparableBrdf": example(
+    "systems.separable.factorization.SeparableBrdf": example(
         lambda draw: call(draw.separable(), draw.upper(5), draw.upper(5)),
     ),
     # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
-    "brdf.separable.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
-    "brdf.harmonic.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
-    "brdf.lobe.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
-    "brdf.lobe.mean": example(
+    "systems.separable.factorization.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
+    "systems.harmonic.table.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
+    "systems.lobe.table.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
+    "systems.lobe.table.mean": example(
         lambda draw: call(draw.changing().lobe, draw.uniform(2)),
         gradient=("table", "share"),
     ),
-    "brdf.dynamic.Mixed": example(
+    "systems.dynamic.brdf_set.Mixed": example(
         lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
     ),
-    "transport.dynamic.light_factors": example(lambda draw: call(draw.changing())),
-    "brdf.paths.weights": example(
+    "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.changing())),
+    "systems.bounces.functions.weights": example(
         lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
     ),
-    "brdf.paths.project": example(lambda draw: call(draw.separable()), degree=2),
-    "brdf.lobe.Remainder": example(
+    "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
+    "systems.lobe.table.Remainder": example(
         lambda draw: call(
-            brdf.lobe.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
+            lobe_system.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
         ),
     ),
-    "brdf.harmonic.project": example(
+    "systems.harmonic.table.project": example(
         lambda draw: call(brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5)),
         degree=2,
         rings=6,
@@ -560,21 +564,21 @@ EXAMPLES = {
     "image.tonemap.encode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.decode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2))),
-    "transport.separable.project": example(
+    "systems.separable.wavelets.project": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()),
     ),
-    "transport.separable.compress": example(
+    "systems.separable.wavelets.compress": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
     # Frames have derivatives along rotations only; see sphere.rotation.
-    "transport.bounce.respond": example(
+    "systems.bounces.gather.respond": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), gradient=("basis",), edge=2
     ),
-    "transport.bounce.respond_again": example(
+    "systems.bounces.gather.respond_again": example(
         lambda draw: call(draw.normal(4, 3, 2), draw.rotation(2), draw.separable()),
         gradient=("arriving", "basis"),
     ),
-    "transport.bounce.arrive": example(
+    "systems.bounces.gather.arrive": example(
         lambda draw: call(
             draw.normal(5, 4, 2),
             draw.rotation(5),
@@ -588,18 +592,24 @@ EXAMPLES = {
         gradient=("response", "basis", "weight", "measure"),
         points=2,
     ),
-    "transport.harmonic.transfer": example(lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2),
-    "transport.harmonic.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
-    "transport.harmonic.right_handed": example(lambda draw: call(draw.rotation(4))),
+    "systems.harmonic.transfer.transfer": example(
+        lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
+    ),
+    "systems.harmonic.transfer.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
+    "systems.harmonic.transfer.right_handed": example(lambda draw: call(draw.rotation(4))),
     # Rounding is constant; what it is relative to is differentiable in dequantize.
-    "transport.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),
-    "transport.quantized.dequantize": example(lambda draw: call(transport.quantized.quantize(draw.sparse()))),
-    "transport.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
+    "systems.separable.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),
+    "systems.separable.quantized.dequantize": example(
+        lambda draw: call(separable_system.quantized.quantize(draw.sparse()))
+    ),
+    "systems.separable.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "scene.texture.lookup": example(lambda draw: call(draw.normal(3, 4, 2), draw.normal(5, 2))),
     # Rounding is constant but for the largest coefficient, which makes steps of all others.
-    "relight.separable.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
-    "relight.separable.modulate": example(lambda draw: call(draw.normal(4, 3, 1), draw.normal(4, 2, 3)), terms=(1, 2)),
-    "relight.reference.integrate": example(
+    "systems.separable.relight.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
+    "systems.separable.relight.modulate": example(
+        lambda draw: call(draw.normal(4, 3, 1), draw.normal(4, 2, 3)), terms=(1, 2)
+    ),
+    "systems.reference.integrate": example(
         lambda draw: call(
             draw.seen(2),
             draw.array(np.zeros((2, 3))),
@@ -609,11 +619,11 @@ EXAMPLES = {
             draw.array(frame.T @ (3 * np.asarray(draw.upper()))),
         )
     ),
-    "relight.direct.split": example(lambda draw: call(draw.light()), count=5),
-    "relight.direct.irradiance": example(
+    "systems.bright_texels.split": example(lambda draw: call(draw.light()), count=5),
+    "systems.bright_texels.irradiance": example(
         lambda draw: call(draw.direct(), draw.integer(96, 5), draw.uniform(5, 3)), gradient=("excess",)
     ),
-    "relight.direct.radiance": example(
+    "systems.bright_texels.radiance": example(
         lambda draw: call(
             each := draw.direct(),
             brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0),
@@ -624,7 +634,7 @@ EXAMPLES = {
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "excess", "eye"),
     ),
-    "relight.dynamic.radiance": example(
+    "systems.dynamic.relight.radiance": example(
         lambda draw: call(
             each := draw.regions(),
             (draw.changing(),),
@@ -636,8 +646,8 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
-    "transport.transfer.scales": example(lambda draw: call((draw.normal(3, 1, 2), draw.normal(2, 3)))),
-    "relight.transfer.radiance": example(
+    "systems.bounces.tensor.scales": example(lambda draw: call((draw.normal(3, 1, 2), draw.normal(2, 3)))),
+    "systems.bounces.relight.radiance": example(
         lambda draw: call(
             each := draw.regions(),
             draw.transfer(len(each.place)),
@@ -649,69 +659,69 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
-    "relight.transfer.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
-    "relight.lobe.prefilter": example(lambda draw: call(draw.light(8))),
-    "relight.lobe.combine": example(
+    "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
+    "systems.lobe.relight.prefilter": example(lambda draw: call(draw.light(8))),
+    "systems.lobe.relight.combine": example(
         lambda draw: call(
-            relight.lobe.prefilter(draw.light(8)),
-            relight.lobe.look(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
+            lobe_system.prefilter(draw.light(8)),
+            lobe_system.look(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
         )
     ),
-    "relight.lobe.radiance": example(
+    "systems.lobe.relight.radiance": example(
         lambda draw: call(each := draw.pyramid(), draw.lobes(), draw.light(8), eye=draw.above(each)),
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "light", "eye"),
     ),
-    "relight.harmonic.project": example(lambda draw: call(draw.light()), degree=2),
-    "relight.harmonic.radiance": example(
+    "systems.harmonic.relight.project": example(lambda draw: call(draw.light()), degree=2),
+    "systems.harmonic.relight.radiance": example(
         lambda draw: call(each := draw.matrix(), draw.harmonic(), draw.normal(4, 3), eye=draw.above(each)),
         gradient=("brdf", "light", "eye"),
     ),
-    "relight.harmonic.unshadowed_radiance": example(
+    "systems.harmonic.relight.unshadowed_radiance": example(
         lambda draw: call(draw.mesh(), draw.harmonic(), draw.normal(4, 3), eye=draw.camera().eye),
         gradient=("brdf", "light", "eye"),
     ),
-    "relight.harmonic.diffuse_radiance": example(
+    "systems.harmonic.relight.diffuse_radiance": example(
         lambda draw: call(
-            transport.TransferVector(draw.normal(4, 1, 3), draw.normal(3, 3)), draw.uniform(3), draw.normal(4, 3)
+            harmonic_system.TransferVector(draw.normal(4, 1, 3), draw.normal(3, 3)), draw.uniform(3), draw.normal(4, 3)
         ),
         gradient=("albedo", "light"),
     ),
-    "relight.harmonic.probe_light": example(
+    "systems.harmonic.relight.probe_light": example(
         lambda draw: call(draw.normal(5, 3), draw.normal(2, 3), draw.normal(2, 4, 3))
     ),
     # Rotations have derivatives along rotations only; see sphere.rotation.
-    "relight.harmonic.local_light": example(
+    "systems.harmonic.relight.local_light": example(
         lambda draw: call(draw.rotation(5), draw.normal(4, 3)), gradient=("light",)
     ),
-    "relight.harmonic.world_view": example(
+    "systems.harmonic.relight.world_view": example(
         lambda draw: call(draw.rotation(5), draw.normal(4, 3, 5)), gradient=("view",)
     ),
-    "relight.harmonic.transferred_light": example(
+    "systems.harmonic.relight.transferred_light": example(
         lambda draw: call(draw.matrix(), draw.normal(4, 3)), gradient=("light",)
     ),
-    "relight.harmonic.transferred_view": example(
+    "systems.harmonic.relight.transferred_view": example(
         lambda draw: call(draw.matrix(), draw.normal(4, 3, 3)), gradient=("view",)
     ),
-    "relight.harmonic.view_coefficients": example(
+    "systems.harmonic.relight.view_coefficients": example(
         lambda draw: call(draw.harmonic(5), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
         gradient=("brdf", "position", "eye"),
     ),
-    "relight.harmonic.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
-    "relight.separable.project": example(lambda draw: call(draw.light())),
-    "relight.separable.choose_by_magnitude": example(lambda draw: call(draw.normal(24, 3)), threshold=9000),
-    "relight.separable.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),
-    "relight.separable.choose_by_transport": example(
+    "systems.harmonic.relight.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
+    "systems.separable.relight.project": example(lambda draw: call(draw.light())),
+    "systems.separable.relight.choose_by_magnitude": example(lambda draw: call(draw.normal(24, 3)), threshold=9000),
+    "systems.separable.relight.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),
+    "systems.separable.relight.choose_by_transport": example(
         lambda draw: call(draw.normal(24, 3), draw.uniform(24)),
         gradient=("coefficient",),  # The weights only choose.
         count=7,
     ),
-    "relight.separable.light_tuple": example(lambda draw: call(draw.sparse(), draw.light()), light_keep=40),
-    "relight.separable.view_tuple": example(
+    "systems.separable.relight.light_tuple": example(lambda draw: call(draw.sparse(), draw.light()), light_keep=40),
+    "systems.separable.relight.view_tuple": example(
         lambda draw: call(mesh := draw.sparse(), draw.separable(), draw.above(mesh)),
     ),
-    "relight.separable.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
-    "relight.separable.radiance": example(
+    "systems.separable.relight.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
+    "systems.separable.relight.radiance": example(
         lambda draw: call(*(all := lit(draw)), eye=draw.above(all[0])),
     ),
 }

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from benchmarks import path_tracing, plugins
+from jaxprt import reference
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.image import raster
-from jaxprt.relight import reference
 from jaxprt.scene import Camera, Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import plan
-from jaxprt.brdf import AshikhminShirley, lobe, lobe_em
-from jaxprt.relight import reference
+from jaxprt import lobe, plan, reference
+from jaxprt.brdf import AshikhminShirley
 from jaxprt.scene import Environment, builtin
 
 BRDF = AshikhminShirley(nu=8, nv=20)
@@ -23,13 +22,13 @@ def small():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_LADDER", tuple(step._replace(resolution=12) for step in plan._LADDER[:3]))
         patch.setattr(plan, "_LOBES", plan._LOBES[:2])
-        patch.setattr(lobe, "_natural_error", lambda brdf, table: 0.0)
-        patch.setattr(lobe, "tabulate", functools.partial(lobe.tabulate, resolution=12))
-        patch.setattr(lobe_em, "RINGS", 24)
-        patch.setattr(lobe_em, "SECTORS", 32)
-        lobe_em.samples.clear_cache()  # which both are compiled into
+        patch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)
+        patch.setattr(lobe.table, "tabulate", functools.partial(lobe.tabulate, resolution=12))
+        patch.setattr(lobe.em, "RINGS", 24)
+        patch.setattr(lobe.em, "SECTORS", 32)
+        lobe.em.samples.clear_cache()  # which both are compiled into
         yield
-    lobe_em.samples.clear_cache()
+    lobe.em.samples.clear_cache()
 
 
 @pytest.fixture(scope="module")

@@ -18,36 +18,36 @@ def scene():
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh = prt.scene.mesh.make_mesh(ball.vertices, ball.faces, normal=ball.vertices)
     camera = prt.scene.camera.orbit(mesh, elevation=0.3, width=48, height=48)
-    return mesh, camera, prt.transport.direct.precompute(mesh, size=8, progress=False)
+    return mesh, camera, prt.visibility.precompute(mesh, size=8, progress=False)
 
 
 def separable(mesh, visible, eye):
-    brdf = prt.brdf.separable.factor(prt.brdf.Lambert(ALBEDO), terms=1, resolution=8)
-    transport = prt.transport.separable.precompute(mesh, brdf, keep=384, size=8, progress=False)
-    return prt.relight.separable.radiance(transport, brdf, WHITE, eye=eye)
+    brdf = prt.separable.factor(prt.brdf.Lambert(ALBEDO), terms=1, resolution=8)
+    transport = prt.separable.precompute(mesh, brdf, keep=384, size=8, progress=False)
+    return prt.separable.radiance(transport, brdf, WHITE, eye=eye)
 
 
 def harmonic(mesh, visible, eye):
-    table = prt.brdf.harmonic.tabulate(prt.brdf.Lambert(ALBEDO), degree=2, resolution=8)
+    table = prt.harmonic.tabulate(prt.brdf.Lambert(ALBEDO), degree=2, resolution=8)
     seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
-    matrix = prt.transport.harmonic.transfer(seen, visible.frame, degree=2)
-    transport = prt.transport.harmonic.TransferMatrix(matrix[:, None], visible.position, visible.frame)
-    return prt.relight.harmonic.radiance(transport, table, prt.relight.harmonic.project(WHITE, degree=2), eye=eye)
+    matrix = prt.harmonic.transfer.transfer(seen, visible.frame, degree=2)
+    transport = prt.harmonic.TransferMatrix(matrix[:, None], visible.position, visible.frame)
+    return prt.harmonic.radiance(transport, table, prt.harmonic.project(WHITE, degree=2), eye=eye)
 
 
 def lobe(mesh, visible, eye):
-    table = prt.brdf.lobe.tabulate(prt.brdf.Lambert(ALBEDO), lobes=1, resolution=4)
-    return prt.relight.lobe.radiance(prt.transport.lobe.compress(visible), table, WHITE, eye=eye)
+    table = prt.lobe.tabulate(prt.brdf.Lambert(ALBEDO), lobes=1, resolution=4)
+    return prt.lobe.radiance(prt.lobe.compress(visible), table, WHITE, eye=eye)
 
 
 def texels(mesh, visible, eye):
     texel, white = jnp.arange(384), jnp.ones((384, 1))
-    return prt.relight.direct.radiance(visible, prt.brdf.Lambert(ALBEDO), texel, white, eye=eye)
+    return prt.bright_texels.radiance(visible, prt.brdf.Lambert(ALBEDO), texel, white, eye=eye)
 
 
 def reference(mesh, visible, eye):
     seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
-    return prt.relight.reference.integrate(seen, visible.position, visible.frame, prt.brdf.Lambert(ALBEDO), WHITE, eye)
+    return prt.reference.integrate(seen, visible.position, visible.frame, prt.brdf.Lambert(ALBEDO), WHITE, eye)
 
 
 @pytest.mark.parametrize("system", [separable, harmonic, lobe, texels, reference])

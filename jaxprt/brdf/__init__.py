@@ -1,25 +1,7 @@
-"""BRDFs: analytic models, and the form that each system gives them."""
+"""BRDFs: analytic models and measured data."""
 
-from jaxprt.brdf import (
-    cylinders,
-    dynamic,
-    errors,
-    harmonic,
-    lobe,
-    lobe_em,
-    measured,
-    models,
-    navigation,
-    paths,
-    published,
-    reflected,
-    scattered,
-    separable,
-)
+from jaxprt.brdf import cylinders, measured, models, navigation, scattered
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
-from jaxprt.brdf.dynamic import DynamicBrdf
-from jaxprt.brdf.harmonic import HarmonicBrdf
-from jaxprt.brdf.lobe import LobeBrdf
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
 from jaxprt.brdf.models import (
     AshikhminShirley,
@@ -37,32 +19,20 @@ __all__ = [
     "AshikhminShirley",
     "BlinnPhong",
     "CookTorrance",
-    "DynamicBrdf",
-    "HarmonicBrdf",
     "Lafortune",
     "Lambert",
-    "LobeBrdf",
     "Phong",
     "PoulinFournier",
     "PoulinFournierGrooves",
     "Ward",
     "WardDuer",
     "cylinders",
-    "dynamic",
-    "errors",
-    "harmonic",
     "load_lafortune",
     "load_merl",
     "load_npf",
     "load_scattered",
-    "lobe",
-    "lobe_em",
     "measured",
     "models",
     "navigation",
-    "paths",
-    "published",
-    "reflected",
     "scattered",
-    "separable",
 ]

@@ -25,7 +25,7 @@ def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Fl
         coordinate: Places u to the right and v up, over width and height: `Mesh.texture`.
 
     Returns:
-        Values of the image, for example weights of `relight.separable.modulate`.
+        Values of the image, for example weights of `separable.modulate`.
 
     Raises:
         ValueError: The image has no axis of colors, or coordinates are no pairs.

@@ -19,13 +19,12 @@ import pytest
 import zarr
 
 import jaxprt as prt
+from jaxprt import separable
 from jaxprt.brdf import navigation
-from jaxprt.relight import separable
 from jaxprt.sphere import hemisphere
-from jaxprt.transport import quantized, sparse
 
 # Host records of the command line and of reports; they hold functions and file names.
-UNSAVED = {"jaxprt.report", "jaxprt.animation", "jaxprt.__main__"}
+UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.cli.main", "jaxprt.__main__"}
 
 
 def classes():
@@ -118,12 +117,14 @@ def test_numbers_of_every_type_and_shape_keep_their_bits(tmp_path):
 @pytest.fixture(scope="module")
 def scene():
     """A factored BRDF, transport made by hand, and a light."""
-    brdf = prt.brdf.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
+    brdf = prt.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
     random = np.random.default_rng(0)
     index = jnp.asarray(random.integers(0, 96, (5, 7, 2)), jnp.uint16)
     frame, _ = np.linalg.qr(random.normal(size=(7, 3, 3)))
     frame, amount = jnp.asarray(frame, jnp.float32), jnp.asarray(random.normal(size=(5, 7, 2, 1)), jnp.float32)
-    transport = prt.transport.SparseTransport(index, amount, 0 * frame[:, 0], frame, sparse.rms(index, amount, 96))
+    transport = prt.separable.SparseTransport(
+        index, amount, 0 * frame[:, 0], frame, separable.sparse.rms(index, amount, 96)
+    )
     light = prt.scene.Environment(jnp.asarray(random.uniform(size=(6, 4, 4, 3)), jnp.float32))
     return transport, brdf, light
 
@@ -133,7 +134,7 @@ def test_what_is_loaded_or_unpickled_relights_to_the_same_bits_with_the_same_pro
     relit = jax.jit(
         lambda transport, brdf, light: separable.radiance(transport, brdf, light, eye=jnp.array([0, 0, 9.0]))
     )
-    for number, each in enumerate((transport, quantized.quantize(transport))):
+    for number, each in enumerate((transport, separable.quantized.quantize(transport))):
         expected = np.asarray(relit(each, brdf, light))
         prt.files.save(tmp_path / str(number), (each, brdf, light))
         for again in (prt.files.load(tmp_path / str(number)), pickle.loads(pickle.dumps((each, brdf, light)))):
@@ -247,8 +248,8 @@ def test_damage_is_found_and_told(tmp_path, scene):
 def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_path, scene, monkeypatch):
     path = tmp_path / "a.prt"
     prt.files.save(path, scene[0])
-    monkeypatch.setattr(sparse, "ALGORITHM", 77, raising=False)
-    with pytest.raises(ValueError, match=r"algorithm in jaxprt.transport.sparse, this jaxprt has version 77"):
+    monkeypatch.setattr(separable.sparse, "ALGORITHM", 77, raising=False)
+    with pytest.raises(ValueError, match=r"algorithm in jaxprt.separable.sparse, this jaxprt has version 77"):
         prt.files.load(path)
     monkeypatch.undo()
     group = zarr.open_group(path, mode="r+")
@@ -270,7 +271,7 @@ def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_p
         {"class": "jaxprt.files.objects:os", "field": {}},
         {"class": "jaxprt.__main__:main", "field": {}},
         {"class": "jaxprt.nothing:Mesh", "field": {}},
-        {"class": "jaxprt.transport.visibility:Occluder", "field": {}},
+        {"class": "jaxprt.visibility.rays:Occluder", "field": {}},
         {"class": "jaxprt.brdf:Lambert", "field": {}},
         {"function": "os:system"},
         {"function": "jaxprt.sphere.hemisphere:arcs"},

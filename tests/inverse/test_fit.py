@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import inverse
-from jaxprt.brdf import AshikhminShirley, Lambert, harmonic
+from jaxprt import harmonic, inverse
+from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import render
 from jaxprt.inverse import Picture
-from jaxprt.relight import harmonic as relight
 from jaxprt.scene import Environment, builtin, camera
 from jaxprt.sphere import cubemap, harmonics
 
@@ -35,11 +34,11 @@ def glossy():
 
 @pytest.fixture(scope="module")
 def sky():
-    return relight.project(builtin.daylight(size=8), degree=DEGREE)
+    return harmonic.project(builtin.daylight(size=8), degree=DEGREE)
 
 
 def lit_by(mesh, table):
-    return lambda light, eye: relight.unshadowed_radiance(mesh, table, light, eye=eye)
+    return lambda light, eye: harmonic.unshadowed_radiance(mesh, table, light, eye=eye)
 
 
 def drawn(mesh, radiance, parameters, cameras, **options):
@@ -110,7 +109,7 @@ def by_texels(mesh, cameras):
         terms = (degree + 1) ** 2
         unit = np.split(np.eye(terms, -(-terms // 3) * 3, dtype=np.float32), -(-terms // 3), axis=1)
         matrix = np.concatenate([lit(jnp.asarray(each), cameras[0].eye) for each in unit], 1)[:, :terms]
-        return lambda light, eye: matrix @ relight.project(light, degree=degree)
+        return lambda light, eye: matrix @ harmonic.project(light, degree=degree)
 
     return of
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from jaxprt import visibility
 from jaxprt.scene import builtin, interiors
 from jaxprt.scene.mesh import Mesh, bounds, join, split
 from jaxprt.sphere import directions
-from jaxprt.transport import visibility
 
 SUN = np.array([-0.62, 0.62, 0.48], np.float32) / np.float32(np.linalg.norm([-0.62, 0.62, 0.48]))  # Of the daylight.
 # Least cosine between the normals of vertices and faces: in the grooves of the pieces, and where edges are rounded

@@ -1,0 +1,258 @@
+"""Tucker decomposition: a tensor as a small core times a matrix with orthonormal columns along each mode.
+
+    X ~ G x_1 U_1 x_2 U_2 ... x_d U_d
+
+Vectors come from the Gram matrix of each mode, n by n, never from the unfolding, whose other edge has the product of
+all other modes. Gram matrices are summed over slices, so that the tensor is neither transposed nor copied. That squares
+the condition: what is below the square root of the precision (3e-4 in float32) of the largest singular value is
+rounding, and errors smaller than that want float64.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.decompose import eigen
+
+_BLOCK = 4096  # columns
+
+
+class Tucker(eqx.Module):
+    """A core, and a matrix with orthonormal columns for each of its modes.
+
+    Attributes:
+        core: As many numbers along each mode as its rank.
+        factor: Of each mode, its size times its rank.
+    """
+
+    core: Float[Array, "*r"]
+    factor: tuple[Float[Array, "_ _"], ...]
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        """Rank of each mode."""
+        return self.core.shape
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the core and of all factors."""
+        return self.core.nbytes + sum(each.nbytes for each in self.factor)
+
+    def full(self) -> Float[Array, "*n"]:
+        """The tensor that this stands for."""
+        result = self.core
+        # From the last mode on, whose product is the cheapest while the others are small.
+        for mode in range(self.core.ndim)[::-1]:
+            result = multiply(result, self.factor[mode].T, mode=mode)
+        return result
+
+
+@partial(jax.jit, static_argnames=("mode",))
+def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: int) -> Float[Array, "*k"]:
+    """The product along a mode: the sum over it of the tensor times each column of the matrix.
+
+    Reference: Kolda and Bader 2009, section 2.5, with the matrix transposed.
+    """
+    slices = _slices(tensor, mode)
+    shape = (*tensor.shape[:mode], matrix.shape[1], *tensor.shape[mode + 1 :])
+    if slices.shape[2] == 1:
+        return (slices[..., 0] @ matrix).reshape(shape)
+    if slices.shape[0] == 1:
+        return (matrix.T @ slices[0]).reshape(shape)
+    return jax.lax.map(lambda each: matrix.T @ each, slices).reshape(shape)
+
+
+@partial(jax.jit, static_argnames=("mode",))
+def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
+    """Inner products of the tensor's slices across a mode: the unfolding times its transpose."""
+    slices = _slices(tensor, mode)
+    if slices.shape[2] == 1:
+        return slices[..., 0].T @ slices[..., 0]
+    if slices.shape[0] == 1:
+        return _square(slices[0])
+    size = slices.shape[1]
+    return jax.lax.scan(lambda sum, each: (sum + each @ each.T, None), jnp.zeros((size, size), tensor.dtype), slices)[0]
+
+
+@partial(jax.jit, static_argnames=("ranks",))
+def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
+    """Truncated higher-order singular value decomposition.
+
+    Args:
+        tensor: With at least two modes.
+        ranks: Of each mode.
+
+    Returns:
+        The decomposition, whose squared error is at most the sum over modes of the squared singular values left out,
+        and so at most sqrt(d) times the least. Its reconstruction is differentiable in the tensor. Single factors are
+        so only up to rotations among their columns, which no function of them may depend on; and where singular values
+        on both sides of the cut are equal, the subspace has no derivative, and zero stands for it.
+
+    Raises:
+        ValueError: As many ranks as modes were not given, or one is not between 1 and its mode's size.
+
+    Reference: De Lathauwer, De Moor, Vandewalle 2000.
+    """
+    _check(tensor, ranks)
+    factor = tuple(_dominant(gram(tensor, mode=mode), rank) for mode, rank in enumerate(ranks))
+    return Tucker(_core(tensor, factor), factor)
+
+
+@partial(jax.jit, static_argnames=("ranks",))
+def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
+    """Sequentially truncated HOSVD: each mode is cut before the next one is looked at, the smallest first.
+
+    The bounds on the error are those of `hosvd`, and the cost is that of the first mode.
+
+    Arguments, result and errors as of `hosvd`.
+
+    Reference: Vannieuwenhoven, Vandebril, Meerbergen 2012.
+    """
+    _check(tensor, ranks)
+    factor, core = [jnp.zeros(0)] * tensor.ndim, tensor
+    for mode in sorted(range(tensor.ndim), key=lambda mode: tensor.shape[mode]):
+        factor[mode] = _dominant(gram(core, mode=mode), ranks[mode])
+        core = multiply(core, factor[mode], mode=mode)
+    return Tucker(core, tuple(factor))
+
+
+@partial(jax.jit, static_argnames=("ranks", "sweeps"))
+def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2) -> tuple[Tucker, Float[Array, " s"]]:
+    """Higher-order orthogonal iteration: the best factor of each mode, given the others, in turn.
+
+    Args:
+        tensor: With at least two modes.
+        ranks: Of each mode.
+        sweeps: How often all modes are improved, from `truncated`.
+
+    Returns:
+        The decomposition, differentiable as in `hosvd`; and the relative error of the start and after each sweep,
+        which never grows but for rounding. It is the difference of two squares: see the module on its least value.
+
+    Raises:
+        ValueError: As of `hosvd`, or negative sweeps.
+
+    Reference: De Lathauwer, De Moor, Vandewalle 2000, "On the best rank-1 and rank-(R1, ..., RN) approximation".
+    """
+    if sweeps < 0:
+        raise ValueError(f"sweeps must not be negative, got {sweeps}")
+    now = truncated(tensor, ranks=ranks)
+    whole = jnp.vdot(tensor, tensor)
+
+    def error(core):
+        left = jnp.maximum(whole - jnp.vdot(core, core), 0)
+        share = jnp.where(whole > 0, left / jnp.where(whole > 0, whole, 1), 0)
+        return jnp.where(share > 0, jnp.sqrt(jnp.where(share > 0, share, 1)), 0)
+
+    errors, factor, core = [error(now.core)], list(now.factor), now.core
+    for _ in range(sweeps):
+        for mode in range(tensor.ndim):
+            others = _core(tensor, tuple(factor), but=mode)
+            factor[mode] = _dominant(gram(others, mode=mode), ranks[mode])
+            core = multiply(others, factor[mode], mode=mode)
+        errors.append(error(core))
+    return Tucker(core, tuple(factor)), jnp.stack(errors)
+
+
+def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
+    """The least ranks by which `hosvd` and `truncated` are sure to have a relative L2 error; chosen on the host.
+
+    Every mode may leave out an equal share of the squared error.
+
+    Args:
+        tensor: With at least two modes.
+        error: Between 0 and 1; see the module on the least that float32 can tell.
+
+    Raises:
+        ValueError: An error out of range, or values that are not finite.
+    """
+    if not 0 < error < 1:
+        raise ValueError(f"error must be between 0 and 1, got {error}")
+    result = []
+    for mode in range(tensor.ndim):
+        square = np.asarray(jnp.linalg.eigvalsh(gram(tensor, mode=mode)), np.float64)
+        if not np.isfinite(square).all():
+            raise ValueError("the tensor must be finite, and is not")
+        left = np.cumsum(np.maximum(square, 0))  # from the smallest on
+        result.append(max(1, len(square) - int(np.searchsorted(left, error**2 / tensor.ndim * left[-1], "right"))))
+    return tuple(result)
+
+
+@jax.custom_jvp
+def _square(matrix: Array) -> Array:
+    """A wide matrix times its transpose, by blocks: one product would pack much of the matrix anew."""
+    count = matrix.shape[1] // _BLOCK
+    rest = matrix[:, count * _BLOCK :]
+
+    def add(total, start):
+        each = jax.lax.dynamic_slice_in_dim(matrix, start, _BLOCK, 1)
+        return total + each @ each.T, None
+
+    return jax.lax.scan(add, rest @ rest.T, _BLOCK * jnp.arange(count))[0] if count else rest @ rest.T
+
+
+@_square.defjvp
+def _square_jvp(primal, tangent):
+    # Transposed, the scan would add a whole matrix at each step.
+    product = tangent[0] @ primal[0].T
+    return _square(*primal), product + product.T
+
+
+def _slices(tensor: Array, mode: int) -> Array:
+    """The tensor with all modes before one joined, and all after it."""
+    shape = tensor.shape
+    return tensor.reshape(math.prod(shape[:mode]), shape[mode], math.prod(shape[mode + 1 :]))
+
+
+def _core(tensor: Array, factor: Sequence[Array], but: int | None = None) -> Array:
+    """The tensor times all factors, or all but one's; those first that leave the least."""
+    kept = {mode: each.shape[1] / each.shape[0] for mode, each in enumerate(factor) if mode != but}
+    for mode in sorted(kept, key=lambda mode: kept[mode]):
+        tensor = multiply(tensor, factor[mode], mode=mode)
+    return tensor
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _dominant(matrix: Array, rank: int) -> Array:
+    """Leading eigenvectors of a positive semidefinite matrix, as columns."""
+    return eigen.symmetric(matrix, terms=rank)[1]
+
+
+@_dominant.defjvp
+def _dominant_jvp(rank, primal, tangent):
+    (matrix,), (moved,) = primal, tangent
+    vector = _dominant(matrix, rank)
+    every, basis = jnp.linalg.eigh(matrix)
+    # What turns the vectors among themselves is left out; what turns them out of their space is a sum over the others.
+    other, low = basis[:, : len(every) - rank], every[: len(every) - rank]
+    gap = jnp.einsum("ir,ij,jr->r", vector, matrix, vector) - low[:, None]
+    least = len(every) * jnp.finfo(matrix.dtype).eps * jnp.abs(every[-1])
+    open_gap = gap > least
+    turned = jnp.where(open_gap, (other.T @ moved @ vector) / jnp.where(open_gap, gap, 1), 0)
+    return vector, other @ turned
+
+
+def _check(tensor: Array, ranks: tuple[int, ...]) -> None:
+    if len(ranks) != tensor.ndim or any(not 1 <= r <= n for r, n in zip(ranks, tensor.shape, strict=False)):
+        raise ValueError(f"ranks must be one for each mode, from 1 to its size in {list(tensor.shape)}, got {ranks}")
+
+
+def oriented(decomposition: Tucker) -> Tucker:
+    """The same decomposition with factors that are the same on every kind of processor, up to rounding.
+
+    Each mode is turned by `jaxprt.decompose.eigen.orientation`, and the core against it. What the decomposition stands
+    for does not change.
+    """
+    core, factor = np.asarray(decomposition.core), []
+    for mode, each in enumerate(map(np.asarray, decomposition.factor)):
+        unfolded = np.moveaxis(core, mode, 0).reshape(core.shape[mode], -1)
+        turn = eigen.orientation(np.sum(unfolded**2, 1), each).astype(core.dtype)
+        core = np.moveaxis(np.tensordot(turn, core, (0, mode)), 0, mode)
+        factor.append(jax.device_put(each @ turn))
+    return Tucker(jax.device_put(core), tuple(factor))

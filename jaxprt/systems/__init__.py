@@ -1,0 +1,14 @@
+"""The systems, their yardstick, and single bright texels beside any of them."""
+
+from jaxprt.systems import adaptive, bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
+
+__all__ = [
+    "adaptive",
+    "bounces",
+    "bright_texels",
+    "dynamic",
+    "harmonic",
+    "lobe",
+    "reference",
+    "separable",
+]

@@ -1,0 +1,281 @@
+"""Integrals over the texels of a cubemap, by smaller and smaller cells where the integrand varies.
+
+A cell has 4 x 4 children, each with 2 x 2 Gauss points. A child whose estimated error is too large becomes a cell. The
+first cells are 4 x 4 texels, so that their children are texels.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
+
+from jaxprt.compile import linear
+from jaxprt.sphere import cubemap, haar
+
+SIDE = 4  # children along the edge of a cell
+LEVELS = 16  # visibility is counted in sixteenths
+SMALL = 1 / 64  # share of a vertex's radiance of which each cell may lose `error`
+_CHUNK = 256  # cells at once
+_FINEST = 4e-4  # edge of the smallest children, on faces of edge 2
+_CURVED = 1 / 200  # times squared second difference over value: the error; 1 / 1440 for the middle of a Gaussian
+_PEAKED = 16.0  # second difference over what the middle of a Gaussian has more than the points around it
+_GAP = 1 / np.sqrt(3)  # between the two Gauss points of an interval of length 1
+_STEEPEST = 8.0  # the largest second difference around one point, in units of its value
+_NEAR = 16.0  # two edges of a child, squared, over what one of its points stands for
+_TINY = 1e-30
+
+
+class Integrand(NamedTuple):
+    """What is integrated.
+
+    Attributes:
+        brdf: A pytree and callable.
+        frame: Rows are tangent, bitangent, normal.
+        wo: Local directions to the eye.
+        light: Radiance of lights l in the texels d.
+    """
+
+    brdf: Callable
+    frame: Float[Array, "b 3 3"]
+    wo: Float[Array, "b 3"]
+    light: Float[Array, "l d c"]
+
+
+class Choice(NamedTuple):
+    """What cells are chosen by.
+
+    Attributes:
+        seen: Visible share of each texel in sixteenths.
+        weight: Reciprocal radiance of each vertex under each light.
+        peak: Mean over colors of BRDF times cosine in the mirror direction.
+        error: Relative error that is allowed.
+    """
+
+    seen: UInt8[Array, "b d"]
+    weight: Float[Array, "b l"]
+    peak: Float[Array, " b"]
+    error: Float[Array, ""]
+
+
+def root(size: int) -> int:
+    """Texels along the edge of the first cells."""
+    return SIDE if size % SIDE == 0 else 1
+
+
+def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -> Float[Array, "*b c"]:
+    """The BRDF in pairs of directions.
+
+    Raises:
+        ValueError: It does not return one row for each direction.
+    """
+    wo = jnp.broadcast_to(wo, wi.shape).reshape(-1, 3)
+    found = brdf(wi.reshape(-1, 3), wo)
+    if jnp.ndim(found) != 2 or found.shape[0] != len(wo):
+        raise ValueError(f"the BRDF must return [{len(wo)}, c] here, got {list(jnp.shape(found))}")
+    return found.reshape(*wi.shape[:-1], -1)
+
+
+def integrate(
+    integrand: Integrand, choice: Choice, chosen: Bool[Array, "b f m m"], *, colors: int
+) -> Float[Array, "b l c"]:
+    """Sums light x visibility x BRDF x cosine over the chosen first cells.
+
+    Differentiable in the integrand; the choice of cells is held fixed.
+
+    Args:
+        integrand: The integrand.
+        choice: What cells are chosen by.
+        chosen: Which of the first cells to integrate, on six faces.
+        colors: Number of colors of the result.
+    """
+    moving = [each for each in jax.tree.leaves(integrand) if _floating(each)]
+    return _total(colors, moving, jax.lax.stop_gradient((integrand, choice, chosen)))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _total(colors: int, moving: list[Array], fixed: tuple) -> Array:
+    integrand, choice, chosen = fixed
+    visit = _visit(fixed, colors)
+
+    def add(total, cell):
+        part, again = visit(moving, cell)
+        return total.at[cell[:, 0]].add(part), again
+
+    zero = jnp.zeros((len(integrand.wo), len(integrand.light), colors), integrand.light.dtype)
+    return _walk(add, zero, choice, chosen)
+
+
+@_total.defjvp
+def _(colors, primals, tangents):
+    moving, fixed = primals
+    tangent, restore = ravel_pytree(tangents[0])
+
+    def forward(given, tangent):
+        moving, fixed = given
+        visit = _visit(fixed, colors)
+
+        def add(total, cell):
+            _, part, again = jax.jvp(partial(visit, cell=cell), (moving,), (restore(tangent),), has_aux=True)
+            return total.at[cell[:, 0]].add(part), again
+
+        return _walk(add, jnp.zeros(shape, dtype), *fixed[1:])
+
+    def backward(given, cotangent):
+        moving, fixed = given
+        visit = _visit(fixed, colors)
+
+        def add(total, cell):
+            _, pull, again = jax.vjp(partial(visit, cell=cell), moving, has_aux=True)
+            return jax.tree.map(jnp.add, total, pull(cotangent[cell[:, 0]])[0]), again
+
+        return ravel_pytree(_walk(add, jax.tree.map(jnp.zeros_like, moving), *fixed[1:]))[0]
+
+    result = _total(colors, moving, fixed)
+    shape, dtype = result.shape, result.dtype
+    return result, linear(forward, backward, (moving, fixed), tangent)
+
+
+def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree:
+    """Adds up all chosen cells and the cells in them, depth first.
+
+    Args:
+        add: From (total, cells [k 5]) to the new total and the children [k 4 4] that become cells. Cells are vertex,
+            level, face, row, column; those beyond the last one have level -1.
+        total: Where to begin.
+        choice: Whose number of texels tells how many levels there are.
+        chosen: The first cells.
+    """
+    size = haar.face_edge(choice.seen.shape[1])
+    deepest = _deepest(size)
+    first = jnp.stack(jnp.nonzero(chosen, size=chosen.size, fill_value=0), -1).astype(jnp.int32)
+    first, count = jnp.insert(first, 1, 0, axis=1), jnp.sum(chosen, dtype=jnp.int32)
+    stack = jnp.zeros((_CHUNK * (SIDE**2 * (deepest + 1) + 1), 5), jnp.int32)
+    child = jnp.stack(jnp.meshgrid(*2 * [jnp.arange(SIDE, dtype=jnp.int32)], indexing="ij"), -1)
+    number = jnp.arange(_CHUNK, dtype=jnp.int32)
+
+    def step(state):
+        """The last cells of the stack and, where these are fewer than at once, the next of the first cells."""
+        stack, top, begun, total = state
+        after = begun + number - top
+        cell = jnp.where((number < top)[:, None], stack[top - 1 - number], first[after])
+        valid = (number < top) | (after < count)
+        total, again = add(total, jnp.where(valid[:, None], cell, jnp.array([0, -1, 0, 0, 0])))
+        again &= (valid & (cell[:, 1] < deepest))[:, None, None]
+        below = jnp.broadcast_to(cell[:, None, None], (*again.shape, 5))
+        below = jnp.concatenate(
+            [below[..., :1], below[..., 1:2] + 1, below[..., 2:3], SIDE * below[..., 3:] + child], -1
+        )
+        left, again = jnp.maximum(top - _CHUNK, 0), again.ravel()
+        place = jnp.where(again, left + jnp.cumsum(again) - 1, len(stack))
+        stack = stack.at[place].set(below.reshape(-1, 5), mode="drop")
+        begun = jnp.minimum(begun + jnp.maximum(_CHUNK - top, 0), count)
+        return stack, left + jnp.sum(again, dtype=jnp.int32), begun, total
+
+    begin = stack, jnp.int32(0), jnp.int32(0), total
+    return jax.lax.while_loop(lambda state: (state[1] > 0) | (state[2] < count), step, begin)[3]
+
+
+def _deepest(size: int) -> int:
+    """Level of the cells with the smallest children; the first cells have level 0."""
+    return max(1, int(np.ceil(np.log(2 * root(size) / size / SIDE / _FINEST) / np.log(SIDE))))
+
+
+def _visit(fixed: tuple, colors: int) -> Callable:
+    """Makes the function of the integrand's floating leaves and some cells: what they add, and children to enter."""
+    whole, choice, _ = fixed
+    leaf, tree = jax.tree.flatten(whole)
+    size = haar.face_edge(choice.seen.shape[1])
+    deepest = _deepest(size)
+    mean = jax.lax.stop_gradient(jnp.mean(whole.light, -1))
+
+    def visit(moving, cell):
+        left = iter(moving)
+        integrand = tree.unflatten([next(left) if _floating(each) else each for each in leaf])
+        vertex, level = cell[:, 0], cell[:, 1]
+        wo = integrand.wo[vertex]
+        wi, weight, texel = _nodes(cell, integrand.frame[vertex], size)
+        weight *= wo[:, 2:, None] > 0
+        sent = value(integrand.brdf, jnp.stack(wi, -1), wo[:, None, None])
+        inner = _children(sent * (jnp.maximum(wi[2], 0) * weight)[..., None])
+        clear = choice.seen[vertex[:, None, None], texel].astype(weight.dtype) / LEVELS
+        scale = clear * brightest(mean[:, texel], choice.weight[vertex].T[:, :, None, None])
+        again = _again(jax.lax.stop_gradient((sent, wi, wo, weight, scale)), vertex, choice)
+        again &= ((level >= 0) & (level < deepest))[:, None, None]
+        kept = clear * ((level >= 0)[:, None, None] & ~again)
+        inner = jnp.broadcast_to(inner * kept[..., None], (*inner.shape[:-1], colors))
+        # Child by child, since the compiler's loop for a sum over all of them takes ten times as long.
+        light, child = integrand.light.swapaxes(0, 1), np.ndindex(SIDE, SIDE)
+        return sum(light[texel[:, i, j]] * inner[:, i, j, None] for i, j in child), again
+
+    return visit
+
+
+def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
+    """The largest over lights of light times weight.
+
+    Light by light, since the compiler's loop for a maximum over all of them takes ten times as long.
+    """
+
+    def step(most, each):
+        return jnp.maximum(most, each[0] * each[1]), None
+
+    return jax.lax.scan(step, jnp.zeros(light.shape[1:], light.dtype), (light, weight))[0]
+
+
+def _nodes(cell: Array, frame: Array, size: int) -> tuple[list[Array], Array, Array]:
+    """Components of local directions, and solid angles, of Gauss points [k 8 8]; the texels of children."""
+    _, level, face, row, column = cell.T
+    level = jnp.maximum(level, 0)
+    edge = (2 * root(size) / size * 0.25 ** level.astype(frame.dtype))[:, None]
+    offset = (np.arange(SIDE)[:, None] + 0.5 + np.array([-_GAP, _GAP]) / 2).ravel() / SIDE
+    s, t = (edge * (at[:, None] + jnp.asarray(offset, frame.dtype)) - 1 for at in (column, row))
+    s, t = s[:, None, :], t[:, :, None]
+    # Component by component, which XLA fuses; products with matrices it does not.
+    axis = jnp.einsum("kij,kaj->kia", frame, jnp.asarray(cubemap.axes(), frame.dtype)[face])[..., None, None]
+    short = jax.lax.rsqrt(1 + s**2 + t**2)
+    wi = [(s * axis[:, i, 0] + t * axis[:, i, 1] + axis[:, i, 2]) * short for i in range(3)]
+    weight = (edge[..., None] / (2 * SIDE)) ** 2 * short**3
+    per = (SIDE ** (level if root(size) > 1 else level + 1))[:, None]  # children along the edge of a texel
+    y, x = (SIDE * at[:, None] + np.arange(SIDE) for at in (row, column))
+    texel = ((face[:, None] * size + y // per)[:, :, None] * size) + (x // per)[:, None, :]
+    return wi, weight, texel
+
+
+def _children(node: Array) -> Array:
+    """Sums over the 2 x 2 points of each child."""
+    shape = node.shape
+    return jnp.sum(node.reshape(shape[0], SIDE, 2, SIDE, 2, *shape[3:]), (2, 4))
+
+
+def _again(given: tuple, vertex: Array, choice: Choice) -> Array:
+    """Which children err too much.
+
+    Two Gauss points err by the fourth difference over 4320. The square of the second difference over the value stands
+    for it, as it does for a Gaussian lobe. The mirror direction is one more point: a peak between all others shows
+    there.
+    """
+    sent, wi, wo, weight, scale = given
+    gray = jax.lax.optimization_barrier(jnp.mean(sent, -1) * jnp.maximum(wi[2], 0) * weight)
+    miss = jnp.zeros_like(gray)
+    gap = jnp.where(jnp.arange(2 * SIDE - 1) % 2 == 0, _GAP, 1 - _GAP).astype(gray.dtype)
+    for axis, apart in ((1, gap[None, :, None]), (2, gap[None, None, :])):
+        bend = jnp.abs(2 * jnp.diff(jnp.diff(gray, axis=axis) / apart, axis=axis))
+        miss += _loss(jnp.pad(bend, [(0, 0), *((1, 1) if axis == a else (0, 0) for a in (1, 2))], mode="edge"), gray)
+    wo = wo[:, :, None, None]
+    near = (wi[0] + wo[:, 0]) ** 2 + (wi[1] + wo[:, 1]) ** 2 + (wi[2] - wo[:, 2]) ** 2 < _NEAR * weight
+    higher = jnp.abs(choice.peak[vertex][:, None, None] * weight - gray)
+    miss += jnp.where(near, _loss(_PEAKED * higher, gray + higher), 0)
+    return scale * _children(miss) > choice.error * jnp.maximum(scale * jnp.abs(_children(gray)), SMALL)
+
+
+def _loss(bend: Array, size: Array) -> Array:
+    return _CURVED * bend**2 / jnp.maximum(jnp.maximum(jnp.abs(size), bend / _STEEPEST), _TINY)
+
+
+def _floating(leaf: Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)

@@ -1,0 +1,23 @@
+"""Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
+
+from jaxprt.systems.bounces import functions, gather, jobs, relight, tensor
+from jaxprt.systems.bounces.functions import factor
+from jaxprt.systems.bounces.relight import arriving, combine, light_side, radiance, view_side
+from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, precompute
+
+__all__ = [
+    "SecondBounce",
+    "TransferTensor",
+    "arriving",
+    "combine",
+    "factor",
+    "functions",
+    "gather",
+    "jobs",
+    "light_side",
+    "precompute",
+    "radiance",
+    "relight",
+    "tensor",
+    "view_side",
+]

@@ -1,0 +1,176 @@
+"""Reflected light along paths of functions: what arrives at vertices after light met surfaces of given functions.
+
+    R_y(l, k) = int_l u_k(w) V_y(w) (w . n) dw
+    T_x(s, p, l) = sum_rays m_s sum_y b_y sum_k g_kp(wo) R_y(l, k)
+
+One bounce T is a tensor over measures s of what arrives, such as harmonics, the function p of the surface, and the
+light's texels l. It is made of the responses R of light factors u at the corners y of the triangles that rays meet,
+with their barycentric weights b, by gathers and products. The response to light that has been reflected itself makes
+the next bounce of the same steps. Functions are those of `jaxprt.bounces.functions`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxprt import visibility
+from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
+from jaxprt.systems.bounces import functions
+from jaxprt.systems.separable import SeparableBrdf
+
+_HITS = 64  # in a group: their responses should stay in the cache
+_GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
+
+
+@functools.partial(jax.jit, static_argnames=("edge",))
+def respond(
+    seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, edge: int
+) -> Float[Array, "b l k"]:
+    """What light factors make of light from each texel of coarse faces: direct light.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
+        edge: Edge of the light's faces, a divisor of the visibility's.
+
+    Returns:
+        Integrals over each coarse texel of light factor x visibility x cosine.
+    """
+    size = haar.face_edge(seen.shape[1])
+    fold = size // edge
+
+    def one(argument):
+        visible, axes = argument
+        met = _met(axes, basis, size) * (visible / visibility.LEVELS)[:, None].astype(axes.dtype)
+        return jnp.sum(met.reshape(6, edge, fold, edge, fold, -1), (2, 4)).reshape(6 * edge * edge, -1)
+
+    return jax.lax.map(one, (seen, frame))
+
+
+@jax.jit
+def respond_again(
+    arriving: Float[Array, "s q b"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf
+) -> Float[Array, "b q k"]:
+    """What light factors make of light that arrives as harmonics, one response for each kind q of it.
+
+    Args:
+        arriving: SH coefficients of radiance in world directions.
+        frame: Rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces.
+
+    Returns:
+        Integrals over the horizon of light factor x radiance x cosine.
+    """
+    local = rotation.rotate_each(arriving, frame)
+    return jnp.einsum("sqb,sk->bqk", local, functions.project(basis, degree=harmonics.degree_of(len(arriving))))
+
+
+class Rays(NamedTuple):
+    """Rays that meet surfaces, in groups of those of one point; where a group has fewer, weights are zero.
+
+    Attributes:
+        owner: The point of each group.
+        corner: Vertices of the triangle that each ray meets.
+        weight: Barycentric weights in it.
+        texel: Through which each ray is sent.
+    """
+
+    owner: Int[np.ndarray, " g"]
+    corner: Int[np.ndarray, "g h 3"]
+    weight: Float[np.ndarray, "g h 3"]
+    texel: Int[np.ndarray, "g h"]
+
+
+@functools.partial(jax.jit, static_argnames=("points",))
+def arrive(
+    response: Float[Array, "v l k"],
+    frame: Float[Array, "v 3 3"],
+    basis: SeparableBrdf,
+    owner: Int[Array, " g"],
+    corner: Int[Array, "g h 3"],
+    weight: Float[Array, "g h 3"],
+    direction: Float[Array, "g h 3"],
+    measure: Float[Array, "g h s"],
+    *,
+    points: int,
+) -> Float[Array, "b s p l"]:
+    """What surfaces send to some points, summed over the rays of each by some measures.
+
+    Args:
+        response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`.
+        frame: Of these vertices.
+        basis: Functions of the surfaces.
+        owner: Of each group of rays the point that they arrive at; this and more as `Rays` has it.
+        corner: Vertices of the triangle that each ray meets.
+        weight: Barycentric weights in it.
+        direction: Directions of the rays.
+        measure: What each ray counts: harmonics times solid angle, or cosine times solid angle over pi.
+        points: Number of points.
+
+    Returns:
+        For each point, measure, function and light.
+    """
+
+    def add(total, group):
+        owner, corner, weight, direction, measure = group
+        wo = jnp.sum(frame[corner] * -direction[:, None, None], -1)
+        wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
+        view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
+        sent = jnp.einsum("hckp,hclk->hpl", view, response[corner])
+        return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent)), None
+
+    shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+    groups = (owner, corner, weight, direction, measure)
+    return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
+
+
+def rays(
+    occluder: visibility.Occluder,
+    start: Float[np.ndarray, "b 3"],
+    normal: Float[np.ndarray, "b 3"],
+    frame: Float[np.ndarray, "v 3 3"],
+    region: Int[np.ndarray, " v"],
+    *,
+    size: int = 16,
+) -> dict[int, Rays]:
+    """Where rays through the texels above some points' horizons meet the fronts of surfaces.
+
+    Args:
+        occluder: The scene.
+        start: Points where rays start.
+        normal: Normals there.
+        frame: Frames of the scene's vertices.
+        region: Of each of the scene's vertices.
+        size: Edge of the faces through whose texels rays are sent.
+
+    Returns:
+        The rays that meet each region that is met; where a triangle has corners of several, each region has its own.
+    """
+    point, texel, corner, share, _ = visibility.hits.hits(occluder, start, normal, size=size)
+    way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
+    seen = visibility.hits.front(occluder, frame[:, 2], corner, way)
+    result = {}
+    for number in np.unique(region[corner[seen]]).tolist():
+        inside = region[corner] == number
+        own = np.flatnonzero(seen & inside.any(1))
+        count = np.bincount(point[own], minlength=len(start))
+        place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+        groups = -(-count // _HITS)
+        group = (np.cumsum(groups) - groups)[point[own]] + place // _HITS
+        padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, share, texel)]
+        for whole, each in zip(padded, (corner[own], (share * inside)[own], texel[own]), strict=True):
+            whole[group, place % _HITS] = each
+        result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
+    return result
+
+
+def _met(axes: Array, basis: SeparableBrdf, size: int) -> Array:
+    """Light factor times cosine times solid angle of all texels, [d, k]."""
+    direction, area = (x(size=size).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
+    flux = jnp.maximum(area @ axes[2], 0)
+    return basis.light(directions.to_local(axes, direction))[..., 0] * flux[:, None]

@@ -1,0 +1,295 @@
+"""Blocks of transfer tensors: what light factors make of direct light; one bounce and two, for clusters of vertices."""
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float16
+
+from jaxprt import visibility
+from jaxprt.decompose import eigen, tucker
+from jaxprt.files.arrays import Layout, sketch
+from jaxprt.sphere import cubemap, haar, harmonics
+from jaxprt.systems import separable
+from jaxprt.systems.bounces import gather
+from jaxprt.systems.separable import SeparableBrdf
+
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 1}
+DEGREE = 3  # of the harmonics that arrive
+_AGAIN = 2  # edge of the light's faces for two bounces
+
+
+@dataclass(frozen=True)
+class ResponseJob(visibility.rays.VisibilityJob):
+    """Blocks of what light factors make of direct light; see `blocks.Job`."""
+
+    basis: SeparableBrdf
+    edge: int
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        """What the result depends on."""
+        return self.made_by("response", ALGORITHM, edge=self.edge, maps=self.basis.coordinates.__name__)
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of the light factors."""
+        return {**super().near, "brdf": sketch(self.basis.light_map)}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        """Shapes of one block."""
+        shape = (visibility.rays.BLOCK, 6 * self.edge**2, self.basis.terms)
+        return {"response": Layout(shape, 0, "float32")}
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        """One block."""
+        seen, count = self.seen(block)
+        frame = jnp.asarray(self.frame[self.part(block)])
+        response = gather.respond(jnp.asarray(seen), frame, self.basis, edge=self.edge)
+        return {"response": np.asarray(response)}, count.rays
+
+
+@dataclass(frozen=True)
+class _PathJob(separable.clustered.ClusterJob, visibility.rays.VisibilityJob):
+    """What surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
+
+    Attributes:
+        bases: Functions of each region.
+        response: Of their light factors, at the vertices of each region.
+        white: Weights of all functions by which a bounce is judged.
+        scale: Of all functions, by which errors of decompositions count them.
+        region: Number of each vertex's region.
+    """
+
+    bases: tuple[SeparableBrdf, ...]
+    response: tuple[np.ndarray, ...]
+    white: np.ndarray
+    scale: np.ndarray
+    region: np.ndarray
+    member: np.ndarray
+    components: int
+    system: ClassVar[str] = "transfer"
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        """What the result depends on."""
+        maps = [basis.coordinates.__name__ for basis in self.bases]
+        made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
+        kinds = self.response[0].shape[1]
+        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components}
+        return self.made_by(self.system, ALGORITHM, **own)
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of the BRDFs' functions, and of what their light factors make of direct light."""
+        parts = {"white": self.white, "scale": self.scale}
+        for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
+            parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
+            parts |= {f"response {number}": response}
+        return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
+
+    def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
+        """Harmonics of what arrives at some vertices, before it is decomposed."""
+        found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
+        way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
+        area = np.asarray(cubemap.solid_angle(size=self.size), np.float32).reshape(-1, 1)
+        measure = np.asarray(harmonics.evaluate(jnp.asarray(way), degree=DEGREE)) * area
+        result = []
+        for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
+            if number not in found:
+                shape = (len(part), measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+                result.append(np.zeros(shape, np.float32))
+                continue
+            rays, own = found[number], np.flatnonzero(self.region == number)
+            local = np.zeros(len(self.region), np.int32)
+            local[own] = np.arange(len(own))
+            # Padded to a power of two groups, so that few shapes are compiled; what is added weighs nothing.
+            spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
+            owner, corner, weight, texel = (np.pad(x, ((0, spare), *[(0, 0)] * (x.ndim - 1))) for x in rays)
+            fixed = (owner, local[corner], weight, way[texel], measure[texel])
+            arrived = gather.arrive(response, self.frame[own], basis, *map(jax.device_put, fixed), points=len(part))
+            result.append(np.asarray(arrived))
+        return np.concatenate(result, 2)
+
+    def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
+        """Irradiance over pi at each vertex of a part, by weights of functions, under constant light."""
+        cosine = harmonics.convolve(
+            harmonics.evaluate(jnp.asarray(self.frame[part, 2]), degree=DEGREE).T,
+            harmonics.cosine(degree=DEGREE) / np.pi,
+        )
+        met = np.sum(tensor, 1)
+        for _ in range(met.ndim - 2):
+            met = met @ white
+        return np.einsum("bs,sb->b", met, cosine)
+
+
+@dataclass(frozen=True)
+class TransferJob(_PathJob):
+    """Tensors of one bounce."""
+
+    modes: int
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        """What the result depends on."""
+        return {**super().header, "modes": self.modes}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        """Shapes of one block."""
+        harmonic, functions = (DEGREE + 1) ** 2, len(self.white)
+        return {
+            "weight": Layout((self.step, self.components), 0, "float32"),
+            "core": Layout((1, self.modes, self.components, harmonic, functions), 0, "float16"),
+            "mode": Layout((1, self.response[0].shape[1], self.modes), 0, "float32"),
+            "error": Layout((1,), 0, "float32"),
+            "energy": Layout((1, functions), 0, "float32"),
+            "white": Layout((self.step,), 0, "float32"),
+        }
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        """One block."""
+        tensor = self.tensor(self.member[block])
+        count, light, harmonic, functions = tensor.shape
+        flat = jax.device_put((tensor * self.scale).reshape(count, light, -1))
+        weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
+        core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions) / self.scale
+        white = self.brought(tensor, self.member[block], self.white)
+        energy = np.sum(tensor**2, (0, 1, 2))[None]
+        rows = {"weight": weight, "core": core, "mode": mode[None], "error": error[None], "energy": energy}
+        return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
+
+    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
+        """What arrives at some vertices, before it is decomposed."""
+        return np.moveaxis(self.arrived(part), 3, 1)
+
+    def again(
+        self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int
+    ) -> "AgainJob":
+        """The job of a second bounce, off surfaces that the first one lights."""
+        fine = math.isqrt(self.response[0].shape[1] // 6)
+        edge = min(_AGAIN, fine)
+        shape = (len(mode), 6, edge, fine // edge, edge, fine // edge, -1)
+        coarse = mode.reshape(shape).sum((3, 5)).reshape(len(mode), 6 * edge * edge, -1)
+        count = coarse.shape[1] * len(function)
+        counts = [np.sum(self.region == number) for number in range(len(self.bases))]
+        response = [np.zeros((n, count, b.terms), np.float32) for n, b in zip(counts, self.bases, strict=True)]
+        local = np.zeros(len(self.region), np.int32)
+        for number, each in enumerate(counts):
+            local[self.region == number] = np.arange(each)
+        for member, *parts in zip(self.member, weight, core, coarse, strict=True):
+            arriving = _expand(*map(jax.device_put, parts))
+            for number, basis in enumerate(self.bases):
+                own = self.region[member] == number
+                if own.any():
+                    made = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
+                    response[number][local[member[own]]] = np.asarray(made)[own]
+        same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
+        return AgainJob(**{**same, "response": tuple(response), "components": components}, function=function)
+
+
+@dataclass(frozen=True)
+class AgainJob(_PathJob):
+    """Tensors of two bounces."""
+
+    function: np.ndarray
+    system: ClassVar[str] = "transfer 2"
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        """What the result depends on."""
+        return {**super().header, "function": self.function.tolist()}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        """Shapes of one block."""
+        functions = len(self.function)
+        light = self.response[0].shape[1] // functions
+        shape = (1, light, self.components, (DEGREE + 1) ** 2, functions, functions)
+        return {
+            "weight": Layout((self.step, self.components), 0, "float32"),
+            "core": Layout(shape, 0, "float16"),
+            "error": Layout((1,), 0, "float32"),
+            "white": Layout((self.step,), 0, "float32"),
+        }
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        """One block."""
+        tensor = self.tensor(self.member[block])
+        scale = self.scale[self.function]
+        both = scale[:, None] * scale
+        weight, core, error = _along_vertices(jax.device_put(tensor * both), components=self.components)
+        rows = {"weight": weight, "core": (np.asarray(core) / both)[None], "error": error[None]}
+        white = self.brought(tensor, self.member[block], self.white[self.function])
+        return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
+
+    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
+        """What arrives at some vertices, before it is decomposed."""
+        found = self.arrived(part)[:, :, self.function]
+        found = found.reshape(*found.shape[:3], -1, len(self.function))
+        return found.transpose(0, 3, 1, 4, 2)
+
+
+@functools.partial(jax.jit, static_argnames=("components", "modes"))
+def compress(
+    tensor: Float[Array, "m l f"], *, components: int, modes: int
+) -> tuple[Float[Array, "m n"], Float16[Array, "e n f"], Float[Array, "l e"], Float[Array, ""]]:
+    """Decomposes the tensor of a cluster along vertices and then along the light.
+
+    What is least is the squared error under light whose spectrum falls like that of natural light.
+
+    Args:
+        tensor: What arrives at each vertex from each texel, of any kinds f.
+        components: Along the vertices.
+        modes: Along the light.
+
+    Returns:
+        Weights of each vertex, cores scaled to largest entries of 1, modes, and the relative error.
+    """
+    count, texels, kinds = tensor.shape
+    size = haar.face_edge(texels)
+    importance = jnp.tile(haar.area(size=size).ravel(), 6)[:, None] ** separable.clustered.SPECTRUM
+    wavelet = haar.forward(tensor.reshape(count, 6, size, size, kinds))
+    tensor = wavelet.reshape(count, texels, kinds) * importance.astype(tensor.dtype)
+    whole = jnp.vdot(tensor, tensor)
+    _, vertex, _ = eigen.symmetric(tucker.gram(tensor, mode=0), terms=components)
+    core = tucker.multiply(tensor, vertex, mode=0)
+    _, mode, _ = eigen.symmetric(tucker.gram(core, mode=1), terms=modes)
+    core = tucker.multiply(core, mode, mode=1)
+    left = jnp.maximum(whole - jnp.vdot(core, core), 0)
+    mode = haar.inverse((mode / importance).reshape(6, size, size, modes)).reshape(texels, modes)
+    error = jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
+    weight, core = _scaled(vertex, core)
+    return weight, core.swapaxes(0, 1), mode, error
+
+
+@functools.partial(jax.jit, static_argnames=("components",))
+def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Array]:
+    """The same along the vertices alone, where the light has few texels and every one counts alike."""
+    whole = jnp.vdot(tensor, tensor)
+    _, vertex, _ = eigen.symmetric(tucker.gram(tensor, mode=0), terms=components)
+    core = tucker.multiply(tensor, vertex, mode=0)
+    left = jnp.maximum(whole - jnp.vdot(core, core), 0)
+    weight, core = _scaled(vertex, core)
+    return weight, core.swapaxes(0, 1), jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
+
+
+def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
+    """Weights with the sizes of the core, and the core in half precision with largest entries of 1."""
+    size = jnp.max(jnp.abs(core), tuple(range(1, core.ndim)), initial=0)  # There may be no functions.
+    size = jnp.where(size > 0, size, 1)
+    return vertex * size, (core / size.reshape(-1, *[1] * (core.ndim - 1))).astype(jnp.float16)
+
+
+@jax.jit
+def _expand(weight: Array, core: Array, coarse: Array) -> Array:
+    """What arrives at the vertices of a cluster from each coarse texel and function, [s l q, m] as harmonics first."""
+    met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
+    return jnp.einsum("mn,nslq->slqm", weight, met).reshape(core.shape[2], -1, len(weight))

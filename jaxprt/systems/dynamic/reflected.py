@@ -1,0 +1,159 @@
+"""What a set of BRDFs reflects of natural light: the tensor that sets and light paths decompose."""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import grid
+from jaxprt.sphere import harmonics, hemisphere
+from jaxprt.systems import lobe as lobe_system
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.table import is_isotropic
+
+DEGREE = 24  # of the natural light that the factors are chosen for
+_RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
+_NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
+
+_stack = jax.jit(lambda brdfs: jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
+
+
+class Reflected(NamedTuple):
+    """What each of some BRDFs reflects to views in the texels of a parabolic map, of light of natural spectrum.
+
+    Attributes:
+        tensor: Reflected radiance for each BRDF, color, view and harmonic.
+        to_map: Light maps of what reflects one harmonic each.
+        direction: Unit direction of each view.
+        area: Solid angle of each view, zero outside the map's disk.
+        whole: Squared norm of what they reflect before lobes are taken out.
+    """
+
+    tensor: Float[Array, "m c d b"]
+    to_map: Float[Array, "b e"]
+    direction: Float[Array, "d 3"]
+    area: Float[Array, " d"]
+    whole: Float[Array, ""]
+
+
+def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> Reflected:
+    """What BRDFs reflect without their lobes.
+
+    Args:
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all of as many colors.
+        lobe: Their lobes, one table along the number of the BRDF; None keeps the BRDFs whole.
+        resolution: Edge of the map of views in texels.
+
+    Raises:
+        ValueError: A BRDF is negative or not finite.
+    """
+    direction = jnp.asarray(np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3))
+    area = jnp.asarray(np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel())
+    together = stacked(brdfs)
+    # All at once where they are of one kind, and else one by one.
+    parts = [(together, np.arange(len(brdfs)))]
+    if together is None:
+        parts = [(_stack((grid.as_argument(each),)), np.array([n])) for n, each in enumerate(brdfs)]
+    # Isotropic BRDFs need only one view of each height.
+    turned = all(map(is_isotropic, brdfs))
+    view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
+    found = [_reflected(part, lobe, number, view) for part, number in parts]
+    check_values([least for _, _, least in found])
+    tensor, square = (np.concatenate([np.asarray(each[part]) for each in found]) for part in (0, 1))
+    tensor = _turn(tensor, back, direction) if turned else jnp.asarray(tensor)
+    whole = jnp.asarray(np.sum(square[:, :, back] * area))
+    return Reflected(tensor, _to_map(direction, _dual()), direction, area, whole)
+
+
+def check_values(least: Sequence[Float[Array, " m"]]) -> None:
+    """Refuses BRDFs by their least values, which are not a number where any is not finite."""
+    value = np.concatenate([np.asarray(each) for each in least])
+    wrong = np.flatnonzero(~(value >= 0))
+    if wrong.size:
+        raise ValueError(
+            f"a BRDF must be finite and not negative above the horizon, {wrong.size} of {len(value)} are not, first "
+            f"number {wrong[0]}"
+        )
+
+
+def stacked(brdfs: Sequence[Callable]) -> Callable | None:
+    """One model whose parameters have a leading axis along the set, if all BRDFs are of one kind."""
+    leaves = [jax.tree.leaves(each) for each in brdfs]
+    if not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
+        return None
+    kinds = {(jax.tree.structure(each), tuple(map(jnp.shape, own))) for each, own in zip(brdfs, leaves, strict=True)}
+    if len(kinds) > 1:
+        return None
+    return _stack(tuple(brdfs))
+
+
+@jax.jit
+def _reflected(
+    brdf: Callable, lobe: LobeBrdf | None, number: Array, view: Float[Array, "d 3"]
+) -> tuple[Float[Array, "m c d b"], Float[Array, "m c d"], Float[Array, " m"]]:
+    """What is left of each harmonic reflected to each view, the square of the whole, and the least value of a BRDF."""
+
+    def row(wo):
+        wi, area = hemisphere.arcs(lobe_system.em.mirror(wo), rings=_RINGS, sectors=_SECTORS)
+        cosine = jnp.maximum(wi[:, 2:], 0)
+        light = area * harmonics.convolve(harmonics.evaluate(wi, degree=DEGREE).T, harmonics.natural(degree=DEGREE))
+
+        def values(number, brdf):
+            value = brdf(wi, jnp.broadcast_to(wo, wi.shape))
+            least = jnp.min(jnp.where(jnp.isfinite(value), value, -1))
+            value = value * cosine
+            return value, value if lobe is None else value - _one(lobe, number).lookup(wo[None]).evaluate(wi).T, least
+
+        whole, rest, least = jax.vmap(values)(number, brdf)
+        whole, rest = (jnp.einsum("mdc,bd->mcb", each, light) for each in (whole, rest))
+        return rest, jnp.sum(whole**2, -1), least
+
+    rest, square, least = jax.lax.map(row, view)
+    return jnp.moveaxis(rest, 0, 2), jnp.moveaxis(square, 0, 2), jnp.min(least, 0)
+
+
+@jax.jit
+def _to_map(direction: Array, dual: Array) -> Array:
+    """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
+    smooth = dual.astype(direction.dtype) @ harmonics.evaluate(direction, degree=DEGREE).T
+    return harmonics.convolve(smooth, 1 / harmonics.natural(degree=DEGREE))
+
+
+@lru_cache(maxsize=1)
+def _dual() -> np.ndarray:
+    """Inverse of the products of harmonics with each other and the cosine, on the hemisphere."""
+    wi, area = hemisphere.arcs(jnp.array([0.0, 0, 1]), rings=_RINGS, sectors=_SECTORS)
+    light = np.asarray(harmonics.evaluate(wi, degree=DEGREE), np.float64)
+    value, vector = np.linalg.eigh(light.T @ (light * np.asarray(wi[:, 2:] * area[:, None], np.float64)))
+    known = value > _NULL * value[-1]
+    return (vector[:, known] / value[known]) @ vector[:, known].T
+
+
+def _heights(direction: Array) -> tuple[Array, np.ndarray]:
+    """A view in the x z plane for each height among some, and which of these every direction has."""
+    height, first, back = np.unique(np.round(np.asarray(direction)[:, 2], 5), return_index=True, return_inverse=True)
+    height = np.asarray(direction)[first, 2]
+    return jnp.asarray(np.stack([np.sqrt(1 - height**2), 0 * height, height], -1)), back
+
+
+@jax.jit
+def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float[Array, "d 3"]) -> Array:
+    """Harmonics of what is reflected to views in the x z plane, turned about the normal to where the views are."""
+    azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])
+    order = np.concatenate([np.arange(-each, each + 1) for each in range(DEGREE + 1)])
+    opposite = np.arange(len(order)) - 2 * order
+    angle = azimuth[:, None] * order
+    tensor = jnp.asarray(tensor)[:, :, back]
+    return tensor * jnp.cos(angle) - tensor[..., opposite] * jnp.sin(angle)
+
+
+def _one(table: LobeBrdf, number) -> LobeBrdf:
+    """Lobes of one of the set."""
+    mean, weight = table.mean[:, :, number], table.weight[:, :, number]
+    return LobeBrdf(mean, table.scale[:, number], weight, table.diffuse[:, number], (), table.error)

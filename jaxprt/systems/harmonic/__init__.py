@@ -1,0 +1,45 @@
+"""The harmonic system: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002)."""
+
+from jaxprt.systems.harmonic import interreflection, relight, table, transfer
+from jaxprt.systems.harmonic.interreflection import interreflect, interreflect_diffuse
+from jaxprt.systems.harmonic.relight import (
+    combine,
+    diffuse_radiance,
+    local_light,
+    probe_light,
+    project,
+    radiance,
+    transferred_light,
+    transferred_view,
+    unshadowed_radiance,
+    view_coefficients,
+    world_view,
+)
+from jaxprt.systems.harmonic.table import HarmonicBrdf, tabulate
+from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, precompute, precompute_diffuse
+
+__all__ = [
+    "HarmonicBrdf",
+    "TransferMatrix",
+    "TransferVector",
+    "combine",
+    "diffuse_radiance",
+    "interreflect",
+    "interreflect_diffuse",
+    "interreflection",
+    "local_light",
+    "precompute",
+    "precompute_diffuse",
+    "probe_light",
+    "project",
+    "radiance",
+    "relight",
+    "table",
+    "tabulate",
+    "transfer",
+    "transferred_light",
+    "transferred_view",
+    "unshadowed_radiance",
+    "view_coefficients",
+    "world_view",
+]

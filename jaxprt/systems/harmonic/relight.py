@@ -1,0 +1,311 @@
+"""Relighting by spherical harmonics: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002).
+
+The published four steps are `local_light` (rotate the light to each vertex's frame), the view turned to that frame
+and the table looked up there (`view_coefficients`), and their dot product (`combine`). With fixed light a caller keeps
+the first, or `transferred_light`; with fixed view the BRDF's coefficients turned to the world, `world_view` or
+`transferred_view`, which then meet the light's coefficients alone. `radiance` and `unshadowed_radiance` do all of it.
+
+Lights, eyes and probes must be finite. Inside `jax.jit`, `jax.vmap` and `jax.grad` values are not known and not
+checked: NaN in a light or in an eye then reaches every vertex, NaN in a probe every vertex that it has a share in.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import directions, harmonics, rotation
+from jaxprt.systems.harmonic.table import HarmonicBrdf
+from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, right_handed
+
+
+def _light_shape(value: Any) -> None:
+    require.array("the light", value, "lm c", "lm c v", source="jaxprt.harmonic.project")
+
+
+def _light(value: Any) -> None:
+    _light_shape(value)
+    require.finite("the light", value)
+
+
+def _environment(value: Any) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+    require.finite("the light", value.radiance)
+
+
+def _brdf(value: Any) -> None:
+    require.kind("the BRDF", value, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
+
+
+def _matrix(value: Any) -> None:
+    require.kind("the transport", value, TransferMatrix, source="jaxprt.harmonic.precompute")
+
+
+def _vector(value: Any) -> None:
+    require.kind("the transport", value, TransferVector, source="jaxprt.harmonic.precompute_diffuse")
+
+
+def _eye(value: Any) -> None:
+    require.array("the eye", value, "3")
+    require.finite("the eye", value)
+
+
+def _probe(value: Any) -> None:
+    require.array("probes", value, "p 3")
+    require.finite("probes", value)
+    if not value.shape[0]:
+        raise ValueError("there must be at least one probe, got an array of shape [0, 3]")
+
+
+def _probe_coefficient(value: Any) -> None:
+    require.array("the light at the probes", value, "p lm c")
+    require.finite("the light at the probes", value)
+
+
+@require.arguments(light=_environment)
+def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
+    """SH coefficients of an environment, in its radiance times sr^1/2; of each one of a batch.
+
+    Raises:
+        TypeError: The light is no Environment.
+        ValueError: The light is not finite, or the degree is negative.
+    """
+    *batch, faces, edge, _, colors = light.radiance.shape
+    every = jnp.moveaxis(light.radiance.reshape(-1, faces, edge, edge, colors), 0, -1)
+    coefficient = harmonics.project(every, degree=degree)
+    return jnp.moveaxis(coefficient, -1, 0).reshape(*batch, -1, colors)
+
+
+@require.arguments(transport=_matrix, brdf=_brdf, light=_light, eye=_eye)
+@jax.jit
+def radiance(
+    transport: TransferMatrix,
+    brdf: HarmonicBrdf,
+    light: Float[Array, "lm c *w"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "v _"]:
+    """Radiance of every vertex towards the eye, with shadows.
+
+    Differentiable in all arguments.
+
+    Args:
+        transport: Transfer matrices.
+        brdf: The BRDF's table.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Per vertex, the parameters of a BRDF that varies.
+        eye: Position of the viewer.
+
+    Returns:
+        Linear radiance; negative where the harmonics ring.
+
+    Raises:
+        TypeError: The transport is no matrix, the BRDF is no table, or the light is an environment.
+        ValueError: Light, transport and table differ in degree, an array has other axes, or the light or the eye is
+            not finite.
+
+    Reference: Kautz, Sloan, Snyder 2002, sections 4 and 5.
+    """
+    view = view_coefficients(brdf, transport.position, transport.frame, *parameter, eye=eye)
+    return combine(light, transferred_view(transport, view))
+
+
+@require.arguments(brdf=_brdf, light=_light, eye=_eye)
+@jax.jit
+def unshadowed_radiance(
+    mesh: Mesh,
+    brdf: HarmonicBrdf,
+    light: Float[Array, "lm c *w"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "v _"]:
+    """Radiance of every vertex towards the eye without shadows: nothing is precomputed but the BRDF's table.
+
+    Args:
+        mesh: The vertices.
+        brdf: The BRDF's table.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Per vertex, the parameters of a BRDF that varies.
+        eye: Position of the viewer.
+
+    Returns:
+        Linear radiance; negative where the harmonics ring.
+
+    Raises:
+        TypeError: The BRDF is no table, or the light is an environment.
+        ValueError: Light and table differ in degree, an array has other axes, or the light or the eye is not finite.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 4.
+    """
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    return combine(local_light(frame, light), view_coefficients(brdf, mesh.position, frame, *parameter, eye=eye))
+
+
+@require.arguments(transport=_vector, light=_light)
+@jax.jit
+def diffuse_radiance(
+    transport: TransferVector, albedo: Float[Array, "..."], light: Float[Array, "lm c *w"]
+) -> Float[Array, "v _"]:
+    """Radiance of ideal diffuse vertices, the same for all views.
+
+    Args:
+        transport: Transfer vectors.
+        albedo: One for all or one for each vertex.
+        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+
+    Raises:
+        TypeError: The transport is no vector, or the light is an environment.
+        ValueError: Light and transport differ in degree, or the light has other axes or is not finite.
+    """
+    return combine(light, transport.vector) * albedo
+
+
+@require.arguments(probe=_probe, coefficient=_probe_coefficient)
+@jax.jit
+def probe_light(
+    position: Float[Array, "v 3"], probe: Float[Array, "p 3"], coefficient: Float[Array, "p lm c"]
+) -> Float[Array, "lm c v"]:
+    """Light that varies over an object: coefficients at some points, interpolated to the vertices.
+
+    Shepard's weights, by the inverse fourth power of the distance: smooth, exact at the probes, and each vertex's
+    light is a mean of theirs. Where a vertex coincides with a probe derivatives by position are zero.
+
+    Args:
+        position: Where light is wanted.
+        probe: Where it is known.
+        coefficient: SH coefficients of the light around each probe.
+
+    Raises:
+        TypeError: Probes or coefficients are no arrays.
+        ValueError: There are no probes, the light is not that of as many, or some values are not finite.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting); Shepard 1968.
+    """
+    if len(probe) != len(coefficient):
+        raise ValueError(f"there must be light at each of the {len(probe)} probes, got light at {len(coefficient)}")
+    square = jnp.sum((position[:, None] - probe) ** 2, -1)
+    nearest = jnp.min(square, -1, keepdims=True)
+    ratio = jnp.where(nearest > 0, nearest, 1) / jnp.where(nearest > 0, square, 1)
+    weight = jnp.where(nearest > 0, ratio**2, jnp.where(square > 0, 0, 1))
+    weight = weight / jnp.sum(weight, -1, keepdims=True)
+    return jnp.einsum("vp,plc->lcv", weight, coefficient)
+
+
+@require.arguments(light=_light)
+@jax.jit
+def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
+    """Light turned to the frame of every vertex: the light side without transfer.
+
+    Args:
+        frame: Rows are tangent, bitangent, normal; bitangents that point the other way count as turned around.
+        light: Coefficients in the world: one set, or one for each vertex.
+    """
+    return rotation.rotate_each(light, right_handed(frame))
+
+
+@require.arguments(transport=_matrix, light=_light)
+@jax.jit
+def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm _ v"]:
+    """Light that arrives at every vertex in its own frame: the light side with transfer.
+
+    Args:
+        transport: Transfer matrices.
+        light: Coefficients in the world: one set, or one for each vertex.
+
+    Raises:
+        ValueError: Light and transport differ in degree.
+    """
+    count, colors, terms, _ = transport.matrix.shape
+    _check_degree(light.shape[0], terms, "the light", "the transport")
+    several_colors = _colors(light.shape[1], colors)
+    if light.ndim == 3:
+        several = jnp.broadcast_to(light, (terms, several_colors, light.shape[2]))
+        return jnp.einsum(
+            "vcoi,icv->ocv", jnp.broadcast_to(transport.matrix, (count, several.shape[1], terms, terms)), several
+        )
+    if colors == 1:
+        return (transport.matrix.reshape(-1, terms) @ light).reshape(count, terms, -1).transpose(1, 2, 0)
+    return jnp.einsum("vcoi,ic->ocv", transport.matrix, jnp.broadcast_to(light, (terms, colors)))
+
+
+@require.arguments(brdf=_brdf, eye=_eye)
+@jax.jit
+def view_coefficients(
+    brdf: HarmonicBrdf,
+    position: Float[Array, "v 3"],
+    frame: Float[Array, "v 3 3"],
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+) -> Float[Array, "lm c v"]:
+    """The BRDF's coefficients for every vertex's view, in its frame: the view side."""
+    return brdf.coefficients(directions.view(right_handed(frame), position, eye), *parameter)
+
+
+@jax.jit
+def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Float[Array, "lm c v"]:
+    """`view_coefficients` turned to the world, so that all vertices meet the same light: for a fixed view."""
+    return rotation.rotate_each(view, right_handed(frame).swapaxes(1, 2))
+
+
+@require.arguments(transport=_matrix)
+@jax.jit
+def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) -> Float[Array, "lm _ v"]:
+    """`view_coefficients` through the transfer, to the distant light in the world: for a fixed view with shadows.
+
+    Raises:
+        ValueError: The table and the transport differ in degree.
+    """
+    count, colors, terms, _ = transport.matrix.shape
+    _check_degree(view.shape[0], terms, "the BRDF", "the transport")
+    _colors(view.shape[1], colors)
+    rows = view.transpose(2, 1, 0)
+    if colors == 1:
+        # Color by color, each a product of one vector and one matrix per vertex.
+        part = [jnp.einsum("voi,vo->iv", transport.matrix[:, 0], rows[:, c]) for c in range(view.shape[1])]
+        return jnp.stack(part, 1)
+    return jnp.einsum("vcoi,vco->icv", transport.matrix, jnp.broadcast_to(rows, (count, colors, terms)))
+
+
+@require.arguments(light=_light_shape)
+@jax.jit
+def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Float[Array, "v _"]:
+    """Dot product of light and BRDF coefficients: radiance.
+
+    Args:
+        light: Coefficients of the light, one set or one for each vertex, in the frame that `view` is in.
+        view: Coefficients of the BRDF, or transfer vectors.
+
+    Raises:
+        ValueError: The two differ in degree, or in colors and neither is gray.
+
+    Reference: Kautz, Sloan, Snyder 2002, equation 1.
+    """
+    _check_degree(light.shape[0], view.shape[0], "the light", "the BRDF or transport")
+    colors = _colors(light.shape[1], view.shape[1])
+    part = [
+        sum(light[i, _color(c, light.shape[1])] * view[i, _color(c, view.shape[1])] for i in range(len(light)))
+        for c in range(colors)
+    ]
+    return jnp.stack(part, -1)
+
+
+def _colors(mine: int, other: int) -> int:
+    """Number of colors of a product."""
+    if mine != other and 1 not in (mine, other):
+        raise ValueError(f"both factors must have as many colors, or one, got {mine} and {other}")
+    return max(mine, other)
+
+
+def _color(number: int, colors: int) -> int:
+    """Index of a color in an axis that is gray or colored."""
+    return number if colors > 1 else 0
+
+
+def _check_degree(mine: int, other: int, name: str, other_name: str) -> None:
+    mine, other = harmonics.degree_of(mine), harmonics.degree_of(other)
+    if mine != other:
+        raise ValueError(f"{name} must have the degree of {other_name}, {other}, got {mine}")

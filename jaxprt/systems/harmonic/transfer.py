@@ -1,0 +1,246 @@
+"""Transport of the harmonic system: how an object shadows and lights itself, as linear maps of the light's SH.
+
+A transfer matrix takes coefficients of distant light in the world to those of the light that arrives at a vertex, in
+the vertex's own frame; with a BRDF's coefficients it gives radiance for any view. A transfer vector is what remains
+of it for an ideal diffuse surface of albedo 1.
+"""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jaxprt import visibility
+from jaxprt.files.arrays import Layout
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
+
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic": 1}
+
+
+class TransferMatrix(eqx.Module):
+    """Light that arrives at each vertex, as a linear map of the distant light.
+
+    Attributes:
+        matrix: To each coefficient of the arriving light in the local frame (third axis) from those of the light in
+            the world (last axis); gray, or one per color where colored surfaces light each other. Vertices come
+            first, so that a view's coefficients meet a matrix in one place.
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+    """
+
+    matrix: Float[Array, "v l lm lm"]
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the coefficients."""
+        return self.matrix.nbytes
+
+
+class TransferVector(eqx.Module):
+    """Radiance that leaves each vertex, were it ideally diffuse with albedo 1, as a linear map of the distant light.
+
+    Attributes:
+        vector: For each coefficient of the light in the world; gray, or one per color.
+        position: Vertex positions in world units.
+    """
+
+    vector: Float[Array, "lm l v"]
+    position: Float[Array, "v 3"]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the coefficients."""
+        return self.vector.nbytes
+
+
+def precompute(
+    mesh: Mesh,
+    *,
+    degree: int = 4,
+    size: int = 32,
+    occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> TransferMatrix:
+    """Precomputes transfer matrices with self-shadowing, for any BRDF.
+
+    Args:
+        mesh: The vertices to light.
+        degree: Highest degree of the harmonics.
+        size: Edge of the visibility's cubemap faces in texels.
+        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
+        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
+        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: Sizes out of range, positions or normals that are not finite, or a store made from something else.
+        BlockingIOError: The store is being written by another process.
+        RuntimeError: A worker of the executor died.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 5.
+    """
+    check(degree, size)
+    job = _MatrixJob.make(mesh, occluder, vertex, size, degree=degree)
+    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
+    position = visibility.rays.place(mesh, vertex)
+    return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
+
+
+def precompute_diffuse(
+    mesh: Mesh,
+    *,
+    degree: int = 4,
+    size: int = 32,
+    occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> TransferVector:
+    """Precomputes transfer vectors with self-shadowing, for ideal diffuse surfaces; options as of `precompute`."""
+    check(degree, size)
+    job = _VectorJob.make(mesh, occluder, vertex, size, degree=degree)
+    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
+    return TransferVector(jax.device_put(result["vector"]), visibility.rays.place(mesh, vertex))
+
+
+@partial(jax.jit, static_argnames="degree")
+def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "b lm lm"]:
+    """Transfer matrices of shadowed light: M_oi = ∫ V y_o (in the local frame) y_i (in the world).
+
+    Below the horizon, where no BRDF meets it, the light counts as dimmed by the mean visibility, and not as dark: an
+    edge there would only ring. So an open vertex has the rotation to its frame, and one that sees nothing zero.
+    Visibility is projected to twice the degree, which is all of it that products of two harmonics meet.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+        degree: Highest degree of the harmonics.
+
+    Raises:
+        ValueError: d is not 6 n n for a power of two n.
+
+    Reference: Kautz, Sloan, Snyder 2002, section 5.
+    """
+    flux = _flux(seen, frame)
+    share = seen.astype(frame.dtype) / visibility.LEVELS
+    mean = jnp.sum(share * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
+    visible = _project(jnp.where(flux > 0, share, mean), degree=2 * degree)
+    node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
+    basis = harmonics.evaluate(node, degree=degree)
+    value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ visible)
+    world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
+    return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
+
+
+@partial(jax.jit, static_argnames="degree")
+def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "lm b"]:
+    """Transfer vectors of shadowed light, t_i = 1/pi ∫ V y_i cos, with i in the world.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        degree: Highest degree of the harmonics.
+
+    Raises:
+        ValueError: d is not 6 n n for a power of two n.
+
+    Reference: Sloan, Kautz, Snyder 2002, section 4.
+    """
+    size = haar.face_edge(seen.shape[1])
+    cosine = _flux(seen, frame) / cubemap.solid_angle(size=size).reshape(-1)
+    return _project(seen.astype(frame.dtype) * (cosine / (visibility.LEVELS * np.pi)), degree=degree)
+
+
+@jax.jit
+def right_handed(frame: Float[Array, "v 3 3"]) -> Float[Array, "v 3 3"]:
+    """Frames with the bitangent that belongs to their tangent and normal: a proper rotation whatever it was.
+
+    Frames that the package makes are so already. Those made by hand may have mirrored bitangents, as texture
+    coordinates have, of which rotations of harmonics would make nonsense.
+    """
+    return jnp.stack([frame[:, 0], jnp.cross(frame[:, 2], frame[:, 0]), frame[:, 2]], 1)
+
+
+def _flux(seen: Array, frame: Array) -> Float[Array, "b d"]:
+    """Integral of the cosine over each texel; zero below the horizon."""
+    area = cubemap.vector_area(size=haar.face_edge(seen.shape[1])).reshape(-1, 3)
+    return jnp.maximum(directions.to_local(frame, area)[..., 2], 0)
+
+
+def _project(value: Float[Array, "b d"], *, degree: int) -> Float[Array, "lm b"]:
+    size = haar.face_edge(value.shape[1])
+    return harmonics.project(value.T.reshape(6, size, size, -1), degree=degree)
+
+
+@lru_cache(maxsize=4)
+def _rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature on the sphere, exact for harmonics up to a degree."""
+    height, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    angle = 2 * np.pi * np.arange(degree + 1) / (degree + 1)
+    radius = np.sqrt(1 - height**2)[:, None]
+    node = np.stack([radius * np.cos(angle), radius * np.sin(angle), height[:, None] + 0 * angle], -1)
+    return node.reshape(-1, 3), np.repeat(weight * 2 * np.pi / (degree + 1), degree + 1)
+
+
+@dataclass(frozen=True)
+class _MatrixJob(visibility.rays.VisibilityJob):
+    """Blocks of shadowed transfer matrices; see `blocks.Job`."""
+
+    degree: int
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return self.made_by("harmonic", ALGORITHM, degree=self.degree)
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        terms = (self.degree + 1) ** 2
+        return {"matrix": Layout((visibility.rays.BLOCK, 1, terms, terms), 0, "float32")}
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        seen, count = self.seen(block)
+        matrix = transfer(seen, self.frame[self.part(block)], degree=self.degree)
+        return {"matrix": np.asarray(matrix)[:, None]}, count.rays
+
+
+@dataclass(frozen=True)
+class _VectorJob(visibility.rays.VisibilityJob):
+    """Blocks of shadowed transfer vectors; see `blocks.Job`."""
+
+    degree: int
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return self.made_by("harmonic diffuse", ALGORITHM, degree=self.degree)
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        return {"vector": Layout(((self.degree + 1) ** 2, 1, visibility.rays.BLOCK), 2, "float32")}
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        seen, count = self.seen(block)
+        vector = transfer_diffuse(seen, self.frame[self.part(block)], degree=self.degree)
+        return {"vector": np.asarray(vector)[:, None]}, count.rays
+
+
+def check(degree: int, size: int) -> None:
+    """Refuses degrees and sizes that are out of range."""
+    if not 0 <= degree <= 25 or size < 1 or size & (size - 1):
+        raise ValueError(f"degree must be 0 to 25 and size a power of two, got {degree} and {size}")

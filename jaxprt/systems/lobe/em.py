@@ -1,0 +1,157 @@
+"""The steps by which lobes are fitted to a BRDF at all nodes of a table at once; see `jaxprt.lobe.tabulate`."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.decompose import mixture
+from jaxprt.sphere import directions, hemisphere
+
+RINGS, SECTORS = 64, 96  # of the quadrature that EM's samples are
+FINEST = 2e5  # concentration: a width of an eighth of a degree
+_WIDEST = 2.0  # times the concentration of one lobe for all: what a lobe must have, or light and shadow decorrelate
+_SHARP = 50.0  # concentration from where a lobe is as good as flat
+_CORE = 0.6  # share of the mass nearest to the mirror direction by which lobes are laid out
+_BATCH = 8  # views fitted at once
+_LOWEST = 0.02  # least height at which a lobe starts
+_GRAZING = 1e-3
+_TINY = 1e-12
+
+
+@jax.jit
+def samples(
+    brdf: Callable, wo: Float[Array, "v 3"]
+) -> tuple[Float[Array, "v s 3"], Float[Array, "v s c"], Float[Array, "v s 1"], Float[Array, "v s"]]:
+    """For each view directions, the mass of f cos that each has, the logarithm of cos / pi, and their extents."""
+
+    def one(view):
+        wi, area = hemisphere.arcs(mirror(view), rings=RINGS, sectors=SECTORS)
+        value = brdf(wi, jnp.broadcast_to(view, wi.shape))
+        if jnp.ndim(value) != 2 or len(value) != len(wi):
+            raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
+        cosine = jnp.maximum(wi[:, 2], jnp.finfo(wi.dtype).tiny)
+        # A disk of solid angle a is a / (4 pi) off its center in the mean of 1 - cos.
+        return wi, value * (cosine * area)[:, None], jnp.log(cosine / np.pi)[:, None], area / (4 * np.pi)
+
+    return jax.lax.map(one, wo, batch_size=_BATCH)
+
+
+@partial(jax.jit, static_argnames=("lobes",))
+def start(
+    wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
+) -> tuple[mixture.Mixture, Float[Array, " v"]]:
+    """Lobes on a spiral over half vectors, as dense as the BRDF's core is; and the least concentration of each view."""
+    away = 1 - jnp.einsum("vsi,vi->vs", sample, mirror(wo))
+    order = jnp.argsort(away, 1)
+    portion = jnp.cumsum(jnp.take_along_axis(mass, order, 1), 1)
+    last = jnp.argmax(portion >= _CORE * portion[:, -1:], 1)[:, None]
+    reach = jnp.take_along_axis(jnp.take_along_axis(away, order, 1), last, 1)
+    near = mass * (away <= reach)
+    total = jnp.sum(near, 1)
+    near = near / jnp.where(total > 0, total, 1)[:, None]
+    slope = _slope(sample + wo[:, None])
+    # The core holds about half of the variance. A BRDF without mass has neither.
+    square = 2 * jnp.einsum("vs,vsi,vsj->vij", near, slope, slope) + 1e-8 * jnp.eye(2, dtype=wo.dtype)
+    number = jnp.arange(lobes, dtype=wo.dtype)
+    radius, turn = 0.9 * jnp.sqrt(-2 * jnp.log1p(-(number + 0.5) / lobes)), np.pi * (3 - 5**0.5) * number
+    tilt = jnp.einsum("vij,jl->vli", jnp.linalg.cholesky(square), radius * jnp.stack([jnp.cos(turn), jnp.sin(turn)]))
+    drop = 2 * jnp.sum(near * away, 1)
+    least = jnp.clip(_WIDEST * mixture.concentration_of(jnp.clip(drop, 1e-7, 0.8)), 1, FINEST / 2)
+    mean = _reflected(wo, tilt, _LOWEST)
+    concentration = jnp.broadcast_to(1.5 * least[:, None], mean.shape[:2])
+    weight = jnp.broadcast_to(portion[:, -1:] / lobes, mean.shape[:2])
+    return mixture.Mixture(weight, mean, concentration), least
+
+
+@partial(jax.jit, static_argnames=("steps",))
+def improve(
+    sample: Float[Array, "v s 3"],
+    mass: Float[Array, "v s"],
+    extent: Float[Array, "v s"],
+    lobe: mixture.Mixture,
+    least: Float[Array, " v"],
+    fixed: Float[Array, "v s k"],
+    weight: Float[Array, "v k"],
+    *,
+    steps: int,
+) -> tuple[mixture.Mixture, Float[Array, "v k"]]:
+    """Some steps of EM for each view; arguments as of `jaxprt.decompose.mixture.fit`, with a leading axis of views."""
+
+    def one(argument):
+        sample, mass, extent, lobe, least, fixed, weight = argument
+        fit = mixture.fit(
+            sample, mass, lobe, extent=extent, fixed=fixed, weight=weight, least=least, most=FINEST, steps=steps
+        )
+        return fit.lobe, fit.fixed
+
+    return jax.lax.map(one, (sample, mass, extent, lobe, least, fixed, weight), batch_size=_BATCH)
+
+
+@partial(jax.jit, static_argnames=("nodes",))
+def blend(
+    wo: Float[Array, "v 3"], lobe: mixture.Mixture, share: Float[Array, ""], *, nodes: tuple[int, ...]
+) -> mixture.Mixture:
+    """Draws the lobes of each node to those of its neighbors: slopes of half vectors, logarithms, parts of the weight.
+
+    A neighbor counts by its lobe's weight, since lobes without weight may be anywhere.
+    """
+    total = jnp.sum(lobe.weight, 1, keepdims=True)
+    part = (lobe.weight / jnp.where(total > 0, total, 1))[..., None]
+    every = jnp.concatenate([_slope(lobe.mean + wo[:, None]), jnp.log(lobe.concentration)[..., None], part], -1)
+    sure = part + 1e-4
+    count, every, sure = lobe.weight.shape[1], every.reshape(*nodes, -1, 4), sure.reshape(*nodes, -1, 1)
+    for axis in range(len(nodes)):
+        rim = [(1, 1) if i == axis else (0, 0) for i in range(every.ndim)]
+        e, s = jnp.pad(every * sure, rim, mode="edge"), jnp.pad(sure, rim, mode="edge")
+        low, own, high = ([jax.lax.slice_in_dim(x, k, k + nodes[axis], axis=axis) for x in (e, s)] for k in range(3))
+        top, sure = ((1 - share) * b + share / 2 * (a + c) for a, b, c in zip(low, own, high, strict=True))
+        every = top / sure
+    every = every.reshape(-1, count, 4)
+    mean = _reflected(wo, every[..., :2], 0.0)
+    return mixture.Mixture(every[..., 3] * total, mean, jnp.exp(every[..., 2]))
+
+
+@jax.jit
+def weigh(
+    sample: Float[Array, "v s 3"],
+    mass: Float[Array, "v s c"],
+    extent: Float[Array, "v s"],
+    lobe: mixture.Mixture,
+    fixed: Float[Array, "v s k"],
+    weight: Float[Array, "v k"],
+) -> Float[Array, "c m v"]:
+    """Weights of all components, the diffuse one last, for each color; the energy above the horizon is the BRDF's."""
+
+    def one(argument):
+        sample, mass, extent, lobe, fixed, weight = argument
+        density = mixture.log_density(sample, lobe.mean, lobe.concentration)
+        # Part of each lobe above the horizon: the plane cuts a sharp one like a normal distribution.
+        wide = jnp.minimum(jnp.sum(jnp.exp(density) * 4 * np.pi * extent[:, None], 0), 1)
+        sharp = jax.scipy.special.ndtr(lobe.mean[:, 2] * jnp.sqrt(lobe.concentration))
+        above = jnp.append(jnp.where(lobe.concentration < _SHARP, wide, sharp), 1)
+        start = jnp.concatenate([lobe.weight, weight])
+        start, density = start + 1e-3 * jnp.mean(start), jnp.concatenate([density, fixed], 1)
+        found = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=30)[0], in_axes=1)(mass)
+        return found * (jnp.sum(found, 1) / jnp.maximum(found @ above, _TINY))[:, None]
+
+    return jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, lobe, fixed, weight)), 0, -1)
+
+
+def mirror(wo: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    """The mirror images of directions about the normal."""
+    return wo * jnp.array([-1, -1, 1], wo.dtype)
+
+
+def _slope(half: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
+    return half[..., :2] / jnp.maximum(half[..., 2:], _GRAZING)
+
+
+def _reflected(wo: Float[Array, "v 3"], slope: Float[Array, "v l 2"], lowest: float) -> Float[Array, "v l 3"]:
+    """Directions whose half vectors with wo have given slopes, at least so high."""
+    normal = directions.normalize(jnp.concatenate([slope, jnp.ones_like(slope[..., :1])], -1))
+    mean = 2 * jnp.sum(wo[:, None] * normal, -1, keepdims=True) * normal - wo[:, None]
+    return directions.normalize(mean.at[..., 2].set(jnp.maximum(mean[..., 2], lowest)))

@@ -1,0 +1,295 @@
+"""What a vertex sees of the sphere at all scales, in six kilobytes: visibility for lobes of any direction and width.
+
+Visibility of cubemap texels in one bit, and means over ever larger texels in bytes. What is seen of a lobe is read at
+the scale of its width, in a few places, whatever BRDF it comes from.
+"""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxprt import visibility
+from jaxprt.compile import apart
+from jaxprt.files.arrays import Layout
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, haar
+from jaxprt.systems import harmonic
+from jaxprt.visibility import DirectTransport
+
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
+DEGREE = 6  # of the harmonics that the diffuse part is lit by
+_BITS = 2  # finest scales, which are read from bits
+_BLOCK = 1024
+
+
+class LobeTransport(eqx.Module):
+    """Visibility pyramids, and transfer vectors for the diffuse part of BRDFs.
+
+    Attributes:
+        level: For each vertex the bits of all texels, four neighbors in each half of a byte, then the means at a
+            quarter of the resolution and below, each face with a rim of its neighbors' texels.
+        vector: SH coefficients of visibility times cosine over pi.
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+        size: Edge of the cubemap's faces in texels.
+    """
+
+    level: UInt8[Array, "v n"]
+    vector: Float[Array, "lm v"]
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    size: int = eqx.field(static=True)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of pyramids and vectors."""
+        return self.level.nbytes + self.vector.nbytes
+
+    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
+        """Whether each vertex sees some texels, 1 or 0: whether it sees at least half of each."""
+        byte, bit = _bit(*_split(texel, self.size), self.size)
+        value = self.level.at[:, byte].get(mode="promise_in_bounds")
+        return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
+
+    def share(
+        self, face: Int[Array, "l v"], s: Float[Array, "l v"], t: Float[Array, "l v"], spread: Float[Array, "l v"]
+    ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
+        """What each vertex sees of its lobes: the mean visibility over each, its horizon included, and the slopes.
+
+        Bilinear in the two scales next to the lobe's, linear in the spread between them.
+
+        Args:
+            face: Face of the cube that each lobe's direction meets.
+            s: First coordinate on it, from `jaxprt.sphere.cubemap.project`.
+            t: Second coordinate.
+            spread: Mean of 1 - cos of the angle to the lobe's direction, as from `jaxprt.decompose.mixture.drop`.
+
+        Returns:
+            Shares from 0 to 1, and their derivatives by s and t.
+        """
+        # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
+        address, bit = _addresses(face, s, t, spread, size=self.size)
+        read = _by_tap(_bytes(self.level, _by_vertex(address)))
+        return _decoded(read, bit, s, t, spread, size=self.size)
+
+
+@partial(apart, static=("size",))
+def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
+    """Bytes of the eight texels that a lobe is read from, and for the scales in bits the place in the byte."""
+    scale = scales(size)
+    number, _ = between(scale, spread)
+    address, bit = [], []
+    for step in (0, 1):
+        edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
+        row, column, weights = corners(edge, s, t)
+        in_bits, twice = number + step < _BITS, jnp.where(number + step == 0, 1, 2)
+        for (down, right), _ in weights:
+            first, second = (jnp.clip(x - 1, 0, edge - 1) * twice for x in (row + down, column + right))
+            byte, place = _bit(face, first, second, size)
+            plain = start + (face * (edge + 2) + row + down) * (edge + 2) + column + right
+            address.append(jnp.where(in_bits, byte, plain))
+            bit.append(place)
+    return tuple(address), tuple(bit)
+
+
+@apart
+def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
+    """All that a vertex reads side by side: what lies in memory together is then read together."""
+    return jnp.stack(address).reshape(-1, address[0].shape[1]).T
+
+
+@apart
+def _bytes(level: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
+    return jnp.take_along_axis(level, address, 1, mode="promise_in_bounds")
+
+
+@apart
+def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
+    return tuple(read.T.reshape(8, -1, len(read)))
+
+
+@partial(apart, static=("size",))
+def _decoded(read: tuple, bit: tuple, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, Array]:
+    """Value and slopes, from the eight bytes."""
+    scale = scales(size)
+    number, upper = between(scale, spread)
+    result = [jnp.zeros_like(spread)] * 3
+    count = 0
+    for step, part in ((0, 1 - upper), (1, upper)):
+        _, _, weights = corners(jnp.asarray(scale.edge)[number + step], s, t)
+        for _, each in weights:
+            value = read[count].astype(jnp.int32)
+            four = value >> (bit[count] & 4)
+            four = (four & 1) + (four >> 1 & 1) + (four >> 2 & 1) + (four >> 3 & 1)
+            coarse = jnp.where(number + step < _BITS, four / 4, value / 255)
+            seen = jnp.where(number + step == 0, value >> bit[count] & 1, coarse).astype(spread.dtype)
+            result = [total + seen * (weight * part) for total, weight in zip(result, each, strict=True)]
+            count += 1
+    return result[0], result[1], result[2]
+
+
+class Scales(NamedTuple):
+    """Scales of a pyramid: edge of each one's faces, its spread (mean of 1 - cos), where it starts, and all texels."""
+
+    edge: np.ndarray
+    spread: np.ndarray
+    start: np.ndarray
+    total: int
+
+
+def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
+    """The scale below each spread, and the share of the one above."""
+    known = jnp.asarray(scale.spread, spread.dtype)
+    number = jnp.sum(spread[..., None] >= known[1:-1], -1)
+    low, high = known[number], known[number + 1]
+    return number, jnp.clip((spread - low) / (high - low), 0, 1)
+
+
+def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:
+    """Row and column of the first of the four texels about a place, rim counted, and weights and slopes of all four."""
+    half = edge.astype(s.dtype) / 2
+    column, row = (jax.lax.stop_gradient(jnp.clip(jnp.floor((x + 1) * half + 0.5), 0, edge)) for x in (s, t))
+    right, down = (s + 1) * half + 0.5 - column, (t + 1) * half + 0.5 - row
+    weights = [
+        ((i, j), (v * u, v * (half if j else -half), (half if i else -half) * u))
+        for i, v in ((0, 1 - down), (1, down))
+        for j, u in ((0, 1 - right), (1, right))
+    ]
+    return row.astype(jnp.int32), column.astype(jnp.int32), weights
+
+
+@lru_cache(maxsize=8)
+def scales(size: int) -> Scales:
+    """Scales of visibility pyramids: from single texels to whole faces."""
+    if size < 8 or size & (size - 1):
+        raise ValueError(f"size must be a power of two, at least 8, got {size}")
+    edge = np.array([size >> k for k in range(size.bit_length())], np.int32)
+    # A texel's box and the bilinear tent have a variance of a quarter of its solid angle along either axis.
+    spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 4
+    count = 6 * (edge[_BITS:] + 2) ** 2
+    start = np.concatenate([[0] * _BITS, 6 * size * size // 8 + np.cumsum(count) - count])
+    return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()))
+
+
+def precompute(
+    mesh: Mesh,
+    *,
+    size: int = 64,
+    occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> LobeTransport:
+    """Traces what each vertex sees, for any BRDF; six kilobytes a vertex at 6 x 64 x 64.
+
+    Args:
+        mesh: The vertices to light.
+        size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
+        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
+        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
+        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The transport.
+
+    Raises:
+        ValueError: A size out of range, positions or normals that are not finite, no such vertices, or a store at
+            `path` made from something else.
+        BlockingIOError: The store is being written by another process.
+        RuntimeError: A worker of the executor died.
+    """
+    scales(size)
+    job = _Job.make(mesh, occluder, vertex, size)
+    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
+    position = visibility.rays.place(mesh, vertex)
+    level, vector = jax.device_put(result["level"]), jax.device_put(result["vector"])
+    return LobeTransport(level, vector, position, jax.device_put(job.frame), size)
+
+
+def compress(direct: DirectTransport) -> LobeTransport:
+    """The same from visibility that is known, without rays.
+
+    Raises:
+        ValueError: Faces of less than 8 texels.
+    """
+    scales(direct.size)
+    frame = np.asarray(direct.frame)
+    level, vector = [], []
+    for first in range(0, len(frame), _BLOCK):
+        part = np.arange(first, min(first + _BLOCK, len(frame)))
+        seen = jax.device_put(direct.seen(part))
+        level.append(np.asarray(pyramid(seen)))
+        vector.append(np.asarray(harmonic.transfer.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
+    level, vector = jax.device_put(np.concatenate(level)), jax.device_put(np.concatenate(vector, 1))
+    return LobeTransport(level, vector, direct.position, direct.frame, direct.size)
+
+
+@jax.jit
+def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
+    """Bits and means of visibility, as `LobeTransport` has them.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+
+    Raises:
+        ValueError: d is not 6 n n for a power of two n of at least 8.
+    """
+    size = haar.face_edge(seen.shape[1])
+    scale, count = scales(size), len(seen)
+    clear = (seen >= visibility.LEVELS // 2).reshape(count, 6, size // 2, 2, size // 4, 2, 2)
+    place = jnp.asarray([[[0, 1], [4, 5]], [[2, 3], [6, 7]]], jnp.uint8)  # row, half of the byte, column
+    bits = jnp.sum(clear.astype(jnp.uint8) << place[:, None], (3, 5, 6), dtype=jnp.uint8)
+    parts = [bits.reshape(count, -1)]
+    area = cubemap.solid_angle(size=size)
+    value = seen.reshape(count, 6, size, size).astype(area.dtype) * (area / visibility.LEVELS)
+    for edge in scale.edge.tolist()[_BITS:]:
+        fold = size // edge
+        mean, whole = (jnp.sum(x.reshape(-1, 6, edge, fold, edge, fold), (3, 5)) for x in (value, area[None]))
+        faces = jnp.moveaxis(cubemap.pad(jnp.moveaxis(mean / whole, 0, -1)), -1, 0)
+        parts.append(jnp.round(255 * faces.reshape(count, -1)).astype(jnp.uint8))
+    return jnp.concatenate(parts, 1)
+
+
+def _bit(face: Array, row: Array, column: Array, size: int) -> tuple[Array, Array]:
+    """Byte and bit of a texel: two by two texels to each half of a byte."""
+    byte = (face * (size // 2) + row // 2) * (size // 4) + column // 4
+    return byte, (column // 2 % 2) * 4 + row % 2 * 2 + column % 2
+
+
+def _split(texel: Array, size: int) -> tuple[Array, Array, Array]:
+    """Face, row and column of texels by their numbers."""
+    return texel // (size * size), texel // size % size, texel % size
+
+
+@dataclass(frozen=True)
+class _Job(visibility.rays.VisibilityJob):
+    """Blocks of pyramids; see `blocks.Job`."""
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return self.made_by("lobe", ALGORITHM, degree=DEGREE)
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        return {
+            "level": Layout((visibility.rays.BLOCK, scales(self.size).total), 0, "uint8"),
+            "vector": Layout(((DEGREE + 1) ** 2, visibility.rays.BLOCK), 1, "float32"),
+        }
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        seen, count = self.seen(block)
+        vector = harmonic.transfer.transfer_diffuse(seen, self.frame[self.part(block)], degree=DEGREE)
+        return {"level": np.asarray(pyramid(seen)), "vector": np.asarray(vector)}, count.rays

@@ -1,0 +1,364 @@
+"""A BRDF times cosine as a few lobes on the sphere, tabulated over the view direction.
+
+    f(wi, wo) max(0, wi_z) ~ d(wo) wi_z / pi + sum_l w_l(wo) p(wi; m_l(wo), k_l(wo))
+
+with von Mises-Fisher densities p whose means, concentrations and weights are free, fitted by EM, and a diffuse part
+beside them. Six to sixteen lobes do what takes separable BRDFs sixty-four terms. The published form, Gaussians of four
+fixed widths around the mirror direction, is `jaxprt.lobe.published.mirror_lobes`.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import grid
+from jaxprt.decompose import mixture
+from jaxprt.sphere import harmonics, hemisphere
+from jaxprt.systems.lobe import em
+
+_STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
+# How many times these, and the share that neighbors in the table have in a lobe after them.
+_ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0))
+_DEGREE = 24  # of the natural light by which a table is judged
+_COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
+_GRAZING = 1e-3
+_TINY = 1e-12
+
+
+class Lobes(eqx.Module):
+    """Lobes of some views, in the local frame of each.
+
+    Attributes:
+        mean: Unit directions.
+        concentration: Of each lobe.
+        weight: Integral of each lobe over the sphere, gray or per color.
+        diffuse: Albedo of the diffuse part.
+    """
+
+    mean: Float[Array, "3 l v"]
+    concentration: Float[Array, "l v"]
+    weight: Float[Array, "c l v"]
+    diffuse: Float[Array, "c v"]
+
+    def evaluate(self, wi: Float[Array, "d 3"]) -> Float[Array, "c d"]:
+        """The BRDF times the cosine of wi in 1/sr; zero below the horizon. Of one view, or of one for each wi."""
+        away = sum((wi[:, i] - self.mean[i]) ** 2 for i in range(3)) / 2
+        density = jnp.exp(mixture.log_peak(self.concentration) - self.concentration * away)
+        value = jnp.sum(self.weight * density, 1) + self.diffuse * wi[:, 2] / np.pi
+        return jnp.where(wi[:, 2] > 0, value, 0)
+
+
+class LobeBrdf(eqx.Module):
+    """A table of lobes. The last axis, or the last two, are nodes of the view; axes before follow the parameters.
+
+    Attributes:
+        mean: Directions of the lobes. An isotropic table is over tan(theta / 2) alone, from the normal to the horizon,
+            and its x axis is the horizontal part of the view direction; others are parabolic maps.
+        scale: Logarithm of the concentration.
+        weight: Integral of each lobe over the sphere, gray or per color.
+        diffuse: Albedo of the diffuse part.
+        knot: Increasing values of each parameter at which the table was made.
+        error: Relative L2 error of the radiance without shadows under light of natural spectrum, over some views
+            between the nodes.
+    """
+
+    holds_cosine: ClassVar = True  # Values are the BRDF times the cosine.
+
+    mean: Float[Array, "3 l *q"]
+    scale: Float[Array, "l *q"]
+    weight: Float[Array, "c l *q"]
+    diffuse: Float[Array, "c *q"]
+    knot: tuple[Float[Array, " _"], ...]
+    error: Float[Array, ""]
+
+    @property
+    def lobes(self) -> int:
+        """Number of lobes."""
+        return self.scale.shape[0]
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether the table is over the view angle alone."""
+        return self.scale.ndim - len(self.knot) == 2
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the table."""
+        return sum(each.nbytes for each in (self.mean, self.scale, self.weight, self.diffuse))
+
+    def at(self, *parameter: Float[Array, ""]) -> "LobeBrdf":
+        """The table for given parameters, which then have no axes; values outside the knots count as the nearest knot.
+
+        Differentiable in the parameters; between knots as `mean` has it.
+
+        Raises:
+            ValueError: The number of parameters is not that of the table.
+        """
+        if len(parameter) != len(self.knot):
+            raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
+        result = self
+        for knot, value in zip(self.knot, parameter, strict=True):
+            low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
+            result = mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
+        return result
+
+    def lookup(self, wo: Float[Array, "v 3"]) -> Lobes:
+        """Lobes for some views, interpolated between the nodes; without weight where the view is below the horizon.
+
+        Raises:
+            ValueError: The table has parameters: choose them first, by `at`.
+        """
+        if self.knot:
+            raise ValueError(f"the table has {len(self.knot)} parameters, which `at` must choose first")
+        resolution = self.scale.shape[-1]
+        square = wo[:, 0] ** 2 + wo[:, 1] ** 2
+        pole = square < _TINY
+        level = jnp.sqrt(jnp.where(pole, _TINY, square))
+        if self.isotropic:
+            axis = [grid.neighbors(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), size=resolution)]
+        else:
+            spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
+            axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
+        nodes = self.scale.shape[1:]
+        rows = [each.reshape(-1, *nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
+        value = grid.read(jnp.concatenate(rows), axis)
+        mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
+        x, y, z = mean.reshape(3, self.lobes, len(wo))
+        if self.isotropic:
+            cosine, sine = jnp.where(pole, 1, wo[:, 0] / level), jnp.where(pole, 0, wo[:, 1] / level)
+            x, y = cosine * x - sine * y, sine * x + cosine * y
+        length = jnp.sqrt(jnp.maximum(x**2 + y**2 + z**2, _TINY))
+        up = jnp.where(wo[:, 2] > 0, jnp.ones_like(level), 0)
+        strength = strength.reshape(len(self.weight), self.lobes, len(wo))
+        return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF times the cosine of wi in 1/sr, as far as the lobes carry it; zero below the horizon."""
+        batch = wo.shape[:-1]
+        value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
+        return value.T.reshape(*batch, len(self.weight))
+
+
+@jax.jit
+def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
+    """Lobes between those along the first parameter of a table, which then has no axis.
+
+        w = sum_h s_h w_h,    (m, log k) = sum_h s_h w_h (m_h, log k_h) / w
+
+    with shares s that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
+
+    Raises:
+        ValueError: The shares are not one for each BRDF along the parameter.
+    """
+    if share.shape != table.scale.shape[1:2]:
+        raise ValueError(f"shares must be one for each of {table.scale.shape[1]} BRDFs, got {list(share.shape)}")
+    share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
+    part = jnp.maximum(share * jnp.sum(table.weight, 0), 0) + _TINY
+    part = part / jnp.sum(part, 1, keepdims=True)
+    place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
+    scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)
+    return LobeBrdf(place, scale, weight, diffuse, table.knot[1:], table.error)
+
+
+class Remainder(eqx.Module):
+    """What the lobes leave of a BRDF, itself a BRDF of either sign, for low-rank terms.
+
+    Attributes:
+        brdf: The BRDF.
+        lobe: Its lobes; the diffuse part counts as one of them.
+    """
+
+    brdf: Callable
+    lobe: LobeBrdf
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value in 1/sr: the BRDF less the lobes over the cosine, which counts as at least 0.001."""
+        return self.brdf(wi, wo) - self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
+
+
+def tabulate(
+    brdf: Callable,
+    *,
+    lobes: int | None = None,
+    error: float | None = None,
+    resolution: int = 32,
+    knot: Sequence[np.ndarray] = (),
+) -> LobeBrdf:
+    """Fits lobes to a BRDF times cosine for all views.
+
+    Lobes are fitted at each node of the view to samples on arcs around the mirror direction. All nodes start alike, in
+    terms of half vectors, and are drawn to their neighbors between the rounds, so that a lobe stays the same one from
+    node to node and can be interpolated. No lobe is wider than about 0.7 of what a single one would be: with wider ones
+    more lobes would bring nothing where light and visibility vary. The energy of each node's
+    view is kept; the last node of an isotropic table is half a degree above the horizon and read as if on it.
+
+    Args:
+        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the
+            parameters that makes one.
+        lobes: Number of lobes; or
+        error: the error of the table, see `LobeBrdf`, that the lobes must reach.
+        resolution: Nodes of the view angle. Anisotropic BRDFs have maps of half that on either edge.
+        knot: For a BRDF that varies, the increasing values of each of its one or two parameters. Of those that widths
+            are powers of, as roughness and exponents are, take the logarithm: it is what widths are interpolated by.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: Neither or both of lobes and error, an option out of range, knots that do not increase, an error
+            that 32 lobes do not reach, or a BRDF with values that are negative or not finite.
+
+    Reference: Sun et al. 2007, section 4.1, with free lobes instead of theirs.
+    """
+    if (lobes is None) == (error is None):
+        raise ValueError(f"give either lobes or error, got lobes={lobes} and error={error}")
+    if (lobes is not None and not lobes >= 1) or (error is not None and not error > 0) or resolution < 4:
+        raise ValueError(
+            f"tabulate needs at least one lobe or an error above 0, and a resolution of at least 4, "
+            f"got {lobes}, {error} and {resolution}"
+        )
+    knots = grid.checked(knot)
+    made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
+    isotropic = all(is_isotropic(each) for each in made)
+    points = itertools.product(*knots)
+    both = [_sampled(each, resolution, isotropic, point) for each, point in zip(made, points, strict=True)]
+    wo, samples = both[0][0], [each for _, each in both]
+    reached = np.inf
+    for count in _COUNTS if lobes is None else (lobes,):
+        tables = [_table(each, wo, lobes=count) for each in samples]
+        result = _stacked(tables, knots, wo.shape[:-1])
+        reached = max(
+            float(_natural_error(b, _stacked([t], (), wo.shape[:-1]))) for b, t in zip(made, tables, strict=True)
+        )
+        if error is None or reached <= error:
+            return eqx.tree_at(lambda x: x.error, result, jnp.asarray(reached, wo.dtype))
+    raise ValueError(f"error must be at least {reached:.3g}, which {_COUNTS[-1]} lobes reach; got {error}")
+
+
+def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
+    """Views at the nodes of a table, and what EM needs of a BRDF there; see `lobe_em.samples`.
+
+    Raises:
+        ValueError: The BRDF is negative or not finite, or has no axis for colors.
+    """
+    brdf = grid.as_argument(brdf)
+    return _sampled(brdf, resolution, is_isotropic(brdf), ())
+
+
+def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> tuple[Array, tuple[Array, ...]]:
+    wo = _nodes(resolution, isotropic)
+    result = em.samples(brdf, wo.reshape(-1, 3))
+    _check(result[0], result[1], wo.reshape(-1, 3), point)
+    return jax.device_put(wo), result
+
+
+def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
+    """One table of all parameters; gray ones serve as colored beside those with colors."""
+    size = tuple(map(len, knots))
+    colors = max(len(table[2]) for table in tables)
+
+    def stack(index: int, lead: int) -> Array:
+        every = [np.asarray(table[index]) for table in tables]
+        every = [np.broadcast_to(each, (colors, *each.shape[1:])) if index > 1 else each for each in every]
+        whole = np.stack(every, lead)
+        return jax.device_put(whole.reshape(*whole.shape[:lead], *size, *nodes))
+
+    dtype = tables[0][0].dtype
+    knot = tuple(jnp.asarray(each, dtype) for each in knots)
+    return LobeBrdf(stack(0, 2), stack(1, 1), stack(2, 2), stack(3, 1), knot, jnp.asarray(jnp.nan, dtype))
+
+
+def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
+    """Mean, logarithm of the concentration, weight and diffuse albedo of one BRDF on the nodes `wo` [*q 3]."""
+    nodes = wo.shape[:-1]
+    view, (sample, mass, fixed, extent) = np.asarray(wo).reshape(-1, 3), samples
+    gray, lobe, least, weight = _begin(view, sample, mass, lobes=lobes)
+    for times, share in _ROUNDS:
+        for _ in range(times):
+            lobe, weight = em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
+        if share:
+            lobe = em.blend(view, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
+    return _end(lobe, em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
+
+
+@partial(jax.jit, static_argnames=("lobes",))
+def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array, mixture.Mixture, Array, Array]:
+    """The mass of all colors, lobes and their least concentrations from which EM starts, and the diffuse part's."""
+    gray = jnp.sum(mass, -1)
+    lobe, least = em.start(wo, sample, gray, lobes=lobes)
+    return gray, lobe, least, jnp.sum(gray, 1, keepdims=True) / 2
+
+
+@partial(jax.jit, static_argnames=("nodes",))
+def _end(lobe: mixture.Mixture, weight: Array, *, nodes: tuple[int, ...]) -> tuple[Array, Array, Array, Array]:
+    """The parts of a table of one BRDF: lobes that EM has found, on the nodes of the view."""
+    mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
+    weight = weight.reshape(*weight.shape[:2], *nodes)
+    return mean, jnp.log(lobe.concentration).T.reshape(-1, *nodes), weight[:, :-1], weight[:, -1]
+
+
+def _nodes(resolution: int, isotropic: bool) -> Float[np.ndarray, "*q 3"]:
+    """View directions of the nodes; the last ones are drawn in from the horizon, where a BRDF has no value."""
+    if not isotropic:
+        return np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution // 2))
+    radius = np.minimum(np.linspace(0, 1, resolution), 1 - 0.25 / resolution)
+    wo = np.stack([2 * radius, 0 * radius, 1 - radius**2], -1) / (1 + radius**2)[:, None]
+    return wo.astype(jnp.result_type(float))
+
+
+def is_isotropic(brdf: Callable) -> bool:
+    """Whether turning both directions about the normal changes nothing, at a few hundred random pairs."""
+    height, angle, turn = np.split(np.random.default_rng(0).uniform(size=(5, 256)), [2, 4])
+    height, angle = 0.05 + 0.95 * height, 2 * np.pi * angle
+    angle = np.concatenate([angle, angle + 2 * np.pi * turn], 1)
+    radius, height = np.sqrt(1 - height**2), np.tile(height, 2)
+    wi, wo = np.stack([np.tile(radius, 2) * np.cos(angle), np.tile(radius, 2) * np.sin(angle), height], -1)
+    dtype = jnp.result_type(float)
+    value = np.split(np.asarray(_values(brdf, wi.astype(dtype), wo.astype(dtype))), 2)
+    with np.errstate(invalid="ignore", over="ignore"):  # Values that are not finite are refused elsewhere.
+        return bool(np.linalg.norm(value[0] - value[1]) <= 1e-2 * np.linalg.norm(value[0]))
+
+
+@eqx.filter_jit
+def _values(brdf: Callable, wi: Array, wo: Array) -> Array:
+    return brdf(wi, wo)
+
+
+@jax.jit
+def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
+    """Relative error of a table without parameters under light of natural spectrum."""
+    random = np.random.default_rng(1).uniform(size=(2, 24))
+    height, angle = 0.05 + 0.95 * random[0], 2 * np.pi * random[1]
+    radius = np.sqrt(1 - height**2)
+    wo = jnp.asarray(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1), table.scale.dtype)
+
+    def one(view):
+        wi, area = hemisphere.arcs(em.mirror(view), rings=em.RINGS, sectors=em.SECTORS)
+        view = jnp.broadcast_to(view, wi.shape)
+        exact = brdf(wi, view) * jnp.maximum(wi[:, 2:], 0)
+        both = jnp.concatenate([table(wi, view) - exact, exact + jnp.zeros_like(table(wi, view))], 1)
+        reflected = harmonics.evaluate(wi, degree=_DEGREE).T @ (both * area[:, None])
+        return harmonics.convolve(reflected, harmonics.natural(degree=_DEGREE)) ** 2
+
+    wrong, whole = jnp.split(jnp.sum(jax.lax.map(one, wo), (0, 1)), 2)
+    return jnp.sqrt(jnp.sum(wrong) / jnp.maximum(jnp.sum(whole), _TINY))
+
+
+def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
+    """Refuses values that are no BRDF's, and says where the first one is."""
+    value = np.asarray(mass)
+    wrong = np.argwhere(~(np.isfinite(value) & (value >= 0)))
+    if wrong.size:
+        view, sample, _ = wrong[0]
+        at = f" at parameters {tuple(map(float, point))}" if point else ""
+        raise ValueError(
+            f"the BRDF must be finite and not negative{at}, and is not for {len(wrong)} pairs of directions, first for "
+            f"wi = {np.asarray(direction)[view, sample]}, wo = {wo[view]}"
+        )

@@ -1,0 +1,213 @@
+"""Direct light integrated over every texel with the BRDF itself: slow, and the yardstick of every error here."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tqdm
+from jaxtyping import Array, Float, UInt8
+
+from jaxprt import require, visibility
+from jaxprt.brdf import grid
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, directions, haar
+from jaxprt.systems import adaptive
+
+_BLOCK = 64
+_MIRROR = np.array([-1, -1, 1], np.float32)
+_DARK = 1e-30
+
+
+def radiance(
+    mesh: Mesh,
+    brdf: Callable,
+    light: Environment,
+    *,
+    eye: Float[Array, "3"],
+    occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
+    error: float = 1e-3,
+    progress: bool = False,
+) -> Float[Array, "..."]:
+    """Radiance that vertices send to the eye: visibility traced, and BRDF and cosine integrated over every texel.
+
+    Args:
+        mesh: The vertices.
+        brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions, of which values below
+            the horizon do not count; a new function object, as a lambda in a loop, compiles anew.
+        light: The environment, or a batch of them along leading axes.
+        eye: Position of the viewer in world units.
+        occluder: What casts shadows; the mesh itself if None.
+        vertex: Numbers of the vertices asked for, or a mask; all if None.
+        error: Relative error that the integrals of BRDF times cosine may cause in the radiance of each vertex, mean
+            over colors. It is an estimate: a peak of the BRDF narrower than a texel is found around the mirror
+            direction only. The light counts as constant over each texel, and visibility as a share of it, in
+            sixteenths; this error leaves theirs out. With infinity each texel counts with the BRDF at its center.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
+
+    Raises:
+        TypeError: The light is no Environment, or the BRDF a table whose values hold the cosine.
+        ValueError: No such vertices, an error that is not positive, the BRDF's values have no axis for colors, or the
+            light or the eye is not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices.
+    """
+    if not error > 0:
+        raise ValueError(f"error must be positive, got {error}")
+    brdf = grid.as_argument(brdf)
+    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
+    require.finite("the light", light.radiance)
+    require.position("the eye", eye)
+    rays = visibility.Occluder(mesh if occluder is None else occluder)
+    start = visibility.start_points(mesh, rays)
+    vertex = visibility.rays.chosen(mesh, vertex)
+    normal = np.asarray(mesh.normal, np.float32)
+    position, upright, tangent = (np.asarray(each) for each in (mesh.position, mesh.normal, mesh.tangent))
+    size = light.radiance.shape[-2]
+    if not vertex.size:
+        return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
+    result = []
+    for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
+        part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
+        seen, _ = visibility.fractional(rays, start[part], normal[part], size=size)
+        frame = directions.frame(upright[part], tangent[part])
+        block = integrate(seen, position[part], frame, brdf, light, eye, error=error)
+        result.append(block[..., : len(vertex) - first, :])
+    return jnp.concatenate(result, -2)
+
+
+@jax.jit
+def integrate(
+    seen: UInt8[Array, "b d"],
+    position: Float[Array, "b 3"],
+    frame: Float[Array, "b 3 3"],
+    brdf: Callable,
+    light: Environment,
+    eye: Float[Array, "3"],
+    *,
+    error: float | Float[Array, ""] = 1e-3,
+) -> Float[Array, "..."]:
+    """Integral of light x BRDF x visibility x cosine over all texels.
+
+    Where the BRDF is smooth, a texel counts with the BRDF at its center and the exact integral of the cosine. Texels
+    where that errs too much are divided, as often as it takes. See `jaxprt.adaptive`.
+
+    Args:
+        seen: Visible share of each texel in sixteenths.
+        position: Positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+        brdf: A BRDF that is a pytree and callable, as the models are.
+        light: The environment, or a batch of them along leading axes.
+        eye: Position of the viewer.
+        error: As in `radiance`.
+
+    Returns:
+        Linear radiance [*l b c]; that of the grazing view where the eye is below a vertex's horizon.
+
+    Reference: Wang, Tran, Luebke 2004, equation 1.
+    """
+    batch, colors = light.radiance.shape[:-4], light.radiance.shape[-1]
+    table = light.radiance.reshape(-1, seen.shape[1], colors)
+    wo = directions.view(frame, position, eye)
+    whole = adaptive.Integrand(brdf, frame, wo, table)
+    smooth, choice, chosen = _centers(whole, seen, jnp.asarray(error, wo.dtype))
+    sharp = adaptive.integrate(whole, choice, chosen, colors=smooth.shape[-1])
+    return jnp.swapaxes(smooth + sharp, 0, 1).reshape(*batch, *smooth.shape[::2])
+
+
+def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Array, adaptive.Choice, Array]:
+    """Sums over texels that need not be divided; what cells are chosen by; and which of the first cells are."""
+    size = haar.face_edge(seen.shape[1])
+    direction, area = (_blocks(each(size=size)) for each in (cubemap.direction, cubemap.vector_area))
+    middle = jnp.mean(direction, 0)
+    light = jax.vmap(lambda each: _blocks(each.reshape(6, size, size, -1)), out_axes=1)(given.light)
+    level = jax.vmap(lambda each: _blocks(each.reshape(6, size, size)))(seen)
+    mean = jax.lax.stop_gradient(jnp.swapaxes(jnp.mean(light, -1), 0, 1))
+    light = jnp.moveaxis(light, -1, 1)
+
+    # Vertices come one after another, so that the arrays of each stay in the processor's cache. `brightest` and the
+    # sum over texels are loops for a reason: XLA computes a value again for each of its uses, except across loops.
+    def one(argument):
+        axes, wo, level = argument
+        value = adaptive.value(given.brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
+        value = value.reshape(*level.shape, -1)
+        flux = area @ axes[2]
+        clear = level.astype(flux.dtype) / visibility.LEVELS
+        peak = wo[2] * jnp.mean(adaptive.value(given.brdf, (wo * _MIRROR)[None], wo))
+        arriving = jnp.maximum(flux, 0) * clear
+        gray, lean, height, flat = jax.lax.stop_gradient((jnp.mean(value, -1), flux, peak, arriving))
+        weight = 1 / jnp.maximum(jnp.einsum("let,et->l", mean, gray * flat), _DARK)
+        away = jax.lax.stop_gradient(middle @ axes.T - wo * _MIRROR)
+        brightest = adaptive.brightest(mean, weight[:, None, None])
+        chosen = _vary(gray, lean, clear * brightest, away, height, error)
+
+        def add(total, texel):
+            light, value, arriving = texel
+            return total + _sums(light, value * (arriving * ~chosen)[:, None]), None
+
+        colors = max(value.shape[-1], light.shape[1])
+        total = jax.lax.scan(add, jnp.zeros((len(mean), colors), value.dtype), (light, value, arriving))[0]
+        return total, weight, height, chosen
+
+    total, weight, height, chosen = jax.lax.map(one, (given.frame, given.wo, level))
+    edge = size // adaptive.root(size)
+    return total, adaptive.Choice(seen, weight, height, error), chosen.reshape(-1, 6, edge, edge)
+
+
+def _sums(light: Array, value: Array) -> Array:
+    """Sums [l c] of light [c l t] times values [t c] over texels; either may be gray, with one color."""
+    # One product for each color: with colors innermost, the compiler's loops take seven times as long.
+    pairs = np.broadcast(np.arange(len(light)), np.arange(value.shape[-1]))
+    return jnp.stack([light[i] @ value[:, j] for i, j in pairs], -1)
+
+
+def _blocks(texel: Array) -> Array:
+    """Texels [6 n n *c] as [e t *c], by their place e in the first cell and the number t of that cell."""
+    edge = adaptive.root(texel.shape[1])
+    count = texel.shape[1] // edge
+    block = texel.reshape(6, count, edge, count, edge, *texel.shape[3:])
+    return jnp.moveaxis(block, (2, 4), (0, 1)).reshape(edge**2, -1, *texel.shape[3:])
+
+
+def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, error: Array) -> Array:
+    """Chooses the first cells in which the BRDF at texel centers is not exact enough.
+
+    The midpoint rule errs by f'' / 24 for one function f, and by another f' g' / 12 for a product f g. The horizon
+    adds at most an eighth of a texel's edge. The mirror direction shows a peak between the centers.
+
+    Args:
+        gray: BRDF at the centers of the texels [e t], in 1/sr, mean over colors. The first axis is the place of a
+            texel in its cell, the second the number of the cell.
+        lean: Integral of the cosine over each texel [e t], in sr; negative below the horizon.
+        scale: Visible light of each texel [e t] over the radiance of the vertex, the largest over lights.
+        away: Vector from the mirror direction to the middle of each cell [t 3].
+        height: BRDF times cosine in the mirror direction, in 1/sr.
+        error: Relative error that is allowed.
+
+    Returns:
+        Whether each cell [t] must be divided.
+    """
+    if len(gray) == 1:
+        return jnp.broadcast_to(error < jnp.inf, gray[0].shape)
+    side, edge = adaptive.SIDE, 2 / haar.face_edge(gray.size)
+    flux = jnp.maximum(lean, 0)
+    miss, size, top, hidden, cut = (jnp.zeros_like(gray[0]) for _ in range(5))
+    # Texels are written out one by one, so that XLA makes one loop over cells of all that follows.
+    for here in range(side**2):
+        much, sent = scale[here], gray[here] * flux[here]
+        for step, place in ((side, here // side), (1, here % side)):
+            if 0 < place < side - 1:
+                back, ahead = here - step, here + step
+                bend = jnp.abs(gray[back] - 2 * gray[here] + gray[ahead]) * flux[here] / 24
+                bend += jnp.abs((gray[ahead] - gray[back]) * (flux[ahead] - flux[back])) / 48
+                miss += 2 * bend * much  # for the two rows in the middle and the two outside
+        size += sent * much
+        top = jnp.maximum(top, gray[here])
+        hidden += jnp.abs(height * edge**2 - sent) * much
+        cut += jnp.where(jnp.abs(lean[here]) < edge**3 / 2, much, 0)
+    near = jnp.sum(away**2, -1) < ((2.5 + side / np.sqrt(2)) * edge) ** 2
+    miss += jnp.where(near, hidden / 8, 0) + edge**3 / 16 * top * cut
+    return miss > error * jnp.maximum(size, adaptive.SMALL)

@@ -1,0 +1,53 @@
+"""The separable system: BRDFs as sums of products, light and transport in Haar wavelets (Wang, Tran, Luebke 2004)."""
+
+from jaxprt.systems.separable import clustered, errors, factorization, published, quantized, relight, sparse, wavelets
+from jaxprt.systems.separable.clustered import ClusteredTransport
+from jaxprt.systems.separable.errors import light_errors, sample_error
+from jaxprt.systems.separable.factorization import SeparableBrdf, factor, join
+from jaxprt.systems.separable.quantized import QuantizedTransport
+from jaxprt.systems.separable.relight import (
+    Transport,
+    choose_by_area,
+    choose_by_magnitude,
+    choose_by_transport,
+    combine,
+    light_tuple,
+    modulate,
+    project,
+    quantize,
+    radiance,
+    view_tuple,
+)
+from jaxprt.systems.separable.sparse import SparseTransport
+from jaxprt.systems.separable.wavelets import precompute
+
+__all__ = [
+    "ClusteredTransport",
+    "QuantizedTransport",
+    "SeparableBrdf",
+    "SparseTransport",
+    "Transport",
+    "choose_by_area",
+    "choose_by_magnitude",
+    "choose_by_transport",
+    "clustered",
+    "combine",
+    "errors",
+    "factor",
+    "factorization",
+    "join",
+    "light_errors",
+    "light_tuple",
+    "modulate",
+    "precompute",
+    "project",
+    "published",
+    "quantize",
+    "quantized",
+    "radiance",
+    "relight",
+    "sample_error",
+    "sparse",
+    "view_tuple",
+    "wavelets",
+]

@@ -1,0 +1,393 @@
+"""Transport as clustered principal components: a few dense products per cluster of vertices instead of sparse sums.
+
+Vertices that lie and face alike have transport alike. In each cluster the matrices of its vertices, all terms
+together, are combinations of a few vectors, and these distinguish a few modes of the light. Only the modes meet the
+light. So the cost of a term falls from `keep` sparse coefficients a vertex to as many numbers as there are vectors,
+and thirty-two to a hundred terms become affordable.
+"""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
+
+from jaxprt import require, visibility
+from jaxprt.compile import linear
+from jaxprt.decompose import clustering, eigen
+from jaxprt.files.arrays import Layout, sketch
+from jaxprt.sphere import haar
+from jaxprt.systems.separable import wavelets
+from jaxprt.systems.separable.factorization import SeparableBrdf, marked
+from jaxprt.visibility import DirectTransport
+
+# Versions of what makes the results; a release that changes them raises one.
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}
+SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
+_SAMPLE = 24  # vertices of a cluster that choose its coefficients
+
+
+class ClusteredTransport(eqx.Module):
+    """Principal components of the transport of each cluster of vertices.
+
+    Weights are stored by row: vertices in the order of their clusters, the last vertex of a smaller cluster repeated.
+    Everything else, and what `apply` returns, is in the order of the vertices.
+
+    Attributes:
+        index: Numbers of the coefficients among the 6 n n that each cluster keeps, the most important first.
+        mode: Its l modes of the light on those coefficients, the leading first.
+        core: What each mode gives to each of n vectors and each term.
+        weight: What each vertex takes of each vector, the leading first.
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+        vertex: Vertex of each row.
+        place: Row of each vertex.
+        rms: Root mean square over rows and terms of each coefficient as kept.
+        mark: Some values of the light factors that it was made of, by which other BRDFs are refused; None if unknown.
+    """
+
+    index: UInt[Array, "p k"]
+    mode: Float16[Array, "p k l"]
+    core: Float16[Array, "p l n r"]
+    weight: Float[Array, "p m n"]
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    vertex: Int[Array, " q"]
+    place: Int[Array, " v"]
+    rms: Float[Array, " b"]
+    mark: Float[Array, "r z"] | None = None
+
+    @property
+    def terms(self) -> int:
+        """Number of BRDF terms r."""
+        return self.core.shape[3]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of modes, cores and weights."""
+        return self.index.nbytes + self.mode.nbytes + self.core.nbytes + self.weight.nbytes
+
+    def keep(
+        self,
+        count: int | None = None,
+        *,
+        modes: int | None = None,
+        vectors: int | None = None,
+        terms: int | None = None,
+    ) -> "ClusteredTransport":
+        """The first `count` coefficients, modes, vectors and terms (all of them if None)."""
+        most = (self.index.shape[1], *self.core.shape[1:])
+        asked = {"count": count, "modes": modes, "vectors": vectors, "terms": terms}
+        for (name, value), limit in zip(asked.items(), most, strict=True):
+            require.between(name, value, 1, limit)
+        index, mode = self.index[:, :count], self.mode[:, :count, :modes]
+        core, weight = self.core[:, :modes, :vectors, :terms], self.weight[:, :, :vectors]
+        rms = _rms(index, mode, core, weight, size=self.rms.shape[0])
+        same = (self.position, self.frame, self.vertex, self.place)
+        mark = None if self.mark is None else self.mark[:terms]
+        return ClusteredTransport(index, mode, core, weight, *same, rms, mark)
+
+    @jax.jit
+    def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
+        """Transport times light coefficients, per vertex: each cluster's modes meet the light once.
+
+        Args:
+            coefficient: Coefficients of the light.
+
+        Returns:
+            The light-modulated tuple of Wang et al., in the light's units.
+
+        Raises:
+            ValueError: The light has another number of coefficients than the transport was made for.
+        """
+        require.length("the light's coefficients", coefficient, self.rms.shape[0])
+        return linear(_relit, _transposed, self, coefficient)
+
+
+def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
+    """Writes each cluster's rows where its vertices are: a gather after the loop would double what is written."""
+    _, modes, vectors, terms = transport.core.shape
+    light = coefficient[transport.index.astype(jnp.int32)]
+    dtype = light.dtype
+    count, rows = len(transport.place), len(transport.vertex)
+    # Rows that no vertex is read from are written past the end, which is dropped.
+    at = jnp.where(_read(transport), transport.vertex, count + jnp.arange(rows)).reshape(len(light), -1)
+
+    def one(result, argument):
+        mode, core, weight, light, at = argument
+        met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
+        vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
+        found = weight.astype(dtype) @ vector.reshape(vectors, -1)
+        return result.at[at].set(found, mode="drop", unique_indices=True), None
+
+    start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
+    clusters = (transport.mode, transport.core, transport.weight, light, at)
+    return jax.lax.scan(one, start, clusters)[0].reshape(count, terms, -1)
+
+
+def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
+    """Cluster by cluster too: JAX's own would keep modes and cores of all of them in full precision."""
+    clusters, modes, vectors, terms = transport.core.shape
+    dtype = cotangent.dtype
+
+    def one(argument):
+        mode, core, weight, at, read = argument
+        vector = (weight.astype(dtype).T @ jnp.where(read, cotangent[at], 0)).reshape(vectors, terms, -1)
+        met = core.reshape(modes, vectors * terms).astype(dtype) @ vector.reshape(vectors * terms, -1)
+        return mode.astype(dtype) @ met
+
+    at = transport.vertex.reshape(clusters, -1)
+    read = _read(transport).reshape(*at.shape, 1)
+    cotangent = cotangent.reshape(len(cotangent), -1)
+    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, at, read))
+    start = jnp.zeros((len(transport.rms), found.shape[2]), dtype)
+    return start.at[transport.index.astype(jnp.int32)].add(found)
+
+
+def _read(transport: ClusteredTransport) -> Array:
+    """Rows that a vertex is read from: one of those that stand for the same vertex."""
+    return transport.place[transport.vertex] == jnp.arange(len(transport.vertex))
+
+
+def precompute(
+    direct: DirectTransport,
+    brdf: SeparableBrdf,
+    *,
+    clusters: int = 160,
+    member: Int[np.ndarray, "p m"] | None = None,
+    vectors: int = 16,
+    modes: int = 128,
+    keep: int = 1024,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> ClusteredTransport:
+    """Compresses the transport of a mesh, cluster by cluster; no more than a cluster is ever held uncompressed.
+
+    Vertices are clustered by position and normal. What is least is the squared error under light whose spectrum falls
+    like that of natural light, summed over the cluster's vertices and all terms.
+
+    Args:
+        direct: Visibility of the vertices.
+        brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.separable.factor` makes them.
+        clusters: Number of clusters, made by `cluster`; a few hundred vertices in each pay best.
+        member: Vertices of each cluster, in place of `clusters`; a vertex may be in one cluster several times.
+        vectors: Principal components of the vertices of a cluster.
+        modes: Principal components of the light that it meets.
+        keep: Wavelet coefficients kept per cluster.
+        path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
+        executor: Where clusters are computed; this machine's cores if None.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The compressed transport of every vertex.
+
+    Raises:
+        TypeError: The BRDF is not factored.
+        ValueError: Light maps per color, more clusters than vertices, more vectors than vertices in a cluster, more
+            coefficients than there are, or a store at `path` made from something else.
+        BlockingIOError: The store is being written by another process.
+        RuntimeError: A worker of the executor died.
+
+    Reference: Sloan, Hall, Hart, Snyder 2003, for the principal components of clusters.
+    """
+    if not isinstance(brdf, SeparableBrdf):
+        raise TypeError(f"brdf must be factored, by jaxprt.separable.factor, got {type(brdf).__name__}")
+    if brdf.light_map.shape[-1] != 1:
+        raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
+    if member is None:
+        member = cluster(direct.position, direct.frame[:, 2], clusters=clusters)
+    missing = np.setdiff1d(np.arange(len(direct.position)), member).size
+    if missing or member.min() < 0 or member.max() >= len(direct.position):
+        raise ValueError(
+            f"member must name all {len(direct.position)} vertices and no others, got {missing} missing and "
+            f"numbers from {member.min()} to {member.max()}"
+        )
+    if not 1 <= vectors <= member.shape[1]:
+        raise ValueError(f"vectors must be between 1 and the {member.shape[1]} vertices of a cluster, got {vectors}")
+    if not 1 <= keep <= direct.level.shape[0]:
+        raise ValueError(f"keep must be between 1 and {direct.level.shape[0]}, got {keep}")
+    if not 1 <= modes <= min(keep, vectors * brdf.terms):
+        raise ValueError(
+            f"modes must be between 1 and the smaller of keep and vectors x terms, {min(keep, vectors * brdf.terms)}, "
+            f"got {modes}"
+        )
+    job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, vectors, modes, keep)
+    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
+    index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
+    weight = jax.device_put(result["weight"]).reshape(*member.shape, vectors)
+    row, place = member.ravel(), places(member)
+    rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
+    same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
+    return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(marked(brdf.light_map)))
+
+
+def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:
+    """Vertices of each cluster, alike in position and normal, by `jaxprt.decompose.clustering.bisect`."""
+    coordinate = []
+    for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
+        offset = each - each.mean(0)
+        coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
+    return clustering.bisect(np.concatenate(coordinate, 1), clusters=clusters)
+
+
+def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:
+    """A row of each vertex among the members of all clusters, one after another; those in several are in the last."""
+    row = member.ravel()
+    result = np.zeros(row.max() + 1, np.int32)
+    result[row] = np.arange(row.size)
+    return result
+
+
+class ClusterJob(visibility.blocks.Job):
+    """A job whose blocks are clusters.
+
+    Attributes:
+        member: Vertices of each cluster.
+    """
+
+    member: np.ndarray
+
+    @property
+    def vertices(self) -> int:
+        """Number of members of all clusters."""
+        return self.member.size
+
+    @property
+    def step(self) -> int:
+        """Number of members of a cluster."""
+        return self.member.shape[1]
+
+
+@partial(jax.jit, static_argnames=("vectors", "modes", "keep"))
+def compress(
+    seen: UInt8[Array, "m d"],
+    frame: Float[Array, "m 3 3"],
+    brdf: SeparableBrdf,
+    *,
+    vectors: int,
+    modes: int,
+    keep: int,
+) -> tuple[UInt[Array, " k"], Float16[Array, "k l"], Float16[Array, "l n r"], Float[Array, "m n"], Array, Array]:
+    """Principal components of one cluster, along its vertices and then along the light.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        brdf: The factored BRDF, of which only the light maps matter.
+        vectors: How many components along the vertices.
+        modes: How many along the light.
+        keep: How many coefficients.
+
+    Returns:
+        Numbers of the coefficients; modes on them and cores, scaled to largest entries of 1 so that half precision
+        holds them; weights; and the squared errors that remain, under light of natural spectrum and relative to the
+        whole, after 0, 1, ... vectors, and after all vectors and 0, 1, ... modes.
+    """
+    size = haar.face_edge(seen.shape[1])
+    importance = jnp.tile(haar.area(size=size).ravel(), 6) ** SPECTRUM
+
+    def transport(argument):
+        visible, axes = argument
+        return wavelets.project(visible[None], axes[None], brdf)[0, ..., 0]
+
+    stride = max(1, len(seen) // _SAMPLE)
+    sample = jax.lax.map(lambda a: jnp.sum(transport(a) ** 2, 1), (seen[::stride], frame[::stride]))
+    _, index = jax.lax.top_k(jnp.sqrt(jnp.sum(sample, 0)) * importance, keep)
+    importance = importance[index, None]
+    kept = jax.lax.map(lambda a: transport(a)[index] * importance, (seen, frame)).reshape(len(seen), -1)
+    value, vector = jnp.linalg.eigh(kept @ kept.T)
+    value, vector = jnp.maximum(value[::-1], 0), vector[:, ::-1][:, :vectors]
+    basis = jnp.moveaxis((vector.T @ kept).reshape(vectors, keep, -1), 0, 1).reshape(keep, -1)
+    strength, mode, _ = eigen.left_singular(basis, terms=modes)
+    core = mode.T @ basis
+    mode = mode / importance
+    # Scales go from modes to cores and from cores to weights.
+    scale = _largest(mode, 0)
+    mode, core = mode / scale, (core * scale[:, None]).reshape(modes, vectors, -1)
+    scale = _largest(core, (0, 2))
+    core, weight = core / scale[:, None], vector * scale
+    small = jnp.uint16 if seen.shape[1] <= 1 << 16 else jnp.uint32
+    total = jnp.sum(value)
+    half = (mode.astype(jnp.float16), core.astype(jnp.float16))
+    return index.astype(small), *half, weight, _remainder(value, total), _remainder(strength, total)
+
+
+def _largest(array: Array, axis) -> Array:
+    size = jnp.max(jnp.abs(array), axis)
+    return jnp.where(size > 0, size, 1)
+
+
+def _remainder(value: Array, total: Array) -> Array:
+    """Share of the whole that is left before the first value, and after each."""
+    left = jnp.maximum(total - jnp.cumsum(value), 0)
+    return jnp.concatenate([total[None], left]) / jnp.where(total > 0, total, 1)
+
+
+@partial(jax.jit, static_argnames=("size",))
+def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) -> Array:
+    def energy(argument):
+        dtype = argument[2].dtype
+        mode, core, weight = (each.astype(dtype) for each in argument)
+        along = jnp.einsum("lnr,no,jor->lj", core, weight.T @ weight, core)
+        return jnp.sum((mode @ along) * mode, 1)
+
+    total = jnp.maximum(jax.lax.map(energy, (mode, core, weight)), 0)
+    count = weight.shape[0] * weight.shape[1] * core.shape[3]
+    return jnp.sqrt(jnp.zeros(size, total.dtype).at[index.astype(jnp.int32)].add(total) / count)
+
+
+@dataclass(frozen=True)
+class _Job(ClusterJob):
+    """Transport of the terms of a BRDF; see `blocks.Job`."""
+
+    direct: DirectTransport
+    brdf: SeparableBrdf
+    member: np.ndarray
+    vectors: int
+    modes: int
+    count: int
+
+    @property
+    def header(self) -> Mapping[str, Any]:
+        return {
+            "system": "clustered",
+            "algorithm": ALGORITHM,
+            "member": visibility.blocks.fingerprint(np.asarray(self.member, np.int64)),
+            "maps": self.brdf.coordinates.__name__,
+            **self._shape,
+        }
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        vertices = {"position": self.direct.position, "frame": self.direct.frame}
+        near = {name: sketch(each, tolerance=visibility.rays.ROUNDING) for name, each in vertices.items()}
+        return {**near, "direct": sketch(self.direct.level), "brdf": sketch(self.brdf.light_map)}
+
+    @property
+    def layout(self) -> Mapping[str, Layout]:
+        return {
+            "weight": Layout((self.step, self.vectors), 0, "float32"),
+            "index": Layout((1, self.count), 0, "uint16" if self.direct.level.shape[0] <= 1 << 16 else "uint32"),
+            "mode": Layout((1, self.count, self.modes), 0, "float16"),
+            "core": Layout((1, self.modes, self.vectors, self.brdf.terms), 0, "float16"),
+        }
+
+    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
+        member = self.member[block]
+        index, mode, core, weight, _, _ = compress(
+            self.direct.seen(member), self.direct.frame[member], self.brdf, **self._shape
+        )
+        cluster = {"index": index, "mode": mode, "core": core}
+        return {"weight": np.asarray(weight), **{name: np.asarray(x)[None] for name, x in cluster.items()}}, 0
+
+    @property
+    def _shape(self) -> Mapping[str, int]:
+        return {"vectors": self.vectors, "modes": self.modes, "keep": self.count}

@@ -1,0 +1,127 @@
+"""How far a factored BRDF is from the BRDF itself: in the radiance under a light, and over pairs of directions."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import cubemap, directions
+
+
+@runtime_checkable
+class Terms(Protocol):
+    """The two factors of each term, as `jaxprt.separable.SeparableBrdf` has them."""
+
+    def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
+        """Light factors."""
+        ...
+
+    def view(self, wo: Float[Array, "*b 3"]) -> Float[Array, "*b r c"]:
+        """View factors."""
+        ...
+
+
+def light_errors(
+    brdf: Callable, factored: Terms, light: Environment, *, frames: int = 32, views: int = 32
+) -> Float[Array, " r"]:
+    """Relative L2 error of the radiance that vertices reflect under a light, without shadows, by number of terms.
+
+    Normals and views are spread evenly over the sphere and the hemisphere. The BRDF and its terms are taken at the
+    centers of the light's texels, so that the number tells what the terms lose, and no more.
+
+    Args:
+        brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: The terms that stand for the BRDF.
+        light: One environment.
+        frames: Number of normals.
+        views: Number of views for each.
+
+    Returns:
+        The error of the first term, of the first two, and so on to all. Zero where all radiance is zero.
+
+    Raises:
+        ValueError: The light is a batch.
+    """
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
+    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
+
+
+@jax.jit
+def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
+    size = light.radiance.shape[1]
+    direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+    table = light.radiance.reshape(len(direction), -1)
+    factor = factored.view(view)
+
+    def one(axes):
+        wi = directions.to_local(axes, direction)
+        received = table * jnp.maximum(directions.to_local(axes, area)[:, 2:], 0)
+        met = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
+        met = met[:, 0] if met.shape[1] == 1 else jnp.einsum("rcc->rc", met)
+        by_terms = jnp.cumsum(factor * met, 1)
+
+        def exact(wo):
+            return jnp.sum(brdf(wi, jnp.broadcast_to(wo, wi.shape)) * received, 0)
+
+        true = jax.lax.map(exact, view)
+        return jnp.sum((by_terms - true[:, None]) ** 2, (0, 2)), jnp.sum(true**2)
+
+    error, whole = jax.lax.map(one, directions.frame(normal, jnp.zeros_like(normal)))
+    whole = jnp.sum(whole)
+    return jnp.sqrt(jnp.sum(error, 0) / jnp.where(whole > 0, whole, 1))
+
+
+def _spread(count: int, lowest: int) -> Array:
+    """Directions that a golden spiral spreads evenly over what lies above a height."""
+    height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - height**2)
+    return jnp.asarray(np.stack([radius * np.cos(turn), radius * np.sin(turn), height], -1), jnp.result_type(float))
+
+
+def sample_error(
+    brdf: Callable, factored: Callable, *, samples: int = 80_000
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Root mean square difference of two BRDFs over random directions, weighted by the cosine of the incident one.
+
+    sqrt(sum cos_i |f - g|^2 / sum cos_i) over pairs of directions that are drawn independently and uniformly by solid
+    angle above the horizon, the same ones at each call; squares are averaged over colors. Half the views lie within 30
+    degrees of the horizon, where glossy BRDFs are largest: their errors make most of this one. The error of the
+    rendered radiance is another matter.
+
+    Args:
+        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: The BRDF in its factored form, or any other callable of the same channels or of one.
+        samples: Number of pairs.
+
+    Returns:
+        The error in 1/sr, and relative to the root mean square of the BRDF under the same weight; the latter is zero
+        where both are.
+
+    Raises:
+        ValueError: No samples.
+
+    Reference: Wang, Tran, Luebke 2004, section 4.3, which names no distribution of the samples; uniform is the choice
+        here.
+    """
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, got {samples}")
+    return _sample_error(brdf, factored, samples)
+
+
+@eqx.filter_jit
+def _sample_error(brdf: Callable, factored: Callable, samples: int) -> tuple[Array, Array]:
+    height, turn = jax.random.uniform(jax.random.key(0), (2, 2, samples), jnp.result_type(float))
+    height = 1 - height  # In (0, 1]: above the horizon.
+    radius, angle = jnp.sqrt(1 - height**2), 2 * jnp.pi * turn
+    wi, wo = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], -1)
+    value = brdf(wi, wo)
+    weight = wi[:, 2:] / jnp.sum(wi[:, 2])
+    error, size = (jnp.sqrt(jnp.sum(weight * f**2) / f.shape[-1]) for f in (factored(wi, wo) - value, value))
+    return error, error / jnp.where((error == 0) & (size == 0), 1, size)

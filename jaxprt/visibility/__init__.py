@@ -1,0 +1,19 @@
+"""What vertices see of the distant sphere: rays, hits, stored visibility, and the loop over blocks."""
+
+from jaxprt.visibility import blocks, hits, rays, stored
+from jaxprt.visibility.rays import LEVELS, Occluder, exhaustive, fractional, start_points
+from jaxprt.visibility.stored import DirectTransport, precompute
+
+__all__ = [
+    "LEVELS",
+    "DirectTransport",
+    "Occluder",
+    "blocks",
+    "exhaustive",
+    "fractional",
+    "hits",
+    "precompute",
+    "rays",
+    "start_points",
+    "stored",
+]

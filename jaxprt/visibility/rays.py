@@ -1,0 +1,391 @@
+"""Visibility of the distant sphere from mesh vertices, by Embree. The only rays of the package.
+
+Everything here is NumPy on the host; what comes out is an array, so the rest of the package is tested with
+visibility made by hand.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Array, Float, Float32, UInt8
+
+from jaxprt.files.arrays import sketch
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import cubemap, directions
+from jaxprt.visibility import blocks
+
+ALGORITHM = 1  # version of what is traced; a release that traces differently raises it
+ROUNDING = 3e-6  # of the norm: more than the last bits of single precision
+BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
+LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
+_SIDE = 4
+_RAYS = 1 << 17  # rays in one call: what a core's cache holds
+_NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
+_SINK = 0.02  # of the scene's diagonal, how deep a vertex may lie inside a simplified occluder
+
+
+@dataclass(frozen=True)
+class RayCount:
+    """What was traced.
+
+    Attributes:
+        rays: All rays.
+        texels: Texels above a vertex's horizon, each of which took one ray.
+        supersampled: Those among them on a visibility boundary, which took 16 more.
+    """
+
+    rays: int
+    texels: int
+    supersampled: int
+
+    def __add__(self, other: "RayCount") -> "RayCount":
+        """Sum of two counts."""
+        return RayCount(self.rays + other.rays, self.texels + other.texels, self.supersampled + other.supersampled)
+
+
+class Occluder:
+    """Triangles that cast shadows, in Embree's form.
+
+    Args:
+        mesh: The triangles; those of zero area cast nothing.
+
+    Raises:
+        ValueError: No triangles, positions that are not finite, or faces that name missing vertices.
+    """
+
+    def __init__(self, mesh: Mesh):
+        _check(mesh, "occluder")
+        self.position = np.asarray(mesh.position, np.float32)
+        self.face = np.asarray(mesh.face, np.int32)
+        used = self.position[self.face.ravel()]
+        low, high = used.min(0), used.max(0)
+        self.diagonal = float(np.linalg.norm(high - low)) or 1.0
+        # Far from the origin float32 itself is coarser than the share of the diagonal.
+        self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, np.ascontiguousarray(self.position), np.ascontiguousarray(self.face))
+
+    def blocked(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]) -> np.ndarray:
+        """Whether each ray meets a triangle; releases the interpreter lock."""
+        return self._scene.run(origin, direction, query="OCCLUDED") == 0
+
+    def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
+        """First triangle on each ray, -1 for none, the distance to it, and the weights of its three vertices."""
+        found = self._scene.run(origin, direction, query="INTERSECT", output=True)
+        u, v = found["u"], found["v"]
+        return found["primID"].astype(np.int64), found["tfar"], np.stack([1 - u - v, u, v], -1)
+
+
+def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
+    """Points just off the surface from which each vertex's rays start.
+
+    They lie on that side of every face around the vertex on which its shading normal is, so that a face never
+    shadows its own front, however far the shading normal leans. A vertex that lies inside a simplified occluder
+    starts where it leaves it. A vertex that touches another surface starts on the open side of that surface, so that
+    light does not leak in from beneath.
+
+    Raises:
+        ValueError: As for `Occluder`, and for normals that are not finite.
+    """
+    _check(mesh, "mesh")
+    position = np.asarray(mesh.position, np.float32)
+    out = _outward(mesh)
+    nudge = np.float32(occluder.nudge)
+    start = position + nudge * out
+    foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
+    if foreign.any():
+        start[foreign] = _surface(occluder, position[foreign], out[foreign])
+    own = ~foreign
+    if own.any():
+        start[own] = _off_contact(occluder, position[own], start[own], out[own])
+    return start
+
+
+def fractional(
+    occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
+) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
+    """Share of each cubemap texel that is seen from each point, in sixteenths; 0 below the horizon.
+
+    One ray goes through the center of every texel whose integral of the cosine is positive. Where a texel and its
+    eight neighbors, across the edges of faces and the horizon too, do not agree, 4 x 4 rays replace it: the samples
+    of a cubemap with four times the resolution, box-filtered.
+
+    Args:
+        occluder: What casts shadows.
+        start: Points where rays start, from `start_points`.
+        normal: Unit normals.
+        size: Edge of the cubemap's faces in texels.
+
+    Returns:
+        Visibility times 16 on 6 size^2 texels, and the number of rays.
+
+    Reference: Wang, Tran, Luebke 2004, section 3.3 (there all texels at 6 x 256 x 256).
+    """
+    table = _tables(size)
+    seen = np.zeros((len(start), 6 * size * size), np.uint8)
+    above = normal.astype(np.float32) @ table.area.T > 0
+    step = max(1, _RAYS // (3 * size * size))
+    count = RayCount(0, 0, 0)
+    for first in range(0, len(start), step):
+        part = slice(first, first + step)
+        count += _trace(occluder, start[part], above[part], seen[part], table)
+    return seen, count
+
+
+def exhaustive(
+    occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
+) -> UInt8[np.ndarray, "v d"]:
+    """The same as `fractional` with 16 rays in every texel above the horizon: slow, to judge it by."""
+    table = _tables(size)
+    seen = np.zeros((len(start), 6 * size * size), np.uint8)
+    above = normal.astype(np.float32) @ table.area.T > 0
+    for vertex in range(len(start)):
+        texel = np.flatnonzero(above[vertex])
+        seen[vertex, texel] = _supersample(occluder, start, np.full(texel.size, vertex), texel, table)
+    return seen
+
+
+def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
+    """Numbers of the vertices to light: all of them for None, those that a mask marks, or those that are named.
+
+    Raises:
+        ValueError: Neither a mask with one entry for each vertex nor numbers of vertices.
+    """
+    count = len(mesh.position)
+    number = np.arange(count)
+    if vertex is None:
+        return number
+    vertex = np.asarray(vertex)
+    mask = vertex.dtype == bool and vertex.shape == (count,)
+    named = vertex.ndim == 1 and vertex.dtype.kind in "iu" and np.all((vertex >= -count) & (vertex < count))
+    if not mask and not named:
+        raise ValueError(
+            f"vertex must be a mask [{count}] or whole numbers below {count} in one row, got {vertex.dtype} "
+            f"{vertex.shape}: {np.array2string(vertex, threshold=4)}"
+        )
+    return number[vertex]
+
+
+def place(mesh: Mesh, vertex: np.ndarray | None) -> Float[Array, "v 3"]:
+    """Positions of the vertices to light; see `chosen`."""
+    return jax.device_put(np.asarray(mesh.position)[chosen(mesh, vertex)])
+
+
+@dataclass(frozen=True)
+class VisibilityJob(blocks.Job):
+    """Blocks of vertices whose visibility becomes transport; systems say what is made of it. See `blocks.Job`.
+
+    Attributes:
+        start: Points where rays start.
+        frame: Rows are tangent, bitangent, normal.
+        occluder: What casts shadows, in NumPy arrays.
+        size: Edge of the cubemap's faces in texels.
+        mesh_key: Fingerprint of the faces and vertices that are given.
+        mesh_near: Sketches of their positions, normals and tangents.
+    """
+
+    start: np.ndarray
+    frame: np.ndarray
+    occluder: Mesh
+    size: int
+    mesh_key: str
+    mesh_near: Mapping[str, list[float]]
+
+    @classmethod
+    def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
+        """A job for some vertices of a mesh, all of them if None, which shadows itself if no occluder is named."""
+        shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
+        vertex = chosen(mesh, vertex)
+        start = start_points(mesh, Occluder(shadowing))[vertex]
+        # Padded to a power of two, so that few shapes are compiled.
+        padded = np.pad(vertex, (0, (1 << max(6, (len(vertex) - 1).bit_length())) - len(vertex)))
+        normal, tangent = (np.asarray(each)[padded] for each in (mesh.normal, mesh.tangent))
+        frame = np.asarray(directions.frame(normal, tangent), np.float32)[: len(vertex)]
+        # By what is given, not by what is traced or computed of it, which other kinds of processors round otherwise.
+        key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
+        given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
+        rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
+        near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}
+        return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
+
+    def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
+        """The header of a system's job: what is traced, and by which versions of the algorithms."""
+        return {"system": system, "algorithm": dict(algorithm), "mesh": self.mesh_key, "size": self.size, **more}
+
+    @property
+    def near(self) -> Mapping[str, list[float]]:
+        """Sketches of what the result depends on."""
+        return self.mesh_near
+
+    @cached_property
+    def rays(self) -> Occluder:
+        """The occluder in Embree's form, built once in each worker."""
+        return Occluder(self.occluder)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields: Embree's form does not travel."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.start)
+
+    def part(self, block: int) -> np.ndarray:
+        """Vertices of a block; the last one repeats its last vertex."""
+        return np.minimum(np.arange(block * BLOCK, (block + 1) * BLOCK), self.vertices - 1)
+
+    def seen(self, block: int) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
+        """Visibility of a block by `fractional`."""
+        part = self.part(block)
+        return fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
+
+
+class _Tables(NamedTuple):
+    area: np.ndarray  # [d, 3] integral of direction over each texel
+    center: np.ndarray  # [d, 3]
+    fine: np.ndarray  # [d, 16, 3]
+    border: np.ndarray  # [6, n + 2, n + 2] texel numbers of faces with their neighbors' rims
+
+
+@lru_cache(maxsize=4)
+def _tables(size: int) -> _Tables:
+    fine = np.asarray(cubemap.direction(size=size * _SIDE), np.float32)
+    fine = fine.reshape(6, size, _SIDE, size, _SIDE, 3).swapaxes(2, 3).reshape(-1, LEVELS, 3)
+    return _Tables(
+        np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3),
+        np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3),
+        np.ascontiguousarray(fine),
+        np.asarray(cubemap.border_index(size=size)),
+    )
+
+
+def _check(mesh: Mesh, name: str) -> None:
+    """Refuses what Embree would hang or lie on, and vectors that make no frame."""
+    if not mesh.face.size:
+        raise ValueError(f"the {name} must have faces, got none")
+    for field in ("position", "normal", "tangent"):
+        broken = np.flatnonzero(~np.isfinite(np.asarray(getattr(mesh, field))).all(1))
+        if broken.size:
+            value = np.asarray(getattr(mesh, field))[broken[0]]
+            raise ValueError(
+                f"the {name}'s {field}s must be finite, got {broken.size} that are not, first at {broken[0]}: {value}"
+            )
+    low, high = int(mesh.face.min()), int(mesh.face.max())
+    if low < 0 or high >= len(mesh.position):
+        raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")
+
+
+def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables) -> RayCount:
+    """Fills `seen` for one part of the points."""
+    vertex, texel = np.nonzero(above)
+    clear = ~occluder.blocked(start.take(vertex, axis=0), table.center.take(texel, axis=0))
+    flat = seen.reshape(-1)
+    place = vertex * above.shape[1] + texel
+    flat[place] = clear
+    mixed = np.flatnonzero(_boundary(seen, table.border).reshape(-1)[place])
+    flat[place] *= LEVELS
+    flat[place[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)
+    return RayCount(len(place) + LEVELS * len(mixed), len(place), len(mixed))
+
+
+def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """Texels in whose 3 x 3 neighborhood some are clear and some are not, below the horizon included."""
+    padded = clear.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
+    return (_dilate(padded) & _dilate(1 - padded)).astype(bool)
+
+
+def _dilate(padded: np.ndarray) -> np.ndarray:
+    """Maximum over 3 x 3 of binary images with a rim."""
+    rows = padded[..., :-2, :] | padded[..., 1:-1, :] | padded[..., 2:, :]
+    return rows[..., :-2] | rows[..., 1:-1] | rows[..., 2:]
+
+
+def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
+    """Clear rays out of 16 in each of the (vertex, texel) pairs."""
+    out = np.empty(len(vertex), np.uint8)
+    step = _RAYS // LEVELS
+    for first in range(0, len(vertex), step):
+        part = slice(first, first + step)
+        origin = np.repeat(start[vertex[part]], LEVELS, axis=0)
+        shadow = occluder.blocked(origin, table.fine.take(texel[part], axis=0).reshape(-1, 3))
+        out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)
+    return out
+
+
+def _rows(position: np.ndarray) -> np.ndarray:
+    """Each position as one opaque item, so that positions compare as wholes; -0 is 0."""
+    return np.ascontiguousarray(position + np.float32(0)).view(np.dtype((np.void, 12))).ravel()
+
+
+def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Unit face normals by winding; zero for faces without area."""
+    a, b, c = (position[face[:, i]].astype(np.float64) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+
+
+def _outward(mesh: Mesh) -> np.ndarray:
+    """Unit vectors on the side of all faces around a vertex on which its shading normal is.
+
+    Around means at the same position: where vertices are split along a crease, the faces across it count too, or a
+    start would be pushed into them.
+    """
+    position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
+    facing = _face_normal(position, face)
+    own = np.zeros_like(normal)
+    for corner in face.T:
+        side = np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)
+        for axis in range(3):
+            own[:, axis] += np.bincount(corner, facing[:, axis] * side, len(normal))
+    _, place = np.unique(_rows(position), return_inverse=True)
+    joint = np.stack([np.bincount(place, own[:, axis]) for axis in range(3)], 1)[place]
+    # The two sides of a sheet cancel; each then keeps to its own.
+    total = np.where(np.sum(joint * own, 1, keepdims=True) > 1e-6 * np.sum(own * own, 1, keepdims=True), joint, own)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal).astype(np.float32)
+
+
+def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """Starts for vertices of a mesh that the occluder only approximates."""
+    triangle, distance, _ = occluder.hit(position - np.float32(occluder.nudge) * out, out)
+    facing = _face_normal(occluder.position, occluder.face)[triangle]
+    leaving = (triangle >= 0) & (distance < _SINK * occluder.diagonal) & (np.sum(facing * out, 1) > 0)
+    depth = np.where(leaving, distance, 0) + occluder.nudge
+    return (position + depth[:, None] * out).astype(np.float32)
+
+
+def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """Mirrors starts that the nudge pushed through a touching surface back to its open side.
+
+    Looking back from beyond, a touching surface is seen from its back, the vertex's own faces from their front.
+    Probes beside the vertex see it even where it coincides with the vertex itself.
+    """
+    facing = _face_normal(occluder.position, occluder.face)
+    nudge = np.float32(occluder.nudge)
+    side = np.cross(out, np.eye(3, dtype=np.float32)[np.argmin(np.abs(out), 1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    result = start.copy()
+    open_start = np.ones(len(start), bool)
+    for offset in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
+        probe = start + nudge / 2 * offset
+        triangle, distance, _ = occluder.hit(probe, -out)
+        found = np.flatnonzero(open_start & (triangle >= 0) & (distance < 1.01 * nudge))
+        if not found.size:
+            continue
+        back = facing[triangle[found]]
+        corner = occluder.position[occluder.face[triangle[found]]]
+        own = (corner == position[found, None]).all(2).any(1)
+        touching = ~own & (np.sum(back * out[found], 1) < 0)
+        found, back, corner = found[touching], back[touching], corner[touching]
+        height = np.sum((corner[:, 0] - start[found]) * back, 1, keepdims=True)
+        result[found] = start[found] + 2 * height * back
+        open_start[found] = False
+    return result

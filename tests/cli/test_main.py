@@ -1,0 +1,359 @@
+"""The command `python -m jaxprt`, on a mesh and a sky of a few triangles and pixels."""
+
+import functools
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.__main__ import main
+from jaxprt.cli import animation
+
+OBJ = """
+v 0 1 0
+v -1 -0.5 1
+v 1 -0.5 1
+v 0 -0.5 -1
+f 1 2 3
+f 1 3 4
+f 1 4 2
+f 2 4 3
+"""
+
+
+SYSTEMS = ("separable", "harmonic", "lobe")
+WHOLE = ("--ground", "--azimuth", "-30", "--system", *SYSTEMS)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse):
+    """Coarse maps, skies and ground: what the command does with them is the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        for room, name, options in (
+            (prt.separable.factorization, "factor", {"resolution": 8}),
+            (prt.scene, "load_environment", {"size": 8}),
+            (prt.separable.wavelets, "precompute", {"size": 8}),
+            (prt.harmonic.transfer, "precompute", {"size": 8}),
+            (prt.harmonic.transfer, "precompute_diffuse", {"size": 8}),
+            (prt.harmonic.table, "tabulate", {"resolution": 8, "error": 1.0}),
+            (prt.lobe.pyramid, "precompute", {"size": 8}),
+            (prt.lobe.table, "tabulate", {"resolution": 8}),
+            (prt.bounces.functions, "factor", {"functions": 2, "terms": 4}),
+            (prt.scene.mesh, "ground_plane", {"vertices": 49}),
+            (prt.dynamic.transport, "precompute", {"size": 8}),
+            (prt.bounces.tensor, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
+        ):
+            patch.setattr(room, name, functools.partial(getattr(room, name), **options))
+        for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
+            patch.setattr(animation, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a tetrahedron, a sky, a sky with negative pixels, and files that are neither."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "mesh.obj").write_text(OBJ)
+    sky = np.random.default_rng(0).uniform(0.1, 2, size=(4, 8, 3)).astype(np.float32)
+    prt.files.write_exr(folder / "sky.exr", sky)
+    prt.files.write_exr(folder / "dusk.exr", sky[::-1] / 3)
+    prt.files.write_exr(folder / "negative.exr", sky - 0.3)
+    prt.files.write_exr(folder / "square.exr", sky[:, :5])
+    prt.files.write_exr(folder / "nan.exr", np.where(sky > 1.9, np.nan, sky).astype(np.float32))
+    (folder / "text.exr").write_text("not a picture")
+    (folder / "empty.obj").write_text("# nothing\n")
+    return folder
+
+
+def run(place, *more, mesh="mesh.obj", sky=("sky.exr",), output=None):
+    """Exit status of the command on small pictures, in a folder of its own."""
+    output = output or place / "out"
+    files = ["--mesh", str(place / mesh), "--environment", *[str(place / name) for name in sky]]
+    options = ["--size", "32", "--brdf", "lambert", "--keep", "8", "--output", str(output)]
+    return main([*files, *options, *more])
+
+
+def numbers(tree):
+    """All numbers in a JSON value."""
+    if isinstance(tree, dict):
+        tree = list(tree.values())
+    if isinstance(tree, list):
+        return [number for each in tree for number in numbers(each)]
+    return [tree] if isinstance(tree, int | float) else []
+
+
+def report(output):
+    """The report, which must be JSON as other programs read it: without NaN and infinity."""
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    found = json.loads((output / "report.json").read_text(), parse_constant=refuse)
+    assert all(map(math.isfinite, numbers(found)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def output(place):
+    """What one whole run leaves: two lights, a coarse ground, all systems."""
+    folder = place / "deep" / "whole"
+    assert run(place, *WHOLE, sky=("sky.exr", "dusk.exr"), output=folder) == 0
+    return folder
+
+
+def test_pictures_and_report_are_written(output):
+    kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
+    names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
+    expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
+    stores = {f"{part}{suffix}.prt" for part in ("object", "ground") for suffix in ("", "_order_5", "_lobe")}
+    assert {path.name for path in output.iterdir()} == expected | stores | {"report.json"}
+    for name in expected:
+        assert (output / name).stat().st_size > 50
+    picture, _ = prt.files.read_image(output / "sky_harmonic.exr")
+    assert picture.shape == (32, 32, 3)
+    assert np.isfinite(picture).all()
+
+
+def test_the_systems_stand_side_by_side_before_the_reference(output):
+    row, _ = prt.files.read_image(output / "sky.png")
+    parts = [prt.files.read_image(output / f"sky_{kind}.png")[0] for kind in (*SYSTEMS, "reference")]
+    np.testing.assert_array_equal(row, np.concatenate(parts, 1))
+
+
+def test_the_report_is_json_of_finite_numbers(output):
+    told = report(output)
+    assert told["vertices"] == {"object": 4, "ground": 49}
+    assert set(told["lights"]) == {"sky", "dusk"}
+    for light in told["lights"].values():
+        for system in SYSTEMS:
+            assert 0 < light[system]["image_error"] < 0.5
+            assert set(light[system]["vertex_error"]) == {"object", "ground"}
+    assert told["precompute"]["separable"]["object"]["keep"] == 8
+    assert told["precompute"]["harmonic"]["object"]["coefficients"] == 25
+    assert told["precompute"]["lobe"]["object"]["lobes"] == 0  # it is diffuse
+    assert told["precompute"]["lobe"]["object"]["exact_texels"] == 16
+    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("object", "ground")}
+    assert min(numbers(told["times"])) > 0
+    assert told["peak_bytes"] > 1e7
+
+
+def test_the_report_says_what_was_relit(place, output):
+    told = report(output)
+    assert told["mesh"] == str(place / "mesh.obj")
+    assert told["up"] == "y"
+    assert told["ground"] is True
+    assert told["environments"] == {name: str(place / f"{name}.exr") for name in ("sky", "dusk")}
+    camera = told["camera"]
+    assert (camera["width"], camera["height"]) == (32, 32)
+    offset = np.subtract(camera["eye"], camera["target"])
+    np.testing.assert_allclose(np.degrees(np.arctan2(offset[0], offset[2])), -30, atol=1e-3)
+
+
+def test_the_pictures_differ_by_what_the_report_says(output):
+    image, reference, difference = (
+        prt.files.read_image(output / f"sky_{kind}.exr")[0] for kind in ("harmonic", "reference", "harmonic_difference")
+    )
+    np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
+
+
+def test_a_second_run_takes_the_transport_from_the_first(place, output, capsys):
+    before = report(output)
+    stored = {path: path.stat().st_mtime_ns for path in output.glob("*.prt/**/*") if path.is_file()}
+    assert run(place, *WHOLE, sky=("sky.exr", "dusk.exr"), output=output) == 0
+    told = capsys.readouterr()
+    assert "pictures and report.json are in" in told.out
+    assert "error" not in told.err.lower()
+    assert stored == {path: path.stat().st_mtime_ns for path in stored}
+    for system in SYSTEMS:
+        errors = (found["lights"]["sky"][system]["image_error"] for found in (before, report(output)))
+        assert len(set(errors)) == 1
+
+
+@pytest.fixture(scope="module")
+def glossy(place):
+    """What a run of a glossy BRDF leaves, with the error table, under two skies of one name."""
+    folder = place / "glossy"
+    (folder / "other").mkdir(parents=True)
+    shutil.copy(place / "dusk.exr", folder / "other" / "sky.exr")
+    options = ["--table", "3", "--terms", "2", "--diffuse", "0.2", "0.3", "0.4", "--specular", "0.1", "--nu", "10"]
+    options += ["--system", *SYSTEMS, "--order", "4", "--window", "hann", "--lobes", "1"]
+    options += ["--brdf", "ashikhmin-shirley"]
+    with pytest.MonkeyPatch.context() as patch:
+        for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("ORDERS", (2, 4)), ("LOBES", (1,))):
+            patch.setattr(f"jaxprt.cli.report.TABLE_{name}", values)
+        assert run(place, *options, sky=("sky.exr", "glossy/other/sky.exr"), output=folder) == 0
+    return folder
+
+
+def test_glossy_brdfs_and_the_error_table(glossy):
+    table = report(glossy)["table"]
+    separable, harmonic, lobe = ([row for row in table if row["system"] == system] for system in SYSTEMS)
+    assert {(row["terms"], row["keep"]) for row in separable} == {(t, k) for t in (1, 4) for k in (32, 96)}
+    assert {row["coefficients"] for row in harmonic} == {4, 16}
+    assert [(row["lobes"], row["exact_texels"]) for row in lobe] == [(1, 0), (1, 16), (1, 64)]
+    assert all(0 < row[f"error {sky}"] < 2 for row in table for sky in ("sky", "sky_2"))
+    made = report(glossy)["precompute"]
+    assert (made["harmonic"]["object"]["coefficients"], made["lobe"]["object"]["lobes"]) == (16, 1)
+
+
+# The command prints warnings itself; here they would be errors before they reach it.
+@pytest.mark.filterwarnings("default:.* pixels are negative:UserWarning")
+def test_negative_pixels_are_told_on_stderr(place, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    assert run(place, sky=("negative.exr",), output=tmp_path) == 130
+    assert "jaxprt: " in (told := capsys.readouterr().err)
+    assert "pixels are negative" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mesh": "absent.obj"}, "there is no mesh file .*absent.obj"),
+        ({"mesh": "sky.exr"}, "sky.exr must end in one of .ply"),
+        ({"mesh": "empty.obj"}, "empty.obj must hold vertices and faces"),
+        ({"sky": ("absent.exr",)}, "absent.exr"),
+        ({"sky": ("text.exr",)}, "text.exr"),
+        ({"sky": ("square.exr",)}, "square.exr must be 2 : 1"),
+        ({"sky": ("nan.exr",)}, "nan.exr must hold finite radiance"),
+        ({"sky": ("sky.exr", "mesh.obj")}, "mesh.obj"),
+    ],
+)
+def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
+    assert run(place, output=tmp_path / "none", **options) == 2
+    assert_told(capsys, message)
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--size", "0"], "--size must be at least 1, got 0"),
+        (["--keep", "0"], "--keep must be at least 1, got 0"),
+        (["--keep", "30000"], "--keep must be at most 384, got 30000"),
+        (["--terms", "0"], "--terms must be at least 1, got 0"),
+        (["--brdf", "ashikhmin-shirley", "--terms", "300"], "terms must be between 1 and .* got 300"),
+        (["--diffuse", "0.1", "0.2"], "--diffuse must be one number or three, got 2"),
+        (["--specular", "1", "2", "3", "4"], "--specular must be one number or three, got 4"),
+        (["--diffuse", "nan"], "--diffuse must be not negative and finite, got nan"),
+        (["--diffuse=-1"], "--diffuse must be not negative and finite, got -1"),
+        (["--specular", "0.1", "0.2", "-0.5"], "--specular must be not negative and finite, got -0.5"),
+        (["--order", "0"], "--order must be from 1 to 15, got 0"),
+        (["--lobes", "0"], "--lobes must be from 1 to 64, got 0"),
+        (["--lobes", "65"], "--lobes must be from 1 to 64, got 65"),
+        (["--nu", "-5"], "--nu must be positive and finite, got -5"),
+        (["--nv", "inf"], "--nv must be positive and finite, got inf"),
+        (["--elevation", "95"], "--elevation must be from -90 to 90 degrees, got 95"),
+        (["--azimuth", "nan"], "--azimuth must be finite, got nan"),
+        (["--table", "-3"], "--table must be at least 1, got -3"),
+    ],
+)
+def test_bad_numbers_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
+    assert run(place, *options, output=tmp_path) == 2
+    assert_told(capsys, message)
+
+
+def assert_told(capsys, message):
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    assert [line for line in err.splitlines() if line.startswith("jaxprt: error: ")], err
+    assert re.search(message, err), err
+
+
+@pytest.mark.parametrize("options", [["--size", "many"], ["--brdf", "velvet"], ["--unknown"], ["--diffuse"]])
+def test_options_that_cannot_be_read_end_with_status_2_and_usage(capsys, options):
+    with pytest.raises(SystemExit) as end:
+        main(options)
+    assert end.value.code == 2
+    assert "usage: python -m jaxprt" in capsys.readouterr().err
+
+
+def test_an_output_that_is_a_file_is_refused(place, tmp_path, capsys):
+    (tmp_path / "file").write_text("precious")
+    assert run(place, output=tmp_path / "file") == 2
+    assert_told(capsys, "file")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_another_meshs_store_in_the_output_is_refused(place, output, capsys):
+    assert run(place, "--keep", "9", output=output) == 2
+    assert_told(
+        capsys, "object.prt holds arrays made from something else .*keep: there 8, now 9.* name another --output"
+    )
+
+
+def stop(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("options", [["--keep", "0"], ["--keep", "30000"], ["--diffuse=-1"], ["--nu", "0"]])
+def test_bad_numbers_are_refused_before_anything_is_factored(place, tmp_path, monkeypatch, options):
+    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    assert run(place, *options, output=tmp_path) == 2
+
+
+def test_an_interrupt_ends_in_one_line_and_status_130(place, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    assert run(place, output=tmp_path) == 130
+    assert capsys.readouterr().err == "jaxprt: stopped; the same command goes on from here\n"
+
+
+def test_two_skies_of_one_name_are_both_relit(place, glossy):
+    paths = (str(place / "sky.exr"), str(place / "glossy" / "other" / "sky.exr"))
+    assert report(glossy)["environments"] == dict(zip(("sky", "sky_2"), paths, strict=True))
+    first, second = (prt.files.read_image(glossy / f"{name}_separable.exr")[0] for name in ("sky", "sky_2"))
+    assert np.abs(first - second).max() > 0.1
+
+
+@pytest.mark.parametrize(("mesh", "count"), [("mesh.obj", 0), ("inside_out.obj", 1)])
+def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
+    swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
+    (place / "inside_out.obj").write_text(swapped)
+    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    assert run(place, mesh=mesh, output=tmp_path) == 130
+    warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jaxprt: warning: ")]
+    assert len(warned) == count
+    assert not count or re.search(r"\d of \d triangles in the picture face away .* inside out", warned[0])
+
+
+def test_the_module_runs_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "jaxprt", "--help"], check=True, capture_output=True, text=True)
+    assert "usage: python -m jaxprt" in done.stdout
+    assert not done.stderr
+
+
+def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys):
+    output = place / "moving"
+    glossy = ["--brdf", "cook-torrance", "--roughness", "0.4", "--specular", "0.6", "0.5", "0.3"]
+    assert run(place, "--ground", "--system", "dynamic", "--animate", "2", *glossy, output=output) == 0
+    told = report(output)
+    assert 0 < told["lights"]["sky"]["dynamic"]["reflected_share"] < 0.5
+    assert told["lights"]["sky"]["dynamic"]["image_error"] < 0.3
+    assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
+    frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
+    assert np.abs(frames[0] - frames[1]).max() > 0.05
+    whole, direct = (prt.files.read_image(output / f"sky_{name}.exr")[0] for name in ("dynamic_bounces", "dynamic"))
+    assert whole.mean() > direct.mean()
+    assert "comes from other surfaces" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--animate", "4"], "--animate needs --system dynamic"),
+        (["--bounces", "1"], "--bounces needs --system dynamic"),
+        (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
+        (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
+        (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of regions 0 to 0, got 7"),
+        (["--material", "0", "0.1", "0.1", "2", "0.1"], "four numbers from 0 to 1, got 0 0.1 0.1 2 0.1"),
+        (["--roughness", "-1"], "--roughness must be from 0 to 1, got -1"),
+    ],
+)
+def test_materials_that_cannot_be_are_refused(place, capsys, options, message):
+    assert run(place, *options, output=place / "refused") == 2
+    assert message in capsys.readouterr().err

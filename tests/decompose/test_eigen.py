@@ -1,0 +1,139 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxprt.decompose import eigen
+
+
+def _planted(value, size=60):
+    basis = scipy.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0][:, : len(value)]
+    return jnp.asarray((basis * value) @ basis.T, jnp.float32), basis
+
+
+def test_planted_eigenvalues_of_either_sign_come_by_magnitude():
+    matrix, basis = _planted([1.0, -8.0, 4.0, -2.0, 0.5])
+    value, vector, residual = eigen.symmetric(matrix, terms=3)
+    np.testing.assert_allclose(value, [-8, 4, -2], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, [1, 2, 3]]), np.eye(3), atol=1e-4)
+    assert residual[-1] < 1e-5
+
+
+def test_nearly_equal_pairs_of_opposite_sign_are_separated():
+    matrix, _ = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=4)
+    np.testing.assert_allclose(value, [242, -241.99, 240, -239.8], rtol=1e-5)
+    np.testing.assert_allclose(jnp.linalg.norm(matrix @ vector - vector * value), 0, atol=2e-2)
+
+
+def test_repeated_eigenvalues_give_an_orthonormal_basis_of_their_space():
+    matrix, basis = _planted([3.0, 3.0, 3.0, 1.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=3)
+    np.testing.assert_allclose(value, 3, rtol=1e-5)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(vector @ vector.T, basis[:, :3] @ basis[:, :3].T, atol=1e-4)
+
+
+def test_zero_matrix_gives_zero_values_and_orthonormal_vectors():
+    value, vector, residual = eigen.symmetric(jnp.zeros((20, 20)), terms=4)
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(residual, 0)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(4), atol=1e-5)
+
+
+def test_rank_below_the_terms_pads_with_zero_values():
+    matrix, _ = _planted([5.0, -2.0])
+    value, vector, _ = eigen.symmetric(matrix, terms=5)
+    np.testing.assert_allclose(value, [5, -2, 0, 0, 0], atol=1e-5)
+    assert jnp.all(jnp.isfinite(vector))
+
+
+def test_left_singular_vectors_equal_scipy_of_the_weighted_matrix():
+    rng = np.random.default_rng(1)
+    matrix = rng.standard_normal((40, 25)) * 0.7 ** np.arange(25)
+    root = rng.standard_normal((25, 25))
+    u, s, _ = scipy.linalg.svd(matrix @ root)
+    value, vector, residual = eigen.left_singular(
+        jnp.asarray(matrix, jnp.float32), metric=jnp.asarray(root @ root.T, jnp.float32), terms=5
+    )
+    np.testing.assert_allclose(value, s[:5] ** 2, rtol=1e-4)
+    np.testing.assert_allclose(np.abs(vector.T @ u[:, :5]), np.eye(5), atol=2e-3)
+    assert residual[-1] < 1e-4
+
+
+def test_residual_falls_with_the_steps():
+    matrix, basis = _planted(0.97 ** np.arange(200), 300)
+    value, vector, residual = eigen.symmetric(matrix, terms=2, steps=6)
+    assert residual.shape == (6,)
+    assert residual[5] < residual[1] < residual[0] / 10
+    np.testing.assert_allclose(value, [1, 0.97], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, :2]), np.eye(2), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["zero", "identity", "few rows", "low rank"])
+def test_vectors_are_orthonormal_where_products_add_nothing_to_the_span(name):
+    size = 85  # The span of 60 vectors fills most of it.
+    corner = np.zeros((size, size))
+    corner[:4, :4] = np.asarray(_planted([4.0, -3.0, 2.0, 1.0], 4)[0])
+    low = _planted([5.0, -2.0], size)[0]
+    matrix = {"zero": 0 * corner, "identity": np.eye(size), "few rows": corner, "low rank": low}[name]
+    value, vector, _ = eigen.symmetric(jnp.asarray(matrix, jnp.float32), terms=4)
+    expected = {"zero": [0] * 4, "identity": [1] * 4, "few rows": [4, -3, 2, 1], "low rank": [5, -2, 0, 0]}
+    np.testing.assert_allclose(value, expected[name], atol=1e-4)
+    np.testing.assert_allclose(vector.T @ vector, np.eye(4), atol=1e-4)
+
+
+def test_power_iteration_finds_well_separated_eigenvalues_in_order():
+    matrix, basis = _planted([1.0, -8.0, 4.0, -2.0, 0.5])
+    value, vector, residual = eigen.power(matrix, terms=3, steps=60)
+    assert residual.shape == (3, 60)
+    np.testing.assert_allclose(value, [-8, 4, -2], rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vector.T @ basis[:, [1, 2, 3]]), np.eye(3), atol=1e-4)
+    assert jnp.all(residual[:, -1] < 1e-5)
+
+
+def test_power_iteration_stalls_between_eigenvalues_of_opposite_sign_and_its_residual_tells():
+    matrix, _ = _planted([242.0, -241.99, 240.0, -239.8, 10.0])
+    value, vector, residual = eigen.power(matrix, terms=1, steps=60)
+    # The Rayleigh quotient has settled, as the published criterion asks, on no eigenvalue.
+    before, _, _ = eigen.power(matrix, terms=1, steps=58)
+    assert jnp.abs(value[0] - before[0]) < 1
+    assert jnp.abs(value[0]) < 230
+    assert residual[0, -1] > 0.3
+    assert jnp.linalg.norm(vector) == pytest.approx(1, abs=1e-5)
+    exact, _, residual = eigen.symmetric(matrix, terms=1)
+    assert exact[0] == pytest.approx(242, rel=1e-5)
+    assert residual[-1] < 1e-4
+
+
+def test_power_iteration_of_zero_is_zero():
+    value, vector, residual = eigen.power(jnp.zeros((60, 60)), terms=3, steps=60)
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(residual, 0)
+    np.testing.assert_allclose(jnp.linalg.norm(vector, axis=0), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("solve", [eigen.symmetric, eigen.power])
+@pytest.mark.parametrize("terms", [0, 21])
+def test_more_terms_than_rows_are_refused(terms, solve):
+    with pytest.raises(ValueError, match="terms must be between 1 and"):
+        solve(jnp.eye(20), terms=terms)
+
+
+def test_identity_inside_a_jitted_function_gives_ones():
+    value, _, _ = jax.jit(lambda m: eigen.symmetric(m, terms=2))(jnp.eye(20))
+    np.testing.assert_allclose(value, 1, rtol=1e-5)
+
+
+def test_orientation_makes_one_basis_of_all_that_rounding_may_choose_and_keeps_different_values_apart():
+    random = np.random.default_rng(1)
+    basis = np.linalg.qr(random.normal(size=(50, 6)))[0]
+    value = np.array([9.0, 5.0, 5.0 - 1e-6, 5.0 - 2e-6, -2.0, 1.0])
+    expected = basis @ eigen.orientation(value, basis)
+    for _ in range(4):
+        turn = np.diag(random.choice([-1.0, 1.0], 6))
+        turn[1:4, 1:4] = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        again = basis @ turn
+        np.testing.assert_allclose(again @ eigen.orientation(value, again), expected, atol=1e-12)
+    np.testing.assert_allclose(np.abs(expected.T @ basis)[[0, 4, 5]], np.eye(6)[[0, 4, 5]], atol=1e-12)

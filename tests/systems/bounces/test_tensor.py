@@ -1,0 +1,306 @@
+"""Transfer tensors: what is decomposed is what arrives, after one bounce and two."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import bounces, harmonic, separable, visibility
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.brdf.models import CookTorrance
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join, make_mesh
+from jaxprt.sphere import cubemap, directions, haar, harmonics
+from jaxprt.systems.bounces.relight import LitTransfer
+
+# Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
+EDGE, SIZE, SEEN = 4, 8, 16
+BLOCK = 512
+ALL = 10**6
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    ball = builtin.sphere(rings=5, sectors=6)
+    return join([ball, ground_plane(ball, vertices=25)])
+
+
+@pytest.fixture(scope="module")
+def brdfs():
+    """Colors that need two functions, and one."""
+    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.5, nu=6, nv=6), terms=4)
+    return [glossy, separable.factor(Lambert([0.9, 0.3, 0.1]), terms=1, resolution=8)]
+
+
+@pytest.fixture(scope="module")
+def whole(mesh, brdfs):
+    """Nothing left out but by half precision."""
+    return bounces.precompute(mesh, brdfs, components=ALL, modes=ALL, edge=EDGE, size=SIZE, progress=False)
+
+
+def light(seed, edge=EDGE):
+    """Random texels, constant over the texels of two bounces."""
+    value = np.random.default_rng(seed).uniform(size=(6, 2, 1, 2, 1, 3))
+    return Environment(jnp.asarray(np.broadcast_to(value, (6, 2, edge // 2, 2, edge // 2, 3)), jnp.float32).reshape(
+        6, edge, edge, 3
+    ))  # fmt: skip
+
+
+def arriving(tensor, environment, weight=None):
+    """SH coefficients of one bounce and of two, [v s c]."""
+    lit = bounces.light_side(tensor, environment)
+    weight = bounces.relight.weights(tensor, [None] * len(tensor.factor)) if weight is None else weight
+    both, one = (np.asarray(bounces.relight.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
+    return one.transpose(2, 0, 1), (both - one).transpose(2, 0, 1)
+
+
+def relative(value, exact):
+    return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
+
+
+def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
+    """Irradiance: all but what harmonics beyond degree three bring, of what arrives first."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    mesh = join([ball, ground_plane(ball, vertices=64)])
+    albedo = np.array([[0.9, 0.5, 0.2], [0.3, 0.6, 0.8]], np.float32)
+    fixed = [separable.factor(Lambert(each), terms=1, resolution=8) for each in albedo]
+    tensor = bounces.precompute(mesh, fixed, components=ALL, modes=ALL, edge=EDGE, size=SEEN, progress=False)
+    assert tensor.error.max() < 1e-3
+    once, twice = arriving(tensor, Environment(jnp.ones((6, EDGE, EDGE, 3))))
+    cosine = np.pi * np.array([1, 2 / 3, 1 / 4, 0])[[0, *[1] * 3, *[2] * 5, *[3] * 7]]
+    at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN, progress=False)
+    options = {"size": SEEN, "progress": False}
+    one, two = (harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
+    exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
+    assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
+    assert relative(np.einsum("vs,vsc->vc", at, twice), exact[1]) < 0.018
+    bright = albedo.max(1, keepdims=True)
+    one, two = (harmonic.interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
+    brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
+    assert np.all(np.abs(tensor.worth / np.sqrt(np.mean(np.square(brought), (1, 2))) - 1) < [0.003, 0.015])
+
+
+def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
+    """From one texel, by glossy and diffuse surfaces, without harmonics between: these leave some percent."""
+    seen = visibility.precompute(mesh, size=SEEN, progress=False).seen(np.arange(len(mesh.position)))
+    frame = np.asarray(directions.frame(mesh.normal, mesh.tangent))
+    occluder = visibility.Occluder(mesh)
+    start, normal, region = visibility.start_points(mesh, occluder), np.asarray(mesh.normal), np.asarray(mesh.region)
+    way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
+    point, through, corner, share, _ = visibility.hits.hits(occluder, start, normal, size=SIZE)
+    front = visibility.hits.front(occluder, normal, corner, way[through])
+    point, through, corner, share = (each[front] for each in (point, through, corner, share))
+    wo = np.einsum("hkij,hj->hki", frame[corner], -way[through])
+    wo[..., 2] = np.maximum(wo[..., 2], 1e-3)
+    wo /= np.linalg.norm(wo, axis=-1, keepdims=True)
+    values = [jax.jit(jax.vmap(lambda wi, wo, brdf=brdf: brdf(wi, jnp.broadcast_to(wo, wi.shape)))) for brdf in brdfs]
+
+    def gather(radiance, size):
+        """Radiance [v d c] that arrives after one more reflection of radiance by texels, those with any alone."""
+        into, area = (np.asarray(x(size=size)).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
+        met = radiance * np.maximum(normal @ area.T, 0)[..., None]
+        lit = np.argsort(~met.any(-1), axis=1, kind="stable")[:, : met.any(-1).sum(1).max()]
+        met = np.take_along_axis(met, lit[..., None], 1)
+        wi = np.einsum("vij,vdj->vdi", frame, into[lit])
+        sent = np.zeros((*corner.shape, 3))
+        for number, value in enumerate(values):
+            own = np.argwhere(region[corner] == number)
+            for first in range(0, len(own), BLOCK):
+                h, k = own[np.arange(first, first + BLOCK) % len(own)].T  # Blocks of one shape; some come twice.
+                v = corner[h, k]
+                factor = np.asarray(value(wi[v].astype(np.float32), wo[h, k].astype(np.float32)))
+                sent[h, k] = np.einsum("hdc,hdc->hc", factor, met[v])
+        result = np.zeros((len(start), len(way), 3))
+        result[point, through] = np.einsum("hk,hkc->hc", share, sent)
+        return result
+
+    texel, fold = 6, SEEN // 2  # Of 24, from the side of +y.
+    lamp = np.zeros((6, 2, 1, 2, 1), np.float32)
+    lamp.reshape(-1)[texel] = 1
+    lamp = np.broadcast_to(lamp, (6, 2, fold, 2, fold)).reshape(6, SEEN, SEEN, 1)
+    lamp = Environment(jax.device_put(lamp))
+    held = np.asarray(bounces.relight.coarse(lamp.radiance, edge=2)).reshape(6, 2, 1, 2, 1)
+    shone = np.broadcast_to(held, (6, 2, fold, 2, fold)).reshape(-1)  # The lamp and some of what is around it.
+    once = gather(shone[:, None] * np.asarray(seen)[..., None] / 16 * np.ones(3), SEEN)
+    shining = np.asarray(harmonics.evaluate(way, degree=3)) * np.asarray(cubemap.solid_angle(size=SIZE)).reshape(-1, 1)
+    twice = np.einsum("vdc,ds->vsc", gather(once, SIZE), shining)
+    _, found = arriving(whole, lamp)
+    assert np.abs(twice).max() > 1e-3
+    assert relative(found, twice) < TWICE
+
+
+# What 16 harmonics leave of the first bounce, in the second.
+TWICE = 0.025
+
+
+def test_linear_in_the_light(whole):
+    first, second = light(0), light(1)
+    both = Environment(first.radiance + 2 * second.radiance)
+    for found, a, b in zip(*(arriving(whole, each) for each in (both, first, second)), strict=True):
+        np.testing.assert_allclose(found, a + 2 * b, atol=2e-6)
+
+
+def test_one_bounce_is_linear_in_the_weights_and_two_are_quadratic(whole):
+    random = np.random.default_rng(0)
+    a, b = (jnp.asarray(random.uniform(size=(3, 3)), jnp.float32) for _ in range(2))
+    found = {name: arriving(whole, light(2), x) for name, x in {"a": a, "b": b, "+": a + b, "-": a - b}.items()}
+    np.testing.assert_allclose(found["+"][0], found["a"][0] + found["b"][0], atol=1e-6)
+    parallelogram = found["+"][1] + found["-"][1]
+    np.testing.assert_allclose(parallelogram, 2 * (found["a"][1] + found["b"][1]), atol=1e-6)
+    np.testing.assert_allclose(arriving(whole, light(2), 3 * a)[1], 9 * found["a"][1], rtol=1e-4, atol=1e-6)
+
+
+def test_diffuse_surfaces_exchange_light_reciprocally():
+    """Two parallel squares of unlike size: area times form factor is the same both ways."""
+    small, large = builtin.plane(cells=8), builtin.plane(cells=16)
+    up = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    down = up * [[1], [-1], [-1]]
+    scale = (0.5, 1.0)
+    parts = []
+    for each, size, axes, height in zip((small, large), scale, (down, up), (0.6, 0.0), strict=True):
+        position = np.asarray(each.position) * size @ axes.T + [0, height, 0]
+        parts.append((position.astype(np.float32), np.asarray(each.face), np.asarray(each.normal) @ axes.T, size))
+    scene = join([make_mesh(p, f, normal=n.astype(np.float32)) for p, f, n, _ in parts])
+    frame = directions.frame(scene.normal, scene.tangent)
+    white = bounces.functions.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
+    occluder = visibility.Occluder(scene)
+    start = visibility.start_points(scene, occluder)
+    size = 32
+    found = bounces.gather.rays(
+        occluder, start, np.asarray(scene.normal), np.asarray(frame), np.asarray(scene.region), size=size
+    )
+    way, area = (np.asarray(x(size=size)).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
+    flux = np.maximum(np.asarray(scene.normal) @ area.T, 0) / np.pi
+    weight = float(bounces.functions.fixed_weights(separable.factor(Lambert(1.0), terms=1, resolution=8))[0, 0])
+    received = []
+    for number, (_, _, _, edge) in enumerate(parts):
+        shining = np.zeros((len(start), 1, 1), np.float32) + np.float32(np.pi) / np.float32(
+            np.asarray(white.light_map).mean()
+        )
+        rays = found[1 - number]
+        each = flux[rays.owner[:, None], rays.texel][..., None]
+        fixed = (rays.owner, rays.corner, rays.weight, way[rays.texel], each)
+        arrived = np.asarray(bounces.gather.arrive(jnp.asarray(shining), frame, white, *fixed, points=len(start)))
+        own = np.asarray(scene.region) == number
+        cells = round(np.sqrt(own.sum()))
+        line = np.ones(cells)
+        line[[0, -1]] = 0.5  # the trapezoidal rule
+        mean = np.average(arrived[own, 0, 0, 0], weights=np.outer(line, line).ravel()) * weight
+        received.append((2 * edge) ** 2 * mean)
+    assert received[0] > 0.1
+    np.testing.assert_allclose(received[0], received[1], rtol=1e-5)
+
+
+def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
+    options = {"edge": EDGE, "size": SIZE, "progress": False}
+    cut = bounces.precompute(mesh, brdfs, components=20, modes=24, bounces=1, **options)
+    assert cut.nbytes < whole.nbytes / 10
+    assert cut.second is None
+    # A color for each wavelet and function.
+    texels, functions = 6 * EDGE**2, 3
+    spectrum = np.tile(np.asarray(haar.area(size=EDGE)).ravel(), 6) ** 0.4
+    faces = np.repeat(np.diag(spectrum), functions, axis=1).reshape(6, EDGE, EDGE, -1).astype(np.float32)
+    lamp = Environment(haar.inverse(jax.device_put(faces)))
+    weight = jnp.tile(jnp.diag(bounces.tensor.scales(whole.factor)), texels)
+    exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
+    assert float(cut.error[0]) > 0.01
+    np.testing.assert_allclose(relative(found, exact), float(cut.error[0]), rtol=1e-3)
+    shorter = whole.keep(20, modes=24)
+    np.testing.assert_allclose(shorter.error, cut.error, rtol=5e-3)
+    exact, short, found = (arriving(each, light(3))[0] for each in (whole, shorter, cut))
+    np.testing.assert_allclose(relative(short, exact), relative(found, exact), rtol=1e-3)
+    with pytest.raises(ValueError, match=r"at most \(51, 96\), got 0, 3"):
+        whole.keep(0, modes=3)
+
+
+def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
+    few = whole.shorten(error=0.1)
+    assert 0.05 < float(few.error[0]) <= 0.1
+    components, modes = few.core.shape[2], few.core.shape[1]
+    assert float(whole.keep(components - 1, modes=modes).error[0]) > 0.1
+    assert float(whole.keep(components, modes=modes - 1).error[0]) > 0.1
+    small = whole.shorten(nbytes=few.nbytes)
+    assert small.nbytes <= few.nbytes
+    assert float(small.error[0]) <= float(few.error[0])
+    with pytest.raises(ValueError, match="give either error or nbytes, got error=None and nbytes=None"):
+        whole.shorten()
+    with pytest.raises(ValueError, match=r"nbytes must be at least \d+, got 10"):
+        whole.shorten(nbytes=10)
+    with pytest.raises(ValueError, match="error must be at least"):
+        few.shorten(error=0.01)
+
+
+def test_what_brings_little_is_left_out_and_told(mesh, capsys):
+    members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
+    changing = bounces.factor(members, functions=2, terms=6, resolution=12)
+    dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
+    options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
+    every = bounces.precompute(mesh, [changing, dark], progress=False, **options)
+    few = bounces.precompute(mesh, [changing, dark], least=0.05, **options)
+    assert len(every.function) == 4
+    assert every.second is not None
+    assert few.second is None
+    assert len(few.function) < 4
+    assert few.nbytes < every.nbytes
+    told = capsys.readouterr()
+    assert "left out the second bounce" in told.out + told.err
+    assert f"of {len(every.function)} functions" in told.out + told.err
+    np.testing.assert_allclose(few.worth[0], every.worth[0], rtol=1e-5)
+    assert few.worth[1] < 0.05
+
+
+def test_a_coarse_light_is_where_the_light_is():
+    np.testing.assert_allclose(bounces.relight.coarse(jnp.full((6, 16, 16, 1), 0.3), edge=4), 0.3, rtol=1e-5)
+    fine = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
+    wide, narrow = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (4, 16))
+    flux = np.sum(bounces.relight.coarse(fine, edge=4) * wide, 0)
+    np.testing.assert_allclose(flux, (narrow * fine.reshape(-1, 3)).sum(0), rtol=0.002)
+    np.testing.assert_allclose(bounces.relight.coarse(fine, edge=16), fine.reshape(-1, 3), rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="must divide the light's 16, got 5"):
+        bounces.relight.coarse(fine, edge=5)
+
+
+@pytest.mark.parametrize("size", [4, 8])
+def test_the_middle_of_a_sun_stays_in_place(size):
+    """Within .04 of a coarse texel; in the middle of one alone it would be off by up to .7."""
+    area = np.asarray(cubemap.solid_angle(size=size)).ravel()
+    place, fine = (np.asarray(cubemap.point(size=n)).reshape(-1, 3) for n in (size, 64))
+    texels = np.random.default_rng(2).integers(0, 64**2, 60)
+    suns = np.zeros((6 * 64**2, len(texels)), np.float32)
+    suns[texels, np.arange(len(texels))] = 1  # A color for each.
+    flux = np.asarray(bounces.relight.coarse(jax.device_put(suns.reshape(6, 64, 64, -1)), edge=size)) * area[:, None]
+    at = fine[texels]
+    own = np.sort(np.abs(at))[:, 1] <= 1 - 1 / size  # Others are shared with other faces.
+    flux, at = flux[:, own], at[own]
+    off = np.linalg.norm(flux.T @ place / flux.sum(0)[:, None] - at, axis=1) / (2 / size)
+    total = np.asarray(cubemap.solid_angle(size=64)).ravel()[texels[own]]
+    np.testing.assert_allclose(flux.sum(0), total, rtol={4: 0.05, 8: 0.025}[size])
+    assert len(off) > 20
+    assert max(off) < 0.04
+
+
+def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
+    options = {"components": 8, "modes": 8, "edge": 2, "size": 8, "progress": False, "path": tmp_path / "bounce"}
+    first, again = (bounces.precompute(mesh, brdfs, **options) for _ in range(2))
+    np.testing.assert_array_equal(first.core, again.core)
+    np.testing.assert_array_equal(first.second.core, again.second.core)
+    with pytest.raises(ValueError, match="something else"):
+        bounces.precompute(mesh, brdfs[::-1], **options)
+
+
+def test_what_makes_no_tensor_is_refused(mesh, brdfs):
+    with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
+        bounces.precompute(mesh, brdfs[:1], progress=False)
+    with pytest.raises(ValueError, match="a power of two, got 0, 64, 8 and 16"):
+        bounces.precompute(mesh, brdfs, components=0, progress=False)
+    with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
+        bounces.precompute(mesh, brdfs, edge=6, progress=False)
+    with pytest.raises(ValueError, match="bounces must be 1 or 2, got 3"):
+        bounces.precompute(mesh, brdfs, bounces=3, progress=False)
+
+
+def test_the_default_number_of_components_keeps_the_light_of_two_bounces(whole):
+    short = whole.keep(32, modes=64)
+    found, exact = (np.sum(arriving(each, light(4))[1][:, 0]) for each in (short, whole))
+    assert found > 0.98 * exact

@@ -1,0 +1,340 @@
+"""Relighting by harmonics: all ways to the same radiance, closed forms without shadows, probes, and the reference."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import harmonic, reference
+from jaxprt.brdf import Phong
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.sphere import cubemap, directions, harmonics
+from jaxprt.systems.harmonic import HarmonicBrdf, TransferMatrix, TransferVector, precompute, tabulate
+
+EYE = jnp.array([2.0, 3.0, 4.0])
+ALBEDO = [0.8, 0.5, 0.2]
+# Shadows are not carried by degree 4 alone; for a smooth light, relative to the norm over all vertices.
+SHADOWED = 0.03
+UNSHADOWED = 0.01  # Bilinear lookup on 16 x 16 texels, and the reference's sum over texels.
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(11)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A sphere that touches a ground."""
+    ground = make_mesh(
+        np.array([[-3, -1, -3], [-3, -1, 3], [3, -1, 3], [3, -1, -3.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    return join([builtin.sphere(rings=6, sectors=10), ground])
+
+
+@pytest.fixture(scope="module")
+def transport(mesh):
+    return precompute(mesh, size=16, progress=False)
+
+
+@pytest.fixture(scope="module")
+def glossy():
+    return tabulate(Phong(diffuse=ALBEDO, specular=[0.1, 0.3, 0.1], exponent=6.0), resolution=16)
+
+
+@pytest.fixture(scope="module")
+def light():
+    """Two broad lobes of light that degree 4 carries to a thousandth."""
+    direction = np.asarray(cubemap.direction(size=32))
+    radiance = np.zeros((6, 32, 32, 3))
+    for axis, color in (
+        ((0.6, 0.8, 0), (1.0, 2, 3)),
+        ((-0.48, 0.6, 0.64), (2.0, 1, 0.5)),
+        ((0, -1, 0), (0.2, 0.4, 0.1)),
+    ):
+        radiance += np.exp(2 * (direction @ np.array(axis) - 1))[..., None] * color
+    return Environment(jnp.asarray(radiance, jnp.float32))
+
+
+@pytest.fixture(scope="module")
+def coefficient(light):
+    return harmonic.project(light, degree=4)
+
+
+def made(random, *, vertices=5, transported=1, colors=3, terms=9):
+    """Random transport and a random table."""
+    frame = np.linalg.qr(random.normal(size=(vertices, 3, 3)))[0]
+    frame = frame * np.sign(np.linalg.det(frame))[:, None, None]
+    array = [random.normal(size=(vertices, transported, terms, terms)), random.normal(size=(vertices, 3)), frame]
+    matrix = TransferMatrix(*(jnp.asarray(each, jnp.float32) for each in array))
+    table = jnp.asarray(random.normal(size=(terms, colors, 4, 4)), jnp.float32)
+    return matrix, HarmonicBrdf(table, (), jnp.zeros(()))
+
+
+def normal(random, *shape):
+    return jnp.asarray(random.normal(size=shape), jnp.float32)
+
+
+@pytest.mark.parametrize("transported", [1, 3])
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("lights", [(3,), (1, 5)])
+def test_all_ways_with_transfer_give_the_same_radiance(random, close, transported, colors, lights):
+    matrix, brdf = made(random, transported=transported, colors=colors)
+    light = normal(random, 9, *lights)
+    view = harmonic.view_coefficients(brdf, matrix.position, matrix.frame, eye=EYE)
+    several = light if light.ndim == 3 else jnp.broadcast_to(light[..., None], (*light.shape, 5))
+    expected = np.einsum(
+        "vcoi,icv,ocv->vc",
+        *np.broadcast_arrays(np.zeros((5, 3, 9, 9)), matrix.matrix)[1:],
+        np.broadcast_to(several, (9, 3, 5)),
+        np.broadcast_to(view, (9, 3, 5)),
+    )
+    expected = expected[:, : max(transported, colors, lights[0])]
+    assert np.abs(expected).max() > 0.1
+    close(harmonic.radiance(matrix, brdf, light, eye=EYE), expected)
+    close(harmonic.combine(harmonic.transferred_light(matrix, light), view), expected)
+    close(harmonic.combine(light, harmonic.transferred_view(matrix, view)), expected)
+
+
+@pytest.mark.parametrize("lights", [(3,), (1, 61)])
+def test_all_ways_without_transfer_give_the_same_radiance(random, close, lights):
+    mesh = builtin.sphere(rings=6, sectors=10)
+    vertices = len(mesh.position)
+    lights = lights[:1] if len(lights) == 1 else (lights[0], vertices)
+    brdf, light = made(random)[1], normal(random, 9, *lights)
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    view = harmonic.view_coefficients(brdf, mesh.position, frame, eye=EYE)
+    expected = harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE)
+    assert expected.shape == (vertices, 3)
+    close(harmonic.combine(harmonic.local_light(frame, light), view), expected)
+    close(harmonic.combine(light, harmonic.world_view(frame, view)), expected)
+    # An open vertex's transfer is the rotation.
+    seen = jnp.full((vertices, 6), 16, jnp.uint8)
+    matrix = harmonic.transfer.transfer(seen, frame, degree=2)[:, None]
+    close(
+        harmonic.radiance(TransferMatrix(matrix, mesh.position, frame), brdf, light, eye=EYE), expected, tolerance=2e-5
+    )
+
+
+def test_unshadowed_radiance_is_the_integral_of_light_times_table(random):
+    """By a product rule that is exact for both: nothing of ours but evaluation and lookup is between."""
+    matrix, brdf = made(random)
+    light = normal(random, 9, 3)
+    mesh = make_mesh(matrix.position, np.array([[0, 1, 2]]), normal=matrix.frame[:, 2], tangent=matrix.frame[:, 0])
+    node, weight = np.polynomial.legendre.leggauss(6)
+    angle = 2 * np.pi * np.arange(9) / 9
+    radius = np.sqrt(1 - node**2)[:, None]
+    wi = np.stack([radius * np.cos(angle), radius * np.sin(angle), node[:, None] + 0 * angle], -1).reshape(-1, 3)
+    arriving = np.asarray(harmonics.reconstruct(light, jnp.asarray(wi, jnp.float32)))
+    wo = directions.view(harmonic.relight.right_handed(matrix.frame), mesh.position, EYE)
+    color = harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE)
+    for vertex in range(5):
+        local = jnp.asarray(wi @ np.asarray(matrix.frame[vertex]).T, jnp.float32)
+        value = brdf(local, jnp.broadcast_to(wo[vertex], local.shape))
+        expected = (np.repeat(weight, 9) * 2 * np.pi / 9) @ (arriving * value)
+        np.testing.assert_allclose(color[vertex], expected, atol=1e-4)
+
+
+def test_one_light_for_all_is_the_same_light_at_each_vertex(random, close):
+    matrix, brdf = made(random)
+    mesh = make_mesh(matrix.position, np.array([[0, 1, 2]]), normal=matrix.frame[:, 2], tangent=matrix.frame[:, 0])
+    light = normal(random, 9, 3)
+    each = jnp.broadcast_to(light[..., None], (9, 3, 5))
+    for made_of, relight in ((matrix, harmonic.radiance), (mesh, harmonic.unshadowed_radiance)):
+        close(relight(made_of, brdf, each, eye=EYE), relight(made_of, brdf, light, eye=EYE))
+
+
+def test_each_vertex_meets_its_own_light(random, close):
+    matrix, brdf = made(random)
+    light = normal(random, 9, 3, 5)
+    actual = harmonic.radiance(matrix, brdf, light, eye=EYE)
+    for vertex in range(5):
+        close(actual[vertex], harmonic.radiance(matrix, brdf, light[..., vertex], eye=EYE)[vertex])
+
+
+def test_gray_is_three_equal_colors(random, close):
+    matrix, brdf = made(random, colors=1)
+    light = normal(random, 9, 1)
+    gray = harmonic.radiance(matrix, brdf, light, eye=EYE)
+    assert gray.shape == (5, 1)
+    colored = eqx.tree_at(lambda b: b.table, brdf, jnp.repeat(brdf.table, 3, 1))
+    thrice = eqx.tree_at(lambda m: m.matrix, matrix, jnp.repeat(matrix.matrix, 3, 1))
+    for one in (matrix, thrice):
+        for table in (brdf, colored):
+            for shine in (light, jnp.repeat(light, 3, 1)):
+                actual = harmonic.radiance(one, table, shine, eye=EYE)
+                close(actual, jnp.repeat(gray, actual.shape[1], 1))
+
+
+def test_radiance_is_linear_in_light_and_table(random, close):
+    matrix, brdf = made(random)
+    first, second = normal(random, 9, 3), normal(random, 9, 3)
+    whole = harmonic.radiance(matrix, brdf, 2 * first - 3 * second, eye=EYE)
+    part = [harmonic.radiance(matrix, brdf, each, eye=EYE) for each in (first, second)]
+    close(whole, 2 * part[0] - 3 * part[1])
+
+
+def test_smooth_light_without_shadows_is_that_of_the_reference(light, coefficient, glossy):
+    mesh = builtin.sphere(rings=6, sectors=10)
+    for table, brdf in ((glossy, Phong(diffuse=ALBEDO, specular=[0.1, 0.3, 0.1], exponent=6.0)),):
+        expected = reference.radiance(mesh, brdf, light, eye=EYE)
+        actual = harmonic.unshadowed_radiance(mesh, table, coefficient, eye=EYE)
+        assert np.linalg.norm(actual - expected) < UNSHADOWED * np.linalg.norm(expected)
+
+
+def test_smooth_light_with_shadows_is_that_of_the_reference(mesh, light, coefficient, glossy, transport):
+    brdf = Phong(diffuse=ALBEDO, specular=[0.1, 0.3, 0.1], exponent=6.0)
+    expected = np.asarray(reference.radiance(mesh, brdf, light, eye=EYE))
+    open_sky = harmonic.unshadowed_radiance(mesh, glossy, coefficient, eye=EYE)
+    assert np.linalg.norm(open_sky - expected) > 3 * SHADOWED * np.linalg.norm(expected), "there are shadows"
+    actual = harmonic.radiance(transport, glossy, coefficient, eye=EYE)
+    assert np.linalg.norm(actual - expected) < SHADOWED * np.linalg.norm(expected)
+
+
+def test_diffuse_radiance_is_that_of_the_reference(mesh, light, coefficient):
+    vector = harmonic.precompute_diffuse(mesh, size=16, progress=False)
+    albedo = np.random.default_rng(0).uniform(size=(len(mesh.position), 3)).astype(np.float32)
+    color = np.asarray(harmonic.diffuse_radiance(vector, jnp.asarray(albedo), coefficient))
+    above = EYE + 10 * mesh.normal[0]  # Some eye; vertices that it does not see are zero in the reference alone.
+    white = Phong(diffuse=[1.0, 1.0, 1.0], specular=[0.0, 0.0, 0.0], exponent=6.0)  # Lambert, by a shared program.
+    expected = np.asarray(reference.radiance(mesh, white, light, eye=above))
+    seen = expected.any(1)
+    assert seen.sum() > 20
+    assert np.linalg.norm((color - expected * albedo)[seen]) < UNSHADOWED * np.linalg.norm(expected[seen])
+    one = harmonic.diffuse_radiance(vector, jnp.asarray(0.5), coefficient)
+    assert np.linalg.norm(2 * one[seen] - expected[seen]) < UNSHADOWED * np.linalg.norm(expected[seen])
+
+
+def test_varying_brdfs_have_the_table_of_each_vertex_parameter(random, coefficient, close):
+    mesh = builtin.sphere(rings=4, sectors=6)
+    knot = np.array([0.0, 0.5, 1.0])
+    varying = HarmonicBrdf(normal(random, 4, 3, 3, 4, 4), (jnp.asarray(knot, jnp.float32),), jnp.zeros(()))
+    choice = random.integers(3, size=len(mesh.position))
+    actual = harmonic.unshadowed_radiance(
+        mesh, varying, coefficient[:4], jnp.asarray(knot[choice], jnp.float32), eye=EYE
+    )
+    for number in range(3):
+        single = HarmonicBrdf(varying.table[:, :, number], (), varying.error)
+        expected = harmonic.unshadowed_radiance(mesh, single, coefficient[:4], eye=EYE)
+        close(actual[choice == number], expected[choice == number])
+
+
+def test_light_at_probes_is_exact_and_equal_probes_are_constant(random, close):
+    probe, value = normal(random, 4, 3), normal(random, 4, 9, 3)
+    close(harmonic.probe_light(probe, probe, value), jnp.moveaxis(value, 0, -1))
+    place = normal(random, 50, 3)
+    same = jnp.broadcast_to(value[0], value.shape)
+    close(harmonic.probe_light(place, probe, same), jnp.broadcast_to(value[0][..., None], (9, 3, 50)))
+    close(harmonic.probe_light(place, probe[:1], value[:1]), jnp.broadcast_to(value[0][..., None], (9, 3, 50)))
+
+
+def test_light_between_probes_is_a_mean_of_theirs(random):
+    probe, value = normal(random, 4, 3), normal(random, 4, 4, 1)
+    between = np.asarray(harmonic.probe_light(normal(random, 100, 3), probe, value))
+    assert (between >= np.min(value, 0)[..., None] - 1e-5).all()
+    assert (between <= np.max(value, 0)[..., None] + 1e-5).all()
+    middle = harmonic.probe_light((probe[:1] + probe[1:2]) / 2, probe[:2], value[:2])
+    np.testing.assert_allclose(middle[..., 0], (value[0] + value[1]) / 2, atol=1e-5)
+
+
+def test_light_next_to_a_probe_is_its_own_and_far_away_the_mean(random, close):
+    probe, value = normal(random, 4, 3), normal(random, 4, 4, 1)
+    for distance in (1e-30, 1e-12, 1e-4):
+        close(harmonic.probe_light(probe + distance, probe, value), jnp.moveaxis(value, 0, -1), tolerance=1e-3)
+    far = harmonic.probe_light(jnp.full((1, 3), 1e12), probe, value)
+    close(far[..., 0], jnp.mean(value, 0), tolerance=1e-3)
+
+
+def test_gradients_at_probes_are_finite(random):
+    probe, value = normal(random, 3, 3), normal(random, 3, 4, 1)
+    twice = jnp.concatenate([probe, probe[:1]])
+    for where in (probe, twice):
+        gradient = jax.grad(lambda p, where=where: jnp.sum(harmonic.probe_light(p, where, value[: len(where)]) ** 2))
+        if len(where) == 3:
+            assert np.isfinite(np.asarray(gradient(probe))).all()
+    doubled = jnp.concatenate([value, value[:1] + 2])
+    middle = harmonic.probe_light(probe[:1], twice, doubled)
+    np.testing.assert_allclose(middle[..., 0], value[0] + 1, rtol=1e-5)
+
+
+def test_left_handed_frames_count_as_right_handed(random, close):
+    matrix, brdf = made(random)
+    left = matrix.frame * jnp.array([1.0, -1, 1])[:, None]
+    light, seen = normal(random, 9, 3), jnp.asarray(random.integers(17, size=(5, 24)), jnp.uint8)
+    view = harmonic.view_coefficients(brdf, matrix.position, matrix.frame, eye=EYE)
+    close(harmonic.view_coefficients(brdf, matrix.position, left, eye=EYE), view)
+    close(harmonic.local_light(left, light), harmonic.local_light(matrix.frame, light))
+    close(harmonic.world_view(left, view), harmonic.world_view(matrix.frame, view))
+    close(*(harmonic.transfer.transfer(seen, each, degree=2) for each in (left, matrix.frame)))
+    mirrored = TransferMatrix(matrix.matrix, matrix.position, left)
+    close(harmonic.radiance(mirrored, brdf, light, eye=EYE), harmonic.radiance(matrix, brdf, light, eye=EYE))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("terms", [3, 10, 24])
+def test_counts_of_coefficients_that_are_no_square_are_refused(random, terms):
+    matrix, brdf = made(random)
+    light, message = normal(random, terms, 3), f"must be a square number, got {terms}"
+    view = harmonic.view_coefficients(brdf, matrix.position, matrix.frame, eye=EYE)
+    mesh = builtin.sphere(rings=3, sectors=3)
+    vector = TransferVector(normal(random, 9, 1, 5), matrix.position)
+    for refused in (
+        lambda: harmonic.radiance(matrix, brdf, light, eye=EYE),
+        lambda: harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE),
+        lambda: harmonic.transferred_light(matrix, light),
+        lambda: harmonic.local_light(matrix.frame, light),
+        lambda: harmonic.combine(light, view),
+        lambda: harmonic.diffuse_radiance(vector, jnp.ones(()), light),
+    ):
+        with pytest.raises(ValueError, match=message):
+            refused()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_degrees_that_differ_are_refused(random):
+    matrix, brdf = made(random)
+    light = normal(random, 25, 3)
+    mesh = builtin.sphere(rings=3, sectors=3)
+    vector = TransferVector(normal(random, 9, 1, 5), matrix.position)
+    _, high = made(random, terms=16)
+    for refused in (
+        lambda: harmonic.radiance(matrix, brdf, light, eye=EYE),
+        lambda: harmonic.unshadowed_radiance(mesh, brdf, light, eye=EYE),
+        lambda: harmonic.transferred_light(matrix, light),
+        lambda: harmonic.diffuse_radiance(vector, jnp.ones(()), light),
+    ):
+        with pytest.raises(ValueError, match=r"the light must have the degree of .*, 2, got 4"):
+            refused()
+    with pytest.raises(ValueError, match="the BRDF must have the degree of the transport, 2, got 3"):
+        harmonic.radiance(matrix, high, normal(random, 9, 3), eye=EYE)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_numbers_of_colors_that_differ_are_refused(random):
+    matrix, brdf = made(random)
+    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+        harmonic.combine(normal(random, 9, 2), normal(random, 9, 3, 5))
+    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+        harmonic.radiance(matrix, brdf, normal(random, 9, 2), eye=EYE)
+    colored = made(random, transported=3)[0]
+    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+        harmonic.transferred_light(colored, normal(random, 9, 2))
+    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+        harmonic.transferred_view(colored, normal(random, 9, 2, 5))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_lights_of_other_vertices_are_refused(random):
+    matrix, brdf = made(random)
+    light = normal(random, 9, 3, 4)
+    view = harmonic.view_coefficients(brdf, matrix.position, matrix.frame, eye=EYE)
+    for refused in (
+        lambda: harmonic.radiance(matrix, brdf, light, eye=EYE),
+        lambda: harmonic.transferred_light(matrix, light),
+        lambda: harmonic.local_light(matrix.frame, light),
+        lambda: harmonic.combine(light, view),
+    ):
+        with pytest.raises((ValueError, TypeError)):
+            refused()

@@ -1,0 +1,163 @@
+"""Visibility pyramids: bits, means, and what a vertex sees of a lobe, against sums over all texels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import harmonic, lobe, visibility
+from jaxprt.decompose import mixture
+from jaxprt.scene import builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.sphere import cubemap
+
+SIZE = 16
+BYTE = 2e-3  # half a step of a byte
+# A pyramid's boxes and tents are no normal distribution: at most .047 was measured, root mean square.
+FRACTION = 0.06
+
+
+@pytest.fixture(scope="module")
+def visible():
+    """A ball over the ground: vertices with contact shadows, and ground vertices near them."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def compressed(visible):
+    return lobe.compress(visible)
+
+
+@pytest.fixture(scope="module")
+def seen(visible):
+    return visible.seen(np.arange(len(visible.position)))
+
+
+def read(transport, direction, spread):
+    """Shares of one lobe in the same world direction for all vertices."""
+    count = len(transport.position)
+    face, s, t = cubemap.project(*(jnp.full((1, count), float(x)) for x in direction))
+    return transport.share(face, s, t, jnp.full((1, count), spread))
+
+
+def exact(seen, direction, spread):
+    """Mean visibility over a von Mises-Fisher lobe, by all texels."""
+    size = int(np.sqrt(seen.shape[1] / 6))
+    center = np.asarray(cubemap.direction(size=size), np.float64).reshape(-1, 3)
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64).ravel()
+    concentration = float(mixture.concentration_of(jnp.asarray(spread)))
+    weight = area * np.exp(concentration * (center @ direction - 1))
+    return seen @ (weight / weight.sum()) / 16
+
+
+def test_single_texels_are_seen_where_at_least_half_of_them_is(compressed, seen):
+    texel = np.random.default_rng(0).permutation(seen.shape[1])[:200]
+    value = np.asarray(compressed.visible(jnp.asarray(texel)))
+    np.testing.assert_array_equal(value, (seen[:, texel] >= 8).T)
+
+
+def test_every_texel_is_its_own_bit(seen):
+    level = lobe.pyramid.pyramid(jnp.asarray(seen))
+    blank = lobe.LobeTransport(
+        level, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
+    )
+    np.testing.assert_array_equal(np.asarray(blank.visible(jnp.arange(seen.shape[1]))), (seen >= 8).T)
+
+
+def test_a_pyramid_takes_six_kilobytes():
+    assert lobe.pyramid.scales(64).total <= 6000
+
+
+@pytest.mark.parametrize("value", [0, 16])
+def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
+    level = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
+    transport = lobe.LobeTransport(level, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
+    for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
+        for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
+            share, by_s, by_t = read(transport, direction, spread)
+            np.testing.assert_allclose(share, value / 16, atol=1e-6)
+            np.testing.assert_allclose(jnp.stack([by_s, by_t]), 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("spread", [3e-3, 0.01, 0.03, 0.1, 0.3])
+def test_shares_are_the_means_over_lobes(compressed, seen, spread):
+    random = np.random.default_rng(0).normal(size=(12, 3))
+    wrong = []
+    for direction in random / np.linalg.norm(random, axis=1, keepdims=True):
+        share, *_ = read(compressed, direction, spread)
+        wrong.append(np.asarray(share)[0] - exact(seen, direction, spread))
+    assert np.sqrt(np.mean(np.square(wrong))) < FRACTION
+
+
+def test_shares_at_a_scale_of_bytes_are_its_means(compressed, seen):
+    """At the center of a texel, and at the scale's own spread, nothing is interpolated."""
+    scale = lobe.pyramid.scales(SIZE)
+    mean = seen.reshape(-1, 6, 4, 4, 4, 4).astype(float) / 16
+    area = np.asarray(cubemap.solid_angle(size=SIZE)).reshape(6, 4, 4, 4, 4)
+    mean = (mean * area).sum((3, 5)) / area.sum((2, 4))
+    for face, row, column in ((0, 1, 2), (3, 2, 1), (5, 0, 3)):
+        direction = np.asarray(cubemap.direction(size=4))[face, row, column]
+        share, *_ = read(compressed, direction, float(scale.spread[2]))
+        np.testing.assert_allclose(share[0], mean[:, face, row, column], atol=BYTE + 1e-5)
+
+
+def test_slopes_are_those_of_the_shares(compressed):
+    count, step = len(compressed.position), 1e-3
+    random = np.random.default_rng(1)
+    face = jnp.asarray(random.integers(6, size=(3, count)))
+    s, t = (jnp.asarray(random.uniform(-0.9, 0.9, (3, count)), jnp.float32) for _ in range(2))
+    spread = jnp.asarray(random.uniform(0.02, 0.4, (3, count)), jnp.float32)
+    _, by_s, by_t = compressed.share(face, s, t, spread)
+    along_s = (compressed.share(face, s + step, t, spread)[0] - compressed.share(face, s - step, t, spread)[0]) / (
+        2 * step
+    )
+    along_t = (compressed.share(face, s, t + step, spread)[0] - compressed.share(face, s, t - step, spread)[0]) / (
+        2 * step
+    )
+    for slope, difference in ((by_s, along_s), (by_t, along_t)):
+        near = np.isclose(slope, difference, atol=5e-3)
+        assert near.mean() > 0.95  # The rest lies across the line between texel centers, where slopes jump.
+
+
+def test_slopes_are_what_differentiation_gives(compressed):
+    face, s, t = cubemap.project(*(jnp.full((1, len(compressed.position)), x) for x in (0.3, 0.9, 0.2)))
+    spread = jnp.full(s.shape, 0.05)
+    _, by_s, by_t = compressed.share(face, s, t, spread)
+    gradient = jax.grad(lambda s, t: jnp.sum(compressed.share(face, s, t, spread)[0]), argnums=(0, 1))(s, t)
+    np.testing.assert_allclose(gradient[0], by_s, atol=1e-5)
+    np.testing.assert_allclose(gradient[1], by_t, atol=1e-5)
+
+
+def test_shares_are_continuous_over_the_edges_of_the_cube(compressed):
+    """At scales of bytes, whose faces have a rim; bits end at the edge."""
+    for spread in (0.05, 0.2):
+        for one, other in (([1, 0.3, 0.9999], [0.9999, 0.3, 1]), ([-0.2, 1, 0.9999], [-0.2, 0.9999, 1])):
+            first, second = (np.asarray(read(compressed, x, spread)[0]) for x in (one, other))
+            np.testing.assert_allclose(first, second, atol=2e-3)
+
+
+def test_transfer_vectors_are_those_of_the_harmonic_system(compressed, visible, seen, close):
+    expected = harmonic.transfer.transfer_diffuse(jnp.asarray(seen), visible.frame, degree=lobe.pyramid.DEGREE)
+    close(compressed.vector, expected)
+
+
+def test_tracing_gives_what_compressing_known_visibility_gives(visible, compressed, close, tmp_path):
+    ball = builtin.sphere(rings=8, sectors=10)
+    scene = join([ball, ground_plane(ball, vertices=36)])
+    chosen = np.arange(0, len(scene.position), 7)
+    traced = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
+    again = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
+    # Known visibility is in four bits, in which 9 sixteenths are 8.
+    assert np.mean(np.asarray(traced.level) != np.asarray(compressed.level)[chosen]) < 0.05
+    assert (
+        np.max(np.abs(np.asarray(traced.level)[:, -96:].astype(int) - np.asarray(compressed.level)[chosen, -96:])) <= 2
+    )
+    close(traced.vector, compressed.vector[:, chosen], tolerance=1e-3)
+    np.testing.assert_array_equal(traced.level, again.level)
+
+
+@pytest.mark.parametrize("size", [4, 12, 0])
+def test_other_sizes_are_refused(size):
+    with pytest.raises(ValueError, match=rf"size must be a power of two, at least 8, got {size}"):
+        lobe.precompute(builtin.sphere(rings=4, sectors=5), size=size)

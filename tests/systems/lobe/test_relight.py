@@ -1,0 +1,201 @@
+"""Relighting by lobes against the sum over all texels."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import bright_texels, lobe, reference, visibility
+from jaxprt.brdf import AshikhminShirley, CookTorrance
+from jaxprt.decompose import mixture
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.sphere import cubemap
+
+pytestmark = pytest.mark.usefixtures("few_samples")
+SIZE = 16
+EYE = jnp.array([1.2, 1.5, 2.5])
+# Errors of total radiance; what was measured, and half as much again.
+COARSE = {"matte": 0.01, "glossy": 0.03, "sharp": 0.021, "brushed": 0.013}
+FURNACE = 0.0125  # Of all vertices together, measured .0083: pyramids and lookups blur the horizon.
+GRAZING = 0.085  # Of the worst vertex, measured .056.
+BLUR = 0.08  # Measured .077 at the finest scale that texels resolve: the lookup's tent is taken out of the blur.
+COVARIANCE = 0.05  # Of the covariance, what terms of higher order leave: measured .034.
+BRDFS = {
+    "matte": CookTorrance(diffuse=[0.8, 0.5, 0.2], specular=0.0),  # Lambert, by programs that the next two share.
+    "glossy": CookTorrance(diffuse=[0.0, 0.0, 0.0], roughness=0.3),
+    "sharp": CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.1),
+    "brushed": AshikhminShirley(nu=8, nv=60),
+}
+
+
+def seen_from(depth):
+    """The visibility of a ball and of the ground that far below it."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    ground = ground_plane(ball, vertices=36)
+    below = eqx.tree_at(lambda mesh: mesh.position, ground, ground.position - jnp.array([0, depth, 0]))
+    return visibility.precompute(join([ball, below]), size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def visible():
+    """A ball on the ground."""
+    return seen_from(0.0)
+
+
+@pytest.fixture(scope="module")
+def transport(visible):
+    return lobe.compress(visible)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return {name: lobe.tabulate(brdf, lobes=6, resolution=16) for name, brdf in BRDFS.items()}
+
+
+@pytest.fixture(scope="module")
+def light():
+    return builtin.daylight(size=SIZE)
+
+
+def facing(visible):
+    """Vertices that the eye sees from above their horizon."""
+    return np.einsum("vi,vi->v", visible.frame[:, 2], EYE - visible.position) > 0
+
+
+def all_texels(visible, brdf, light):
+    seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
+    return np.asarray(reference.integrate(seen, visible.position, visible.frame, brdf, light, EYE))
+
+
+@pytest.mark.parametrize("name", BRDFS)
+def test_radiance_is_that_of_all_texels(name, visible, transport, tables, light, close):
+    texel, excess, rest = bright_texels.split(light, count=8)
+    color = lobe.radiance(transport, tables[name], rest, eye=EYE)
+    color = color + bright_texels.radiance(transport, BRDFS[name], texel, excess, eye=EYE)
+    seen = facing(visible)
+    close(np.asarray(color)[seen], all_texels(visible, BRDFS[name], light)[seen], tolerance=COARSE[name])
+
+
+def test_light_that_grows_towards_the_open_side_counts_more():
+    """Half of a lobe is seen, the bright half: the product of means is off by the covariance, which slopes bring."""
+    center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
+    area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
+    open_side = (center[:, 2] > 0) & (center[:, 0] > 0)
+    level = lobe.pyramid.pyramid(jnp.asarray(np.where(open_side, 16, 0)[None], jnp.uint8))
+    frame = jnp.eye(3)[None]
+    half = lobe.LobeTransport(level, jnp.zeros((49, 1)), jnp.zeros((1, 3)), frame, SIZE)
+    radiance = 1 + 0.8 * center[:, 0]
+    light = Environment(jnp.asarray(radiance.reshape(6, SIZE, SIZE, 1), jnp.float32))
+    for concentration in (8.0, 20.0, 60.0):
+        nodes = jnp.ones((1, 1, 4))
+        up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0])[:, None, None], (3, 1, 4))
+        one = lobe.LobeBrdf(up, jnp.log(concentration) * nodes[0], nodes, 0 * nodes[0], (), jnp.array(0.0))
+        weight = area * np.exp(concentration * (center[:, 2] - 1))
+        weight /= weight.sum()
+        exact, apart = weight @ (open_side * radiance), (weight @ open_side) * (weight @ radiance)
+        value = float(lobe.radiance(half, one, light, eye=jnp.array([0.0, 0.0, 5.0]))[0, 0])
+        assert abs(value - exact) < COVARIANCE * abs(apart - exact)
+
+
+def test_a_furnace_gives_back_its_albedo(tables):
+    """An open vertex under constant light: the lobes' energy, cut by the horizon."""
+    frames = seen_from(1e4)
+    open_above = lobe.compress(frames)
+    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
+    color = np.asarray(lobe.radiance(open_above, tables["glossy"], white, eye=EYE))
+    expected = all_texels(frames, BRDFS["glossy"], white)
+    seen = facing(frames) & (frames.position[:, 1] > -10)  # the ball
+    np.testing.assert_allclose(color[seen], expected[seen], rtol=GRAZING)
+    assert abs(color[seen].sum() / expected[seen].sum() - 1) < FURNACE
+
+
+def test_blurred_light_is_the_mean_over_lobes(light):
+    """Against sums over all texels, at the texel centers of each scale."""
+    filtered, scale = lobe.prefilter(light), lobe.relight.scales(SIZE)
+    center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
+    area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
+    radiance = np.asarray(light.radiance, np.float64).reshape(-1, 3)
+    for number in range(3, len(scale.edge)):
+        edge, start = int(scale.edge[number]), int(scale.start[number])
+        concentration = float(mixture.concentration_of(jnp.asarray(scale.spread[number])))
+        place = np.asarray(cubemap.direction(size=edge), np.float64).reshape(-1, 3)
+        weight = area * np.exp(concentration * (place @ center.T - 1))
+        expected = (weight / weight.sum(1, keepdims=True)) @ radiance
+        level = np.asarray(filtered.level)[:, start : start + 6 * (edge + 2) ** 2].reshape(3, 6, edge + 2, edge + 2)
+        value = level[:, :, 1:-1, 1:-1].reshape(3, -1).T
+        assert np.linalg.norm(value - expected) < BLUR * np.linalg.norm(expected)
+
+
+def test_constant_light_stays_constant_at_all_scales(close):
+    filtered = lobe.prefilter(Environment(jnp.full((6, SIZE, SIZE, 3), 2.5)))
+    close(filtered.level, np.full(filtered.level.shape, 2.5))
+
+
+def test_radiance_is_linear_in_the_light(transport, tables, light, close):
+    other = Environment(light.radiance[:, ::-1] ** 2)
+    both = Environment(2 * light.radiance + 3 * other.radiance)
+    one, two, three = (np.asarray(lobe.radiance(transport, tables["sharp"], x, eye=EYE)) for x in (light, other, both))
+    close(three, 2 * one + 3 * two)
+
+
+def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, tables, light, close):
+    gray = Environment(jnp.mean(light.radiance, -1, keepdims=True))
+    colored = Environment(jnp.repeat(gray.radiance, 3, -1))
+    for name in ("sharp", "brushed"):
+        color = lobe.radiance(transport, tables[name], gray, eye=EYE)
+        expected = lobe.radiance(transport, tables[name], colored, eye=EYE)
+        close(np.broadcast_to(color, expected.shape), expected)
+
+
+def test_the_halves_are_the_whole(transport, tables, light, close):
+    filtered, view = lobe.prefilter(light), lobe.look(transport, tables["brushed"], eye=EYE)
+    close(lobe.combine(filtered, view), lobe.radiance(transport, tables["brushed"], light, eye=EYE))
+
+
+def test_gradients_by_light_eye_and_table_are_finite_differences(transport, tables, light):
+    table = tables["sharp"]
+
+    def loss(light, table, eye):
+        return jnp.mean(lobe.radiance(transport, table, light, eye=eye) ** 2)
+
+    gradient = jax.grad(loss, argnums=(0, 1, 2), allow_int=True)(light, table, EYE)
+    step = 1e-2
+    by_light = (
+        loss(Environment(light.radiance * (1 + step)), table, EYE)
+        - loss(Environment(light.radiance * (1 - step)), table, EYE)
+    ) / (2 * step)
+    np.testing.assert_allclose(jnp.sum(gradient[0].radiance * light.radiance), by_light, rtol=2e-3)
+    weights = [
+        lobe.LobeBrdf(table.mean, table.scale, table.weight * (1 + x), table.diffuse, (), table.error)
+        for x in (step, -step)
+    ]
+    by_weight = (loss(light, weights[0], EYE) - loss(light, weights[1], EYE)) / (2 * step)
+    np.testing.assert_allclose(jnp.sum(gradient[1].weight * table.weight), by_weight, rtol=2e-3)
+    assert np.isfinite(gradient[2]).all()
+    assert np.abs(gradient[2]).max() > 0
+
+
+def test_a_light_of_another_size_is_refused(transport, tables):
+    with pytest.raises(ValueError, match=r"must have the transport's 16 texels, got 32"):
+        lobe.radiance(transport, tables["matte"], Environment(np.ones((6, 32, 32, 3), np.float32)), eye=EYE)
+
+
+def test_a_batch_of_lights_is_refused(light, unchecked):
+    with pytest.raises(ValueError, match=r"must be one environment \[6, n, n, c\].* got \[2, 6, 16, 16, 3\]"):
+        lobe.prefilter(Environment(jnp.stack([light.radiance] * 2)))
+
+
+def test_a_table_with_parameters_is_refused(transport, tables, light):
+    both = jax.tree.map(np.asarray, (tables["sharp"], tables["glossy"]))
+    mean, scale, weight, diffuse = (
+        np.stack([getattr(each, part) for each in both], axis)
+        for part, axis in (("mean", 2), ("scale", 1), ("weight", 2), ("diffuse", 1))
+    )
+    table = lobe.LobeBrdf(
+        *map(jnp.asarray, (mean, scale, weight, diffuse)), (jnp.log(jnp.array([0.1, 0.3])),), tables["sharp"].error
+    )
+    with pytest.raises(ValueError, match=r"has 1 parameters, which `at` must choose first"):
+        lobe.radiance(transport, table, light, eye=EYE)
+    assert np.isfinite(lobe.radiance(transport, table.at(jnp.asarray(-1.7)), light, eye=EYE)).all()

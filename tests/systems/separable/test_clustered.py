@@ -1,0 +1,443 @@
+"""Clustered principal components against dense transport and NumPy's singular values."""
+
+import pickle
+from concurrent.futures import Executor, Future
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import separable, visibility
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.scene import builtin
+from jaxprt.scene.mesh import join
+from jaxprt.sphere import directions, haar
+from jaxprt.systems.separable import SeparableBrdf, factor
+from jaxprt.systems.separable.clustered import cluster, precompute
+from jaxprt.systems.separable.wavelets import project
+
+SIZE = 8
+ALL = 6 * SIZE**2
+VERTICES = 39  # Three clusters of ten, and one of nine that repeats its last.
+CLUSTERS, TERMS = 4, 3
+WHOLE = {"clusters": CLUSTERS, "vectors": 10, "modes": 30, "keep": ALL}
+SMALL = {"clusters": CLUSTERS, "vectors": 4, "modes": 8, "keep": 100}
+HALF = 2e-3  # Numbers of half precision have 11 bits: modes and cores lose 5e-4 each; measured 3e-4 together.
+EYE = jnp.array([1.0, 2.0, 3.0])
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(2)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return join([builtin.sphere(rings=5, sectors=7), builtin.plane(cells=2)])
+
+
+@pytest.fixture(scope="module")
+def seen(mesh):
+    return visibility.precompute(mesh, size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def brdf():
+    return factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5, nu=20, nv=80), terms=TERMS, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def exact(seen, brdf):
+    """Transport of all vertices uncompressed, [v d r]."""
+    level = jnp.asarray(seen.seen(np.arange(VERTICES)))
+    return np.asarray(project(level, seen.frame, brdf)[..., 0], np.float64)
+
+
+@pytest.fixture(scope="module")
+def whole(seen, brdf):
+    """All vectors, modes and coefficients."""
+    return precompute(seen, brdf, progress=False, **WHOLE)
+
+
+@pytest.fixture(scope="module")
+def small(seen, brdf):
+    return precompute(seen, brdf, progress=False, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def importance():
+    """Rms of natural light by the area of a wavelet, as the module states it."""
+    return np.tile(np.asarray(haar.area(size=SIZE), np.float64).ravel(), 6) ** 0.4
+
+
+def dense(transport):
+    """The matrix that it stands for, [q d r], by NumPy in float64 from what is stored."""
+    parts = [np.asarray(each, np.float64) for each in (transport.mode, transport.core, transport.weight)]
+    value = np.einsum("pkl,plnr,pmn->pmkr", *parts)
+    result = np.zeros((*value.shape[:2], transport.rms.shape[0], value.shape[3]))
+    for number, index in enumerate(np.asarray(transport.index)):
+        result[number][:, index] = value[number]
+    return result.reshape(-1, *result.shape[2:])
+
+
+def by_vertex(transport):
+    return dense(transport)[np.asarray(transport.place)]
+
+
+def best(matrix, rank):
+    """The nearest matrix of some rank."""
+    u, s, v = np.linalg.svd(matrix, full_matrices=False)
+    return (u[:, :rank] * s[:rank]) @ v[:rank]
+
+
+def same(first, second):
+    for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+class Strangers(Executor):
+    """Workers that know no job until it is sent to them by pickle, and do not take them in order."""
+
+    def __init__(self):
+        self.count = 0
+
+    def submit(self, work, key, job, block):
+        """Answers at once."""
+        future = Future()
+        if job is not None:
+            self.count += 1
+        future.set_result(None if job is None else pickle.loads(pickle.dumps(job)).run(block))
+        return future
+
+
+def test_all_vectors_modes_and_coefficients_are_the_uncompressed_transport(whole, exact, close):
+    close(by_vertex(whole), exact, tolerance=HALF)
+    assert whole.index.shape == (CLUSTERS, ALL)
+    assert (whole.mode.shape, whole.core.shape) == ((CLUSTERS, ALL, 30), (CLUSTERS, 30, 10, TERMS))
+    assert (whole.weight.shape, whole.terms) == ((CLUSTERS, 10, 10), TERMS)
+
+
+@pytest.fixture(scope="module")
+def expected(seen, brdf):
+    """Radiance under daylight by uncompressed transport."""
+    level = jnp.asarray(seen.seen(np.arange(VERTICES)))
+    met = np.einsum("vdrl,dc->vrc", project(level, seen.frame, brdf), separable.project(builtin.daylight(size=SIZE)))
+    return np.sum(met * np.asarray(brdf.view(directions.view(seen.frame, seen.position, EYE))), 1)
+
+
+def test_all_of_it_lights_as_uncompressed_transport_does(whole, brdf, expected, close):
+    light = builtin.daylight(size=SIZE)
+    close(separable.radiance(whole, brdf, light, eye=EYE), expected, tolerance=HALF)
+    assert np.count_nonzero(expected.any(1)) > 10
+
+
+def test_errors_fall_with_vectors_modes_and_coefficients(whole, exact):
+    size = np.linalg.norm(exact)
+    for name, counts in (("vectors", (1, 4)), ("modes", (1, 8)), ("count", (6, 100))):
+        error = [np.linalg.norm(by_vertex(whole.keep(**{name: each})) - exact) / size for each in counts]
+        assert 1 > error[0] > error[1] > HALF
+
+
+def test_the_first_vectors_are_the_best_of_their_number(whole, exact, importance, close):
+    found = by_vertex(whole.keep(vectors=4)) * importance[:, None]
+    for vertex in np.asarray(whole.vertex).reshape(CLUSTERS, -1):
+        # A repeated vertex counts twice.
+        matrix = (exact[vertex] * importance[:, None]).reshape(len(vertex), -1)
+        close(found[vertex].reshape(matrix.shape), best(matrix, 4), tolerance=HALF)
+
+
+def test_the_first_modes_are_the_best_of_their_number(whole, exact, importance, close):
+    found = by_vertex(whole.keep(modes=8)) * importance[:, None]
+    for vertex in np.asarray(whole.vertex).reshape(CLUSTERS, -1):
+        matrix = np.moveaxis(exact[vertex] * importance[:, None], 1, 0).reshape(ALL, -1)
+        close(np.moveaxis(found[vertex], 1, 0).reshape(ALL, -1), best(matrix, 8), tolerance=HALF)
+
+
+def test_the_first_coefficients_and_terms_are_the_rows_and_columns_themselves(whole, close):
+    everything, part = dense(whole), whole.keep(50, terms=2)
+    expected = np.zeros((*everything.shape[:2], 2))
+    for number, index in enumerate(np.asarray(whole.index)[:, :50]):
+        row = slice(number * 10, (number + 1) * 10)
+        expected[row, index] = everything[row][:, index, :2]
+    close(dense(part), expected, tolerance=1e-12)
+    assert (part.terms, part.index.shape) == (2, (CLUSTERS, 50))
+    assert part.nbytes == CLUSTERS * (2 * 50 + 2 * 50 * 30 + 2 * 30 * 10 * 2 + 4 * 10 * 10)
+    same(whole.keep(), whole)
+
+
+def test_coefficients_are_chosen_by_energy_under_natural_light(whole, small, exact, importance):
+    for index, part, vertex in zip(
+        np.asarray(whole.index), np.asarray(small.index), np.asarray(whole.vertex).reshape(CLUSTERS, -1), strict=True
+    ):
+        np.testing.assert_array_equal(np.sort(index), np.arange(ALL))
+        np.testing.assert_array_equal(part, index[:100])
+        energy = np.sqrt(np.sum(exact[vertex] ** 2, (0, 2))) * importance
+        assert np.all(np.diff(energy[index]) <= 1e-5 * energy.max())
+
+
+def test_remainders_are_those_of_numpys_singular_values(seen, brdf, whole, exact, importance):
+    vertex = np.asarray(whole.vertex)[:10]
+    options = {name: value for name, value in SMALL.items() if name != "clusters"}
+    index, mode, core, weight, after_vectors, after_modes = separable.clustered.compress(
+        jnp.asarray(seen.seen(vertex)), seen.frame[vertex], brdf, **options
+    )
+    kept = (exact[vertex] * importance[:, None])[:, np.asarray(index)]
+    u, value, _ = np.linalg.svd(kept.reshape(10, -1), full_matrices=False)
+    total = np.sum(value**2)
+    np.testing.assert_allclose(after_vectors, 1 - np.cumsum([0, *value**2]) / total, atol=1e-5)
+    basis = np.einsum("mn,mkr->knr", u[:, :4], kept).reshape(100, -1)
+    strength = np.linalg.svd(basis, compute_uv=False)[:8] ** 2
+    np.testing.assert_allclose(after_modes, 1 - np.cumsum([0, *strength]) / total, atol=1e-5)
+    found = np.einsum("kl,lnr,mn->mkr", *(np.asarray(each, np.float64) for each in (mode, core, weight)))
+    error = np.sum((found * importance[np.asarray(index), None] - kept) ** 2) / total
+    np.testing.assert_allclose(error, after_modes[-1], rtol=1e-3)
+
+
+def test_stored_numbers_use_the_range_of_half_precision(small):
+    np.testing.assert_array_equal(np.abs(small.mode).max(1), 1)
+    np.testing.assert_array_equal(np.abs(small.core).max((1, 3)), 1)
+
+
+def test_rms_is_that_of_the_dense_rows(whole, small, close):
+    for transport in (whole, small, whole.keep(50, terms=2)):
+        close(transport.rms, np.sqrt(np.mean(dense(transport) ** 2, (0, 2))), tolerance=1e-5)
+
+
+def test_apply_is_the_dense_product_and_linear(small, random, close):
+    light, other = (jnp.asarray(random.normal(size=(ALL, 3)), jnp.float32) for _ in range(2))
+    expected = np.einsum("vdr,dc->vrc", by_vertex(small), np.asarray(light, np.float64))
+    close(small.apply(light), expected)
+    close(small.apply(2 * light - other), 2 * small.apply(light) - small.apply(other))
+    close(small.apply(light[:, :1])[..., 0], expected[..., 0])
+    both = jax.vmap(small.apply)(jnp.stack([light, other]))
+    close(both, jnp.stack([small.apply(light), small.apply(other)]))
+
+
+def test_derivatives_by_the_light_are_the_transposed_matrix(small, random, close):
+    light = jnp.asarray(random.normal(size=(ALL, 3)), jnp.float32)
+    value, pull = jax.vjp(small.apply, light)
+    back = random.normal(size=value.shape)
+    (found,) = pull(jnp.asarray(back, jnp.float32))
+    close(found, np.einsum("vdr,vrc->dc", by_vertex(small), back))
+
+
+def test_in_float64_only_what_is_stored_is_rounded(small, random, close, x64):
+    light = random.normal(size=(ALL, 3))
+    value = small.apply(jnp.asarray(light))
+    assert value.dtype == np.float64
+    close(value, np.einsum("vdr,dc->vrc", by_vertex(small), light))
+
+
+def test_slopes_of_radiance_by_the_light_are_radiance_itself(small, brdf, random, close):
+    """Radiance is linear: <w, radiance(d)> is the slope of <w, radiance(light)> along d."""
+    light = builtin.daylight(size=SIZE)
+    weight = random.normal(size=(VERTICES, 3))
+
+    def seen_by_all(light):
+        return jnp.vdot(jnp.asarray(weight, jnp.float32), separable.radiance(small, brdf, light, eye=EYE))
+
+    slope = jax.grad(seen_by_all)(light).radiance
+    for _ in range(3):
+        along = random.normal(size=(6, SIZE, SIZE, 3)).astype(np.float32)
+        moved = separable.radiance(small, brdf, eqx.tree_at(lambda x: x.radiance, light, along), eye=EYE)
+        scale = np.linalg.norm(slope) * np.linalg.norm(along)
+        assert abs(np.vdot(slope, along) - np.vdot(weight, moved)) < 1e-5 * scale
+
+
+def test_slopes_by_stored_numbers_are_finite(small, brdf):
+    light = builtin.daylight(size=SIZE)
+
+    def total(transport):
+        return jnp.sum(separable.radiance(transport, brdf, light, eye=EYE))
+
+    slope = eqx.filter_grad(total)(small)
+    assert all(np.isfinite(np.asarray(each)).all() for each in jax.tree.leaves(slope))
+    assert np.asarray(slope.weight).any()
+
+
+def test_rows_are_vertices_by_cluster_and_everything_that_is_given_is_in_the_order_of_the_mesh(whole, seen):
+    assert sorted(set(np.asarray(whole.vertex).tolist())) == list(range(VERTICES))
+    np.testing.assert_array_equal(whole.vertex[whole.place], np.arange(VERTICES))
+    assert not np.array_equal(whole.vertex[:VERTICES], np.arange(VERTICES))
+    same((whole.position, whole.frame), (seen.position, seen.frame))
+    assert isinstance(whole, separable.Transport)
+
+
+def test_tuples_and_weights_of_a_texture_are_in_the_order_of_the_mesh(whole, brdf, expected, random, close):
+    """As README shows them: one side changes, the other is kept."""
+    light = builtin.daylight(size=SIZE)
+    lit, view = separable.light_tuple(whole, light), separable.view_tuple(whole, brdf, EYE)
+    close(separable.combine(lit, view), expected, tolerance=HALF)
+    texture = random.uniform(size=(VERTICES, 1, 3)).astype(np.float32)
+    painted = separable.modulate(view, jnp.asarray(texture), terms=(TERMS,))
+    close(separable.combine(lit, painted), expected * texture[:, 0], tolerance=HALF)
+
+
+def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, random, close):
+    light = builtin.daylight(size=SIZE)
+    order = random.permutation(VERTICES)
+    number = np.argsort(order)
+    shuffled = jax.tree.map(lambda each: each[order] if len(each) == VERTICES else each, mesh)
+    shuffled = eqx.tree_at(lambda m: m.face, shuffled, jnp.asarray(number[np.asarray(mesh.face)], jnp.int32))
+    again = precompute(visibility.precompute(shuffled, size=SIZE, progress=False), brdf, progress=False, **WHOLE)
+    expected = separable.radiance(whole, brdf, light, eye=EYE)[order]
+    close(separable.radiance(again, brdf, light, eye=EYE), expected, tolerance=2 * HALF)
+
+
+def test_clusters_join_what_lies_and_faces_alike(random):
+    """Four groups: two places, two sides."""
+    group = random.permutation(np.repeat(np.arange(4), 10))
+    position = np.array([[0, 0, 0], [5, 0, 0]])[group // 2] + 0.1 * random.normal(size=(40, 3))
+    normal = np.array([[0, 0, 1], [0, 0, -1]])[group % 2] + 0.01 * random.normal(size=(40, 3))
+    for scale in (1, 1e-6, 1e6):
+        member = cluster(jnp.asarray(position * scale + scale), jnp.asarray(normal), clusters=4)
+        assert sorted(np.unique(group[member], axis=1).ravel().tolist()) == [0, 1, 2, 3]
+
+
+def test_flat_and_coincident_vertices_are_clustered(random):
+    up = jnp.tile(jnp.array([0.0, 1, 0]), (12, 1))
+    for position in (jnp.zeros((12, 3)), jnp.asarray(random.normal(size=(12, 3)))):
+        assert sorted(cluster(position, up, clusters=3).ravel().tolist()) == list(range(12))
+
+
+def test_clusters_may_be_named(seen, brdf, whole, close):
+    member = np.asarray(whole.vertex).reshape(CLUSTERS, -1)
+    options = {name: value for name, value in WHOLE.items() if name != "clusters"}
+    same(precompute(seen, brdf, member=member, progress=False, **options), whole)
+    mixed = np.concatenate([np.arange(VERTICES), [0]]).reshape(-1, 4).T
+    other = precompute(seen, brdf, member=mixed, progress=False, **options)
+    close(by_vertex(other), by_vertex(whole), tolerance=2 * HALF)
+
+
+def test_workers_of_any_kind_give_the_same_bits_and_a_store_is_resumed(seen, brdf, small, tmp_path):
+    path = tmp_path / "a.prt"
+    for lost, count in (((), CLUSTERS), ((), 0), ((1, 3), 2)):
+        for block in lost:
+            (path / "checksum" / "c" / str(block)).unlink()
+        executor = Strangers()
+        same(precompute(seen, brdf, path=path, executor=executor, progress=False, **SMALL), small)
+        assert executor.count == count
+
+
+def test_float64_workers_give_the_same_and_their_store_is_resumed(seen, brdf, small, tmp_path, close, x64):
+    for count in (CLUSTERS, 0):
+        executor = Strangers()
+        found = precompute(seen, brdf, path=tmp_path / "a.prt", executor=executor, progress=False, **SMALL)
+        assert executor.count == count
+        close(dense(found), dense(small), tolerance=HALF)
+
+
+def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path):
+    path = tmp_path / "a.prt"
+    precompute(seen, brdf, path=path, progress=False, **SMALL)
+    darker = eqx.tree_at(lambda t: t.level, seen, seen.level.at[5, 7].set(0x11))
+    other = eqx.tree_at(lambda b: b.light_map, brdf, 2 * brdf.light_map)
+    for transport, factored, options in (
+        (darker, brdf, SMALL),
+        (seen, other, SMALL),
+        (seen, brdf, SMALL | {"keep": 99}),
+        (seen, brdf, SMALL | {"vectors": 3}),
+        (seen, brdf, SMALL | {"clusters": 5}),
+    ):
+        with pytest.raises(ValueError, match=r"a\.prt holds arrays made from something else"):
+            precompute(transport, factored, path=path, progress=False, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"clusters": 0}, "clusters must be between 1 and the 39 points, got 0"),
+        ({"clusters": 40}, "clusters must be between 1 and the 39 points, got 40"),
+        ({"vectors": 0}, "vectors must be between 1 and the 10 vertices of a cluster, got 0"),
+        ({"vectors": 11}, "vectors must be between 1 and the 10 vertices of a cluster, got 11"),
+        ({"keep": 0}, "keep must be between 1 and 384, got 0"),
+        ({"keep": 385}, "keep must be between 1 and 384, got 385"),
+        ({"modes": 0}, "smaller of keep and vectors x terms, 30, got 0"),
+        ({"modes": 31}, "smaller of keep and vectors x terms, 30, got 31"),
+        ({"keep": 7}, "smaller of keep and vectors x terms, 7, got 30"),
+        ({"member": np.arange(38)[None]}, "member must name all 39 vertices and no others, got 1 missing"),
+        ({"member": np.arange(40)[None]}, "and numbers from 0 to 39"),
+        ({"member": np.arange(-1, 39)[None]}, "and numbers from -1 to 38"),
+    ],
+)
+def test_impossible_numbers_are_refused(seen, brdf, options, message):
+    with pytest.raises(ValueError, match=message):
+        precompute(seen, brdf, progress=False, **WHOLE | options)
+
+
+@pytest.mark.parametrize(("name", "limit"), [("count", 100), ("modes", 8), ("vectors", 4), ("terms", 3)], ids=str)
+def test_keeping_more_than_there_are_is_refused(small, name, limit):
+    for value in (0, -1, limit + 1):
+        with pytest.raises(ValueError, match=f"{name} must be between 1 and {limit}, got {value}"):
+            small.keep(**{name: value})
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_brdfs_without_shared_light_maps_are_refused(seen):
+    with pytest.raises(TypeError, match=r"must be factored, by jaxprt.separable.factor, got Lambert"):
+        precompute(seen, Lambert(0.5), progress=False, **SMALL)
+    colored = SeparableBrdf(jnp.ones((3, 4, 4, 3)), jnp.ones((3, 4, 4, 3)), jnp.zeros(()))
+    with pytest.raises(ValueError, match="light maps must be shared by all colors, got 3 channels"):
+        precompute(seen, colored, progress=False, **SMALL)
+
+
+def test_other_brdfs_and_lights_than_it_was_made_for_are_refused(small, brdf):
+    light = builtin.daylight(size=SIZE)
+    with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
+        separable.radiance(small, SeparableBrdf(brdf.light_map[:2], brdf.view_map[:2], brdf.error), light, eye=EYE)
+    with pytest.raises(ValueError, match=r"the light must be one environment \[6, 8, 8, c\], got \[6, 4, 4, 3\]"):
+        separable.radiance(small, brdf, builtin.daylight(size=4), eye=EYE)
+    with pytest.raises(ValueError, match="the light's coefficients must be 384, got 96"):
+        small.apply(jnp.ones((96, 3)))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(7, 2, 3), (7, 4, 3), (1, 3, 3), (7, 3, 2)])
+def test_tuples_of_other_terms_vertices_or_colors_are_not_combined(shape):
+    """Terms that one side lacks were left out, without a word."""
+    for light, view in (((7, 3, 3), shape), (shape, (7, 3, 3))):
+        with pytest.raises(ValueError, match="light and view must have the same vertices, terms and colors, got"):
+            separable.combine(jnp.ones(light), jnp.ones(view))
+
+
+@pytest.mark.parametrize("colors", [(1, 1), (1, 3), (3, 1), (3, 3)])
+def test_tuples_are_combined_color_by_color(random, close, colors):
+    light, view = (random.normal(size=(7, TERMS, each)) for each in colors)
+    found = separable.combine(*(jnp.asarray(each, jnp.float32) for each in (light, view)))
+    close(found, np.sum(light * view, 1))
+
+
+def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_refuse_others(
+    seen, brdf, tmp_path, monkeypatch
+):
+    path, options = tmp_path / "a.prt", {"progress": False, **SMALL}
+    first = precompute(seen, brdf, path=path, **options)
+    monkeypatch.setattr(separable.clustered, "compress", None)  # Nothing is computed again.
+    rounded = eqx.tree_at(lambda x: x.frame, seen, jnp.nextafter(seen.frame, jnp.inf))
+    factors = eqx.tree_at(lambda x: x.light_map, brdf, jnp.nextafter(brdf.light_map, jnp.inf))
+    again = precompute(rounded, factors, path=path, **options)
+    np.testing.assert_array_equal(again.core, first.core)
+    darker = eqx.tree_at(lambda x: x.light_map, brdf, 0.99 * brdf.light_map)
+    turned = eqx.tree_at(lambda x: x.light_map, brdf, brdf.light_map.at[-1].multiply(-1))
+    dimmed = eqx.tree_at(lambda x: x.level, seen, seen.level & 7)
+    moved = eqx.tree_at(lambda x: x.position, seen, seen.position.at[7, 1].add(1e-3))
+    for what, name in (
+        ((seen, darker), "brdf"),
+        ((seen, turned), "brdf"),
+        ((dimmed, brdf), "direct"),
+        ((moved, brdf), "(member|position)"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.prt holds arrays made from something else \({name}: there"):
+            precompute(*what, path=path, **options)
+
+
+def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
+    light = builtin.daylight(size=SIZE)
+    other = factor(Lambert(0.5), terms=TERMS, resolution=12)
+    fewer = small.keep(terms=2)
+    assert np.isfinite(separable.radiance(fewer, brdf.keep(2), light, eye=EYE)).all()
+    for transport, wrong in ((small, other), (fewer, other.keep(2))):
+        with pytest.raises(ValueError, match="must be the one that the transport was made for, got another"):
+            separable.radiance(transport, wrong, light, eye=EYE)

@@ -1,0 +1,181 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import separable
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.scene import Environment
+from jaxprt.sphere import hemisphere
+from jaxprt.systems.separable import light_errors, sample_error
+
+WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
+
+
+@jax.jit
+def evaluate(brdf, wi, wo):
+    return brdf(wi, wo)
+
+
+def _texels(resolution):
+    direction = np.asarray(hemisphere.texel_direction(resolution=resolution)).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    wi, wo = np.meshgrid(inside, inside)
+    return direction[wi.ravel()], direction[wo.ravel()]
+
+
+def test_lambert_needs_one_term():
+    factored = separable.factor(Lambert([0.5, 0.2, 0.1]), terms=1, resolution=16)
+    wi, wo = _texels(12)
+    expected = np.array([[0.5, 0.2, 0.1]]) / np.pi * np.ones((len(wi), 1))
+    np.testing.assert_allclose(evaluate(factored, wi, wo), expected, 1e-4)
+    assert separable.factor(Lambert(0.5), error=0.01, resolution=16).terms == 1
+
+
+def test_light_maps_are_gray_and_color_is_in_the_view_maps():
+    factored = separable.factor(AshikhminShirley(diffuse=[0.9, 0.2, 0.1], specular=0.3), terms=3, resolution=16)
+    assert factored.light_map.shape == (3, 16, 16, 1)
+    assert factored.view_map.shape == (3, 16, 16, 3)
+
+
+def _parabolic_texels(resolution):
+    """Texel centers of a parabolic map, without those so near the rim that they stand for directions inside it."""
+    center = (np.arange(resolution) + 0.5) / resolution
+    place = np.stack(np.meshgrid(center, center), -1).reshape(-1, 2).astype(np.float32)
+    place = place[np.linalg.norm(2 * place - 1, axis=1) <= 1 - 0.5 / resolution]
+    wi, wo = np.meshgrid(np.arange(len(place)), np.arange(len(place)))
+    direction = np.asarray(hemisphere.parabolic_direction(jnp.asarray(place)))
+    return direction[wi.ravel()], direction[wo.ravel()]
+
+
+def test_all_terms_reproduce_every_texel():
+    resolution = 8
+    wi, wo = _parabolic_texels(resolution)
+    inside = np.count_nonzero(hemisphere.texel_area(resolution=resolution))
+    factored = separable.factor(WANG, terms=int(inside), resolution=resolution)
+    expected = np.asarray(evaluate(WANG, wi, wo))
+    # The last eigenvalues lie below single precision of the first, and with them their share of the norm.
+    assert np.linalg.norm(evaluate(factored, wi, wo) - expected) < 1e-2 * np.linalg.norm(expected)
+    assert factored.error < 2e-3
+
+
+def test_error_falls_with_the_terms_and_names_them():
+    errors = [float(separable.factor(WANG, terms=k, resolution=16).error) for k in (1, 4, 16)]
+    assert errors[0] > errors[1] > errors[2]
+    asked = 1.001 * errors[1]  # Iterations for other numbers of terms round otherwise.
+    factored = separable.factor(WANG, error=asked, resolution=16)
+    assert factored.terms == 4
+    assert factored.error <= asked
+
+
+def test_kept_terms_are_the_leading_ones():
+    factored = separable.factor(WANG, terms=8, resolution=16)
+    fewer = factored.keep(3)
+    np.testing.assert_array_equal(fewer.light_map, factored.light_map[:3])
+    assert jnp.isnan(fewer.error)
+    with pytest.raises(ValueError, match="terms must be between 1 and 8, got 9"):
+        factored.keep(9)
+
+
+def test_maps_are_finite_and_continue_beyond_the_rim():
+    for texel in jax.tree.leaves(separable.factor(WANG, terms=16, resolution=16)):
+        assert np.all(np.isfinite(texel))
+    factored = separable.factor(Lambert(0.5), terms=1, resolution=16)
+    angle = np.linspace(0, 6.28, 50)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.full(50, 1e-3)], -1).astype(np.float32)
+    zenith = np.broadcast_to(np.float32([0.0, 0, 1]), rim.shape)
+    np.testing.assert_allclose(evaluate(factored, rim, zenith), 0.5 / np.pi, rtol=1e-4)
+    np.testing.assert_allclose(evaluate(factored, zenith, rim), 0.5 / np.pi, rtol=1e-4)
+
+
+def test_prior_is_a_covariance():
+    direction = hemisphere.texel_direction(resolution=10).reshape(-1, 3)
+    covariance = separable.factorization.light_covariance(direction, degree=36)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-5)
+    assert np.linalg.eigvalsh(np.asarray(covariance, np.float64)).min() > -1e-3
+    np.testing.assert_allclose(jnp.diag(covariance), np.sum(2 / (np.arange(37) + 0.5)) / (4 * np.pi), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "either terms or error"),
+        ({"terms": 2, "error": 0.1}, "either terms or error"),
+        ({"error": 0.0}, "error must be positive"),
+        ({"terms": 0}, "terms must be between 1 and"),
+        ({"terms": 1000, "resolution": 8}, "terms must be between 1 and 52, got 1000"),
+        ({"terms": 1, "resolution": 1}, "resolution must be at least 2"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        separable.factor(WANG, **options)
+
+
+def test_bad_brdfs_are_refused():
+    with pytest.raises(ValueError, match="must be finite above the horizon"):
+        separable.factor(lambda wi, wo: jnp.full((*wi.shape[:-1], 1), jnp.nan), terms=1, resolution=8)
+    with pytest.raises(ValueError, match=r"\[b 1\] or \[b 3\]"):
+        separable.factor(lambda wi, wo: wi[..., 0], terms=1, resolution=8)
+
+
+def test_black_brdf_gives_zero_without_nan():
+    factored = separable.factor(Lambert(0.0), terms=2, resolution=8)
+    wi, wo = _texels(8)
+    assert not np.any(evaluate(factored, wi, wo))
+    assert factored.error == 0
+    assert separable.factor(Lambert(0.0), error=0.1, resolution=8).error == 0
+
+
+def _constant(value):
+    return lambda wi, wo: jnp.full((*wi.shape[:-1], 1), value) * jnp.ones_like(wi)
+
+
+def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_does_not():
+    sun = Environment(jnp.full((6, 8, 8, 3), 0.1).at[2, 3, 5].set(30.0))
+    brdf = AshikhminShirley(nu=10, nv=10)
+    by_prior = separable.factor(brdf, error=0.4, resolution=24)
+    assert light_errors(brdf, by_prior, sun)[-1] > 2 * by_prior.error
+    chosen = separable.factor(brdf, error=0.4, light=[sun], resolution=24)
+    assert chosen.error <= 0.4
+    assert chosen.terms > by_prior.terms
+    errors = light_errors(brdf, chosen, sun, frames=50, views=20)  # others than it was chosen by
+    assert errors.shape == (chosen.terms,)
+    assert errors[-1] < 0.5
+    with pytest.raises(ValueError, match=r"lights must be at least one and come with error, got 1 and terms=3"):
+        separable.factor(brdf, terms=3, light=[sun])
+
+
+def test_sample_error_of_closed_forms():
+    error, relative = sample_error(_constant(0.5), _constant(0.3))
+    np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
+    # sqrt(mean of cos_i^3 / mean of cos_i) = sqrt(1/2), and views weigh alike: sqrt(mean of cos_o^2) = sqrt(1/3).
+    samples = 5e-3
+    incident = sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
+    assert incident[0] == pytest.approx(np.sqrt(0.5), rel=samples)
+    assert incident[1] == pytest.approx(1)
+    view = sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
+    assert view[0] == pytest.approx(np.sqrt(1 / 3), rel=samples)
+
+
+def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
+    first, second = (sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
+    assert first == second
+    assert sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
+    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
+        sample_error(WANG, WANG, samples=0)
+
+
+def test_factoring_again_with_other_rounding_finds_the_same_factors_in_the_same_order_and_signs():
+    # Isotropic, so that singular values come in equal pairs, one of which the last term cuts.
+    brdf = CookTorrance(diffuse=0.3, roughness=0.3)
+    first = separable.factor(brdf, terms=5, resolution=12)
+    again = separable.factor(
+        lambda wi, wo: brdf(wi, wo) * (1 + 1e-6 * jnp.sin(1e4 * wi[..., :1])), terms=5, resolution=12
+    )
+    assert jnp.linalg.norm(again.light_map - first.light_map) < 1e-3 * jnp.linalg.norm(first.light_map)
+    separable.factorization.check_mark(jnp.asarray(separable.factorization.marked(first.light_map)), again.light_map)
+    with pytest.raises(ValueError, match="the ball must be the one that the transport was made for, got another"):
+        separable.factorization.check_mark(
+            jnp.asarray(separable.factorization.marked(first.light_map)), 1.01 * again.light_map, name="the ball"
+        )

@@ -1,0 +1,368 @@
+"""The separable system from end to end where something degenerates: nothing may become NaN, infinite or absurd."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import jaxprt as prt
+from jaxprt import bright_texels, reference, separable
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.environment import environment_from_image
+from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.sphere import directions
+from jaxprt.systems.separable import SeparableBrdf, factor, precompute
+from jaxprt.systems.separable.quantized import quantize
+from jaxprt.systems.separable.wavelets import project
+from jaxprt.visibility import precompute as see
+
+SIZE = 8
+ALL = 6 * SIZE**2
+EYE = jnp.array([1.0, 2.0, 3.0])
+# All coefficients are kept: what is left is rounding, relative to the largest radiance, and for Lambert alone the
+# one term of a factorization in float32.
+HORIZON = 1e-3  # Texels of 8 x 8 faces that the horizon cuts, by 2 x 2 points in each: measured 7.5e-4 at worst.
+EXACT = 2e-4
+
+
+@pytest.fixture(scope="module")
+def lambert():
+    return factor(Lambert([0.8, 0.5, 0.2]), terms=1, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def glossy():
+    return factor(AshikhminShirley(diffuse=0.3, specular=0.5, nu=20, nv=80), terms=4, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def light():
+    return builtin.daylight(size=SIZE)
+
+
+def sphere():
+    return builtin.sphere(rings=5, sectors=8)
+
+
+def moved(mesh, *, scale=1.0, shift=0.0):
+    return eqx.tree_at(lambda m: m.position, mesh, mesh.position * scale + jnp.asarray(shift, jnp.float32))
+
+
+def repeated(mesh, vertex):
+    """Vertices again and again, all of them if None, up to a number that all tests share: compiling takes the time."""
+    vertex = np.arange(len(mesh.position)) if vertex is None else vertex
+    return len(vertex), np.resize(vertex, 64 if len(vertex) <= 64 else 128)
+
+
+def relight(mesh, brdf, light, *, keep=24, eye=EYE, vertex=None):
+    """Radiance, checked to be finite."""
+    count, vertex = repeated(mesh, vertex)
+    transport = precompute(mesh, brdf, keep=keep, size=SIZE, vertex=vertex, progress=False)
+    color = np.asarray(separable.radiance(transport, brdf, light, eye=eye))
+    assert color.shape == (len(vertex), 3)
+    assert np.isfinite(color).all()
+    return color[:count]
+
+
+def exact_radiance(mesh, brdf, light, *, eye=EYE, vertex=None, error=1e-5):
+    count, vertex = repeated(mesh, vertex)
+    return np.asarray(reference.radiance(mesh, brdf, light, eye=eye, vertex=vertex, error=error))[:count]
+
+
+def known_error(mesh, color, light, *, albedo=(0.8, 0.5, 0.2), keep=24, eye=EYE, vertex=None):
+    """Largest deviation from exact radiance, checked to be no more than the coefficients that were dropped can make."""
+    exact = exact_radiance(mesh, Lambert(list(albedo)), light, eye=eye, vertex=vertex)
+    error = np.abs(color - exact).max()
+    assert (color >= -error - 1e-6).all()
+    return error / max(np.abs(exact).max(), 1e-30)
+
+
+def sun(strength):
+    """Half of the light, or so, in one texel."""
+    radiance = jnp.ones((6, SIZE, SIZE, 3))
+    return Environment(radiance.at[2, 3, 4].set(strength))
+
+
+@pytest.mark.parametrize("strength", [384.0, 1e6, 1e30])
+def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
+    mesh, light = sphere(), sun(strength)
+    color = relight(mesh, lambert, light, keep=ALL)
+    exact = exact_radiance(mesh, Lambert([0.8, 0.5, 0.2]), light)
+    np.testing.assert_allclose(color / strength, exact / strength, atol=1e-5)
+
+
+def test_no_light_gives_no_radiance(lambert, glossy):
+    for brdf in (lambert, glossy):
+        assert not relight(sphere(), brdf, Environment(jnp.zeros((6, SIZE, SIZE, 3)))).any()
+
+
+def test_an_image_of_one_pixel_is_constant_light(lambert):
+    light = environment_from_image(np.full((1, 1, 3), 2, np.float32), size=SIZE)
+    color = relight(sphere(), lambert, light, keep=ALL)
+    facing = color.any(1)
+    np.testing.assert_allclose(color[facing] / [1.6, 1.0, 0.4], 1, atol=0.01)
+
+
+@pytest.mark.parametrize("exponents", [(1, 1), (1000, 1000), (10000, 10000), (0, 0), (1, 10000)])
+def test_dull_and_sharp_brdfs_give_finite_radiance(light, exponents):
+    brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=exponents[0], nv=exponents[1])
+    color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
+    assert color.any()
+    exact = exact_radiance(sphere(), brdf, light, error=0.01)
+    assert np.isfinite(exact).all()
+    assert (exact >= 0).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_black_and_white_brdfs_give_finite_radiance(light, value):
+    for brdf in (Lambert(value), AshikhminShirley(diffuse=value, specular=value)):
+        color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
+        assert color.any() or isinstance(brdf, Lambert) or value
+    assert not relight(sphere(), factor(Lambert(0.0), terms=4, resolution=12), light).any()
+
+
+def test_all_coefficients_equal_the_reference_and_one_is_finite(lambert, light):
+    mesh = sphere()
+    assert known_error(mesh, relight(mesh, lambert, light, keep=ALL), light) < EXACT
+    assert known_error(mesh, relight(mesh, lambert, light, keep=1), light) < 1.5
+
+
+def test_the_error_falls_as_more_is_kept(lambert, light):
+    mesh = join([sphere(), moved(builtin.plane(cells=3), scale=2.0, shift=[0, -1.2, 0])])
+    error = [known_error(mesh, relight(mesh, lambert, light, keep=keep), light) for keep in (4, 24, 96, ALL)]
+    assert error[0] > error[1] > error[2] > error[3]
+    assert error[3] < EXACT
+
+
+def test_grazing_eyes_give_finite_radiance(lambert, glossy, light):
+    plane = builtin.plane(cells=2)
+    for height in (1e-30, 1e-6, 1e-3, 0.0, -1e-6):
+        for brdf in (lambert, glossy):
+            color = relight(plane, brdf, light, eye=jnp.array([50.0, height, 3.0]))
+            assert np.isfinite(color).all()
+            assert color.any()
+
+
+@pytest.mark.parametrize("place", ["vertex", "center", "inside", "far away", "just off"])
+def test_eyes_in_odd_places_give_finite_radiance(lambert, glossy, light, place):
+    mesh = sphere()
+    eye = {
+        "vertex": mesh.position[7],
+        "center": jnp.zeros(3),
+        "inside": jnp.array([0.3, -0.2, 0.4]),
+        "far away": jnp.array([1e15, 1e15, -1e15]),
+        "just off": mesh.position[7] * (1 + 1e-6),
+    }[place]
+    for brdf in (lambert, glossy):
+        color = relight(mesh, brdf, light, eye=eye)
+        assert np.isfinite(color).all()
+    assert np.isfinite(exact_radiance(mesh, AshikhminShirley(), light, eye=eye, error=0.01)).all()
+
+
+def test_one_triangle_is_lit_from_its_front(lambert, light):
+    mesh = make_mesh(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]))
+    color = relight(mesh, lambert, light, keep=ALL)
+    # Builtin daylight gives a white plane that faces up radiance 1 in the mean of its colors.
+    np.testing.assert_allclose(np.mean(color / [0.8, 0.5, 0.2], 1), 1, rtol=0.01)
+
+
+def test_a_flat_plane_is_lit_evenly(lambert, light):
+    color = relight(builtin.plane(cells=4), lambert, light)
+    np.testing.assert_allclose(color, np.broadcast_to(color[0], color.shape), rtol=1e-5)
+
+
+def test_the_two_sides_of_a_sheet_are_lit_by_their_own_halves(lambert, light, close):
+    up = builtin.plane(cells=2)
+    down = make_mesh(np.asarray(up.position), np.asarray(up.face)[:, ::-1], normal=-np.asarray(up.normal))
+    sheet = join([up, down])
+    for eye, part in ((EYE, slice(0, 9)), (-EYE, slice(9, 18))):
+        color = relight(sheet, lambert, light, eye=eye)
+        alone = relight(up if eye is EYE else down, lambert, light, eye=eye)
+        close(color[part], alone, tolerance=EXACT)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e3, 1e12])
+def test_size_does_not_matter(lambert, light, close, scale):
+    mesh = join([sphere(), moved(builtin.plane(cells=3), scale=2.0, shift=[0, -1.2, 0])])
+    expected = relight(mesh, lambert, light, keep=ALL)
+    # Rays that pass an edge closer than float32 tells may fall on its other side: a sixteenth of a few texels.
+    close(relight(moved(mesh, scale=scale), lambert, light, keep=ALL, eye=EYE * scale), expected, tolerance=0.01)
+
+
+def test_the_inside_of_a_closed_box_is_dark(lambert, glossy, light):
+    box = trimesh.creation.box()
+    inward = make_mesh(np.array(box.vertices), np.array(box.faces)[:, ::-1])
+    for brdf in (lambert, glossy):
+        assert not relight(inward, brdf, light, eye=jnp.array([0.1, 0.05, -0.1])).any()
+
+
+def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
+    below = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[3].set(1))
+    ball = moved(sphere(), shift=[0, 1, 0])
+    mesh = join([ball, moved(builtin.plane(cells=21), scale=21.0)])
+    near = np.flatnonzero(np.abs(np.asarray(mesh.position)).max(1) < 3)
+    assert not relight(mesh, lambert, below, vertex=near, eye=jnp.array([0.0, -5, 1])).any()
+    assert not relight(mesh, lambert, below, vertex=near).any()
+
+
+def test_one_huge_coefficient_erases_no_others_when_quantized(glossy, light, close):
+    mesh = sphere()
+    transport = precompute(mesh, glossy, keep=24, size=SIZE, progress=False)
+    spoiled = eqx.tree_at(lambda t: t.value, transport, transport.value.at[0, 5, 1].multiply(1e6))
+    color, expected = (separable.radiance(quantize(each), glossy, light, eye=EYE) for each in (spoiled, transport))
+    assert np.isfinite(np.asarray(color)).all()
+    others = np.arange(len(mesh.position)) != 5
+    np.testing.assert_array_equal(color[others], expected[others])
+    # 32,767 levels for each vertex and term.
+    close(expected, separable.radiance(transport, glossy, light, eye=EYE), tolerance=1e-4)
+    close(color[5], separable.radiance(spoiled, glossy, light, eye=EYE)[5], tolerance=1e-4)
+
+
+def test_transport_of_zeros_is_quantized_to_zeros(lambert, light):
+    transport = precompute(sphere(), lambert, keep=24, size=SIZE, progress=False)
+    dark = eqx.tree_at(lambda t: t.value, transport, 0 * transport.value)
+    assert not np.asarray(separable.radiance(quantize(dark), lambert, light, eye=EYE)).any()
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Visibility from the 38 vertices of a sphere that lies on a ground."""
+    return see(join([moved(sphere(), shift=[0, 1, 0]), builtin.plane(cells=1)]), size=SIZE, progress=False)
+
+
+# Two clusters of ten vertices, two of nine. All is kept, so that what is left is the rounding of half precision.
+KEPT = {"clusters": 4, "vectors": 10, "modes": 30, "keep": ALL}
+HALF = 2e-3
+
+
+def clustered_radiance(seen, brdf, light, **options):
+    """Radiance by clustered transport, every number of which is checked to be finite."""
+    transport = separable.clustered.precompute(seen, brdf, progress=False, **KEPT | options)
+    for name in ("mode", "core", "weight", "rms"):
+        assert np.isfinite(np.asarray(getattr(transport, name), np.float64)).all(), name
+    color = np.asarray(separable.radiance(transport, brdf, light, eye=EYE))
+    assert np.isfinite(color).all()
+    return color
+
+
+def all_texels(seen, brdf, light):
+    """Radiance of a BRDF, factored or not, with the same visibility and no compression."""
+    level = jnp.asarray(seen.seen(np.arange(len(seen.position))))
+    if not isinstance(brdf, SeparableBrdf):
+        return np.asarray(reference.integrate(level, seen.position, seen.frame, brdf, light, EYE, error=1e-5))
+    met = np.einsum("vdrl,dc->vrc", project(level, seen.frame, brdf), separable.project(light))
+    return np.sum(met * np.asarray(brdf.view(directions.view(seen.frame, seen.position, EYE))), 1)
+
+
+def blind(seen, vertex):
+    """The same where some vertices see nothing."""
+    level = np.asarray(seen.level).copy()
+    for each in vertex:
+        block, place = divmod(int(each), 64)
+        level[:, block * 32 + place % 32] &= 0xF0 if place < 32 else 0x0F
+    dark = eqx.tree_at(lambda t: t.level, seen, jnp.asarray(level))
+    assert not dark.seen(np.asarray(vertex)).any()
+    return dark
+
+
+@pytest.mark.parametrize("exponents", [(0, 0), (1, 1000), (1000, 1), (1000, 1000)])
+def test_clusters_hold_dull_sharp_and_brushed_brdfs(seen, light, close, exponents):
+    brdf = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5, nu=exponents[0], nv=exponents[1])
+    factored = factor(brdf, terms=3, resolution=12)
+    expected = all_texels(seen, factored, light)
+    close(clustered_radiance(seen, factored, light), expected, tolerance=HALF)
+    assert expected.any()
+
+
+def test_clusters_hold_more_terms_than_the_brdf_has(seen, light, close):
+    brdf = Lambert([0.8, 0.5, 0.2])
+    close(
+        clustered_radiance(seen, factor(brdf, terms=3, resolution=12), light),
+        all_texels(seen, brdf, light),
+        tolerance=HALF,
+    )
+
+
+def test_clusters_of_a_black_brdf_are_black(seen, light):
+    assert not clustered_radiance(seen, factor(Lambert([0.0, 0, 0]), terms=3, resolution=12), light).any()
+
+
+def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
+    count = len(seen.position)
+    color = clustered_radiance(seen, glossy, light, clusters=count, vectors=1, modes=4)
+    close(color, all_texels(seen, glossy, light), tolerance=HALF)
+
+
+@pytest.mark.parametrize("which", ["one vertex", "a cluster", "all"])
+def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, light, close, which):
+    brdf = factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5), terms=3, resolution=12)
+    member = separable.clustered.cluster(seen.position, seen.frame[:, 2], clusters=4)
+    vertex = {"one vertex": member[1, :1], "a cluster": member[1], "all": np.arange(len(seen.position))}[which]
+    color = clustered_radiance(blind(seen, vertex), brdf, light)
+    expected = all_texels(seen, brdf, light).copy()
+    expected[vertex] = 0
+    close(color, expected, tolerance=HALF)
+    if which != "one vertex":  # Alone in its cluster it is as black as half precision has it.
+        assert not color[vertex].any()
+
+
+@pytest.mark.parametrize("strength", [384.0, 1e6])
+def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, close, strength):
+    brdf, light = Lambert([0.8, 0.5, 0.2]), sun(strength)
+    texel, excess, rest = bright_texels.split(light, count=1)
+    assert np.asarray(rest.radiance).max() < 3
+    bright = np.asarray(bright_texels.radiance(seen, brdf, texel, excess, eye=EYE))
+    color = bright + clustered_radiance(seen, factor(brdf, terms=3, resolution=12), rest)
+    expected = all_texels(seen, brdf, light)
+    # What is compressed is off by half precision, the sun is not.
+    close(color, expected, tolerance=HALF * np.linalg.norm(expected - bright) / np.linalg.norm(expected) + 1e-5)
+    assert bright.any()
+
+
+AWKWARD = [
+    "bunny_vrip_res2.ply",
+    "busted.STL",
+    "chair_model.obj",
+    "cube_blender_uv.ply",
+    "cycloidal.ply",
+    "dragon_vrip_res3.ply",
+    "featuretype.STL",
+    "fuze.obj",
+    "joined_tetrahedra.obj",
+    "nancolor.obj",
+    "negative_indices.obj",
+    "polygonfaces.obj",
+    "quadknot.obj",
+    "rabbit.obj",
+    "singlevn.obj",
+    "soup.stl",
+    "suzanne_facets.ply",
+    "tube.obj",
+]
+
+
+def test_every_awkward_mesh_is_in_the_list(data):
+    found = {path.name for path in (data / "meshes_awkward").iterdir() if path.suffix != ".mtl"}
+    assert found == {*AWKWARD, "empty.obj"}
+
+
+def test_an_empty_mesh_is_refused_before_anything_is_computed(data):
+    with pytest.raises(ValueError, match=r"empty\.obj must hold vertices and faces"):
+        prt.scene.load_mesh(data / "meshes_awkward" / "empty.obj")
+
+
+@pytest.mark.parametrize("name", AWKWARD)
+def test_awkward_meshes_are_lit_like_the_reference(data, lambert, glossy, light, name):
+    mesh = prt.scene.load_mesh(data / "meshes_awkward" / name)
+    count = len(mesh.position)
+    # One number of vertices for all, so that they are compiled once.
+    vertex = np.resize(np.random.default_rng(0).permutation(count), 64)
+    low, high = prt.scene.mesh.bounds(mesh)
+    eye = jnp.asarray((low + high) / 2 + np.linalg.norm(high - low) * np.array([0.5, 0.7, 1.1]), jnp.float32)
+    color = relight(mesh, lambert, light, keep=ALL, eye=eye, vertex=vertex)
+    error = known_error(mesh, color, light, eye=eye, vertex=vertex)
+    assert error < HORIZON
+    assert color.any()
+    relight(mesh, glossy, light, eye=eye, vertex=vertex)

@@ -1,0 +1,117 @@
+"""All systems: lights and BRDFs of another kind are refused by what is needed, before anything else is looked at."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt.brdf import Lambert
+from jaxprt.scene import Environment
+from jaxprt.systems.harmonic import HarmonicBrdf, TransferMatrix, TransferVector
+
+MODEL, EYE = Lambert(0.5), jnp.ones(3)
+LIGHT, COEFFICIENT = Environment(jnp.ones((6, 8, 8, 3))), jnp.ones((9, 3))
+TABLE = HarmonicBrdf(jnp.ones((9, 1, 4)), (), jnp.zeros(()))
+MATRIX = TransferMatrix(jnp.ones((2, 1, 9, 9)), jnp.zeros((2, 3)), jnp.stack([jnp.eye(3)] * 2))
+VECTOR = TransferVector(jnp.ones((9, 1, 2)), jnp.zeros((2, 3)))
+POINT = jnp.zeros((2, 3))
+WANTED = {
+    "jaxprt.harmonic.project": [
+        lambda: harmonic.radiance(MATRIX, TABLE, LIGHT, eye=EYE),
+        lambda: harmonic.unshadowed_radiance(None, TABLE, LIGHT, eye=EYE),
+        lambda: harmonic.diffuse_radiance(VECTOR, jnp.ones(()), LIGHT),
+        lambda: harmonic.transferred_light(MATRIX, LIGHT),
+        lambda: harmonic.local_light(MATRIX.frame, LIGHT),
+        lambda: harmonic.combine(LIGHT, VECTOR.vector),
+    ],
+    "jaxprt.harmonic.tabulate": [
+        lambda: harmonic.radiance(MATRIX, MODEL, COEFFICIENT, eye=EYE),
+        lambda: harmonic.unshadowed_radiance(None, lambda wi, wo: 1, COEFFICIENT, eye=EYE),
+        lambda: harmonic.view_coefficients(MODEL, POINT, MATRIX.frame, eye=EYE),
+    ],
+    "jaxprt.harmonic.precompute": [lambda: harmonic.radiance(VECTOR, TABLE, COEFFICIENT, eye=EYE)],
+    "jaxprt.separable.factor": [
+        lambda: separable.radiance(None, MODEL, LIGHT, eye=EYE),
+        lambda: separable.view_tuple(None, MODEL, EYE),
+        lambda: dynamic.relight._check(0, None, MODEL, None, 2),
+    ],
+    "jaxprt.lobe.tabulate": [
+        lambda: lobe.radiance(None, MODEL, LIGHT, eye=EYE),
+        lambda: lobe.look(None, TABLE, eye=EYE),
+    ],
+    "jaxprt.scene.load_environment": [
+        lambda: harmonic.project(COEFFICIENT, degree=2),
+        lambda: separable.light_tuple(None, COEFFICIENT),
+        lambda: separable.project(COEFFICIENT),
+        lambda: lobe.prefilter(COEFFICIENT),
+        lambda: reference.radiance(None, MODEL, COEFFICIENT, eye=EYE),
+        lambda: bright_texels.split(COEFFICIENT, count=3),
+    ],
+}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("source", WANTED)
+def test_what_is_of_another_kind_is_refused_by_the_function_that_makes_what_is_needed(source):
+    for refused in WANTED[source]:
+        with pytest.raises(TypeError, match=f"must be .*{source}.* makes, got"):
+            refused()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda: reference.radiance(None, TABLE, LIGHT, eye=EYE),
+        lambda: bright_texels.radiance(None, TABLE, None, None, eye=EYE),
+        lambda: lobe.tabulate(TABLE, lobes=1),
+    ],
+)
+def test_tables_whose_values_hold_the_cosine_do_not_pass_for_brdfs(refused):
+    with pytest.raises(TypeError, match="those of HarmonicBrdf hold the cosine"):
+        refused()
+
+
+BROKEN = jnp.ones((9, 3)).at[4, 1].set(jnp.nan)
+
+
+@pytest.mark.parametrize(
+    ("refused", "message"),
+    [
+        (lambda: harmonic.radiance(MATRIX, TABLE, BROKEN, eye=EYE), r"the light must be finite, .* first at \(4, 1\)"),
+        (lambda: harmonic.unshadowed_radiance(None, TABLE, COEFFICIENT, eye=EYE.at[0].set(jnp.inf)), "the eye must be"),
+        (lambda: harmonic.view_coefficients(TABLE, POINT, MATRIX.frame, eye=EYE * jnp.nan), "the eye must be finite"),
+        (lambda: harmonic.diffuse_radiance(VECTOR, jnp.ones(()), BROKEN), "the light must be finite"),
+        (lambda: harmonic.transferred_light(MATRIX, BROKEN), "the light must be finite"),
+        (lambda: harmonic.local_light(MATRIX.frame, BROKEN), "the light must be finite"),
+        (lambda: harmonic.project(Environment(LIGHT.radiance * jnp.nan), degree=2), "radiance must be finite"),
+        (lambda: harmonic.probe_light(POINT, POINT * jnp.nan, jnp.ones((2, 9, 3))), "probes must be finite"),
+        (lambda: harmonic.probe_light(POINT, POINT, BROKEN[None]), "the light at the probes must be finite"),
+        (lambda: harmonic.probe_light(POINT, POINT[:0], jnp.ones((0, 9, 3))), "there must be at least one probe"),
+        (lambda: harmonic.combine(COEFFICIENT[:, 0], VECTOR.vector), r"\[lm, c\] or \[lm, c, v\], .* shape \[9\]"),
+        (lambda: harmonic.radiance(MATRIX, TABLE, COEFFICIENT[:, 0], eye=EYE), r"\[lm, c\] or .* shape \[9\]"),
+        (lambda: harmonic.local_light(MATRIX.frame, COEFFICIENT[:, 0]), r"\[lm, c\] or .* shape \[9\]"),
+    ],
+)
+def test_harmonics_refuse_what_is_not_finite_or_has_other_axes(refused, message):
+    with pytest.raises(ValueError, match=message):
+        refused()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_light_at_another_number_of_probes_is_refused():
+    with pytest.raises(ValueError, match="light at each of the 2 probes, got light at 3"):
+        harmonic.probe_light(POINT, POINT, jnp.ones((3, 9, 3)))
+
+
+def test_inside_jit_a_light_that_is_not_finite_reaches_the_vertices():
+    color = jax.jit(lambda light: harmonic.diffuse_radiance(VECTOR, jnp.ones(()), light))(BROKEN)
+    np.testing.assert_array_equal(np.isnan(color), [[False, True, False]] * 2)
+
+
+def test_a_batch_of_lights_is_projected_one_by_one(close):
+    light = Environment(jax.random.normal(jax.random.key(0), (2, 3, 6, 8, 8, 3)))
+    together = harmonic.project(light, degree=2)
+    assert together.shape == (2, 3, 9, 3)
+    close(together[1, 2], harmonic.project(Environment(light.radiance[1, 2]), degree=2))

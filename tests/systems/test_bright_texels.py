@@ -1,0 +1,295 @@
+"""Bright texels one by one: what is taken out of a light, and that it lights as the light did."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import bright_texels, reference
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import join
+from jaxprt.sphere import cubemap
+from jaxprt.visibility import precompute
+
+SIZE = 8
+ALL = 6 * SIZE**2
+COUNT = 6
+SLOPE = 1e-4  # Derivatives in float32 of a lobe of exponent 80.
+EYE = jnp.array([1.0, 2.0, 3.0])
+GLOSSY = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=[0.2, 0.4, 0.5], nu=20.0, nv=80.0)
+GRAY = AshikhminShirley(diffuse=0.3, specular=0.4, nu=20.0, nv=80.0)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(11)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return join([builtin.sphere(rings=5, sectors=7), builtin.plane(cells=2)])
+
+
+@pytest.fixture(scope="module")
+def transport(mesh):
+    return precompute(mesh, size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    """Daylight, whose sun is some hundred times as bright as the rest."""
+    return builtin.daylight(size=SIZE)
+
+
+def flux(radiance):
+    """Flux of each texel, all colors together, in float64."""
+    radiance = np.asarray(radiance, np.float64).reshape(ALL, -1)
+    return radiance.sum(1) * np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
+
+
+def whole(texel, excess):
+    """An environment of nothing but the excess."""
+    radiance = jnp.zeros((ALL, excess.shape[1])).at[texel].set(excess)
+    return Environment(radiance.reshape(6, SIZE, SIZE, -1))
+
+
+def exact(transport, brdf, light, eye=EYE):
+    """Every texel summed with the BRDF at its center and the same stored visibility."""
+    seen = jnp.asarray(transport.seen(np.arange(len(transport.position))))
+    return reference.integrate(seen, transport.position, transport.frame, brdf, light, eye, error=np.inf)
+
+
+@jax.jit
+def weighed(brdf, excess, eye, texel, transport, weight):
+    """A sum over vertices and colors, with its slopes by the BRDF, the excess and the eye."""
+
+    def total(brdf, excess, eye):
+        return jnp.vdot(weight, bright_texels.radiance(transport, brdf, texel, excess, eye=eye))
+
+    return jax.value_and_grad(total, (0, 1, 2))(brdf, excess, eye)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e30])
+def test_excess_and_rest_are_the_light(random, colors, strength):
+    radiance = strength * random.exponential(size=(6, SIZE, SIZE, colors)).astype(np.float32) ** 3
+    texel, excess, rest = bright_texels.split(Environment(jnp.asarray(radiance, jnp.float32)), count=COUNT)
+    order = np.argsort(-flux(radiance))
+    np.testing.assert_array_equal(texel, order[:COUNT])
+    np.testing.assert_allclose(whole(texel, excess).radiance + rest.radiance, radiance, rtol=1e-6)
+    assert np.all(np.asarray(excess) > 0)
+    assert np.all(np.asarray(rest.radiance) >= 0)
+    # What is left is level with the brightest that was not taken, and all others are as they were.
+    np.testing.assert_allclose(flux(rest.radiance)[order[:COUNT]], flux(radiance)[order[COUNT]], rtol=1e-5)
+    untouched = np.asarray(rest.radiance).reshape(ALL, -1)[order[COUNT:]]
+    np.testing.assert_array_equal(untouched, radiance.reshape(ALL, -1)[order[COUNT:]])
+
+
+@pytest.mark.parametrize("count", [1, 5, 40, 300])
+@pytest.mark.parametrize("kind", ["random", "constant", "few"])
+def test_the_brightest_are_taken_and_of_equal_ones_the_first(random, kind, count):
+    level = {
+        "random": random.random(6 * 32**2),
+        "constant": np.ones(6 * 32**2),
+        "few": random.integers(3, size=6 * 32**2),
+    }
+    light = Environment(jnp.asarray(level[kind].reshape(6, 32, 32, 1), jnp.float32))
+    texel, _, _ = bright_texels.split(light, count=count)
+    brightness = np.asarray(light.radiance[..., 0] * cubemap.solid_angle(size=32)).ravel()
+    np.testing.assert_array_equal(texel, np.argsort(-brightness, kind="stable")[:count])
+
+
+def test_a_texel_keeps_its_color(random):
+    radiance = jnp.asarray(random.uniform(0.1, 3, size=(6, SIZE, SIZE, 3)), jnp.float32)
+    texel, excess, rest = bright_texels.split(Environment(radiance), count=COUNT)
+    before = np.asarray(radiance).reshape(ALL, 3)[texel]
+    for part in (np.asarray(excess)[:-1], np.asarray(rest.radiance).reshape(ALL, 3)[texel[:-1]]):
+        part = part / part.sum(1, keepdims=True)
+        np.testing.assert_allclose(part, before[:-1] / before[:-1].sum(1, keepdims=True), rtol=1e-3)
+
+
+def test_no_light_has_no_excess():
+    black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
+    _, excess, rest = bright_texels.split(black, count=COUNT)
+    assert not np.asarray(excess).any()
+    assert not np.asarray(rest.radiance).any()
+
+
+def test_texels_of_equal_flux_have_no_excess():
+    solid_angle = cubemap.solid_angle(size=SIZE)[..., None]
+    flat = Environment(1 / solid_angle)
+    _, excess, rest = bright_texels.split(flat, count=COUNT)
+    np.testing.assert_allclose(excess * solid_angle.max(), 0, atol=1e-6)
+    np.testing.assert_allclose(rest.radiance, flat.radiance, rtol=1e-6)
+    constant = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+    _, excess, rest = bright_texels.split(constant, count=COUNT)
+    # Four texels around each of six face centers are alike and the largest.
+    np.testing.assert_allclose(excess, 0, atol=1e-6)
+    np.testing.assert_allclose(rest.radiance, 1, rtol=1e-6)
+
+
+def test_fewer_bright_texels_than_asked_for_are_taken_whole():
+    radiance = jnp.zeros((6, SIZE, SIZE, 3)).at[2, 3, 4].set(jnp.array([5.0, 3, 0])).at[0, 0, 0].set(1.0)
+    texel, excess, rest = bright_texels.split(Environment(radiance), count=COUNT)
+    np.testing.assert_array_equal(texel[:2], [2 * 64 + 3 * 8 + 4, 0])
+    np.testing.assert_array_equal(excess[:3], [[5, 3, 0], [1, 1, 1], [0, 0, 0]])
+    assert not np.asarray(rest.radiance).any()
+
+
+def test_all_but_one_texel_can_be_taken(random):
+    radiance = random.uniform(1, 2, size=(6, SIZE, SIZE, 3)).astype(np.float32)
+    texel, excess, rest = bright_texels.split(Environment(jnp.asarray(radiance)), count=ALL - 1)
+    np.testing.assert_allclose(flux(rest.radiance), flux(radiance).min(), rtol=1e-5)
+    np.testing.assert_allclose(whole(texel, excess).radiance + rest.radiance, radiance, rtol=1e-6)
+
+
+def test_a_batch_of_lights_is_refused(sky):
+    with pytest.raises(ValueError, match=r"the light must be one environment \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
+        bright_texels.split(Environment(jnp.stack([sky.radiance] * 2)), count=COUNT)
+
+
+def test_a_light_of_float32_keeps_its_type_where_float64_is_enabled(sky, x64):
+    _, excess, rest = bright_texels.split(sky, count=COUNT)
+    assert excess.dtype == rest.radiance.dtype == np.float32
+
+
+@pytest.mark.parametrize("part", ["vertices", "texels"])
+def test_none_have_no_radiance(mesh, transport, part):
+    count = 0 if part == "texels" else COUNT
+    lit = precompute(mesh, size=SIZE, vertex=np.zeros(0, int), progress=False) if part == "vertices" else transport
+    color = bright_texels.radiance(lit, GLOSSY, jnp.zeros(count, int), jnp.ones((count, 3)), eye=EYE)
+    assert color.shape == (len(lit.position), 3)
+    assert not np.asarray(color).any()
+
+
+def test_none_may_be_taken(transport, sky):
+    texel, excess, rest = bright_texels.split(sky, count=0)
+    np.testing.assert_array_equal(rest.radiance, sky.radiance)
+    assert not np.asarray(bright_texels.radiance(transport, GLOSSY, texel, excess, eye=EYE)).any()
+
+
+@pytest.mark.parametrize("count", [-1, ALL])
+def test_an_impossible_number_of_texels_is_refused(sky, count):
+    with pytest.raises(ValueError, match=f"number of texels must be from 0 to {ALL - 1}, got {count}"):
+        bright_texels.split(sky, count=count)
+
+
+def test_the_excess_has_finite_slopes_even_in_the_dark(random):
+    """As an inverse problem meets them: a light that starts black."""
+
+    def energy(radiance):
+        _, excess, rest = bright_texels.split(Environment(radiance), count=COUNT)
+        return jnp.sum(jnp.sin(excess)) + jnp.sum(rest.radiance**2)
+
+    for radiance in (jnp.zeros((6, SIZE, SIZE, 3)), jnp.ones((6, SIZE, SIZE, 3))):
+        assert np.isfinite(np.asarray(jax.grad(energy)(radiance))).all()
+
+
+@pytest.mark.parametrize("colored", ["both", "light", "brdf", "neither"])
+def test_excess_and_rest_light_as_the_light_did(transport, sky, close, colored):
+    brdf = GLOSSY if colored in ("both", "brdf") else GRAY
+    light = sky if colored in ("both", "light") else Environment(sky.radiance[..., :1])
+    texel, excess, rest = bright_texels.split(light, count=COUNT)
+    bright = bright_texels.radiance(transport, brdf, texel, excess, eye=EYE)
+    assert bright.shape == (39, 1 if colored == "neither" else 3)
+    close(bright, exact(transport, brdf, whole(texel, excess)))
+    close(bright + exact(transport, brdf, rest), exact(transport, brdf, light))
+    assert np.count_nonzero(np.asarray(bright).any(1)) > 10
+
+
+@pytest.mark.parametrize("brdf", [GLOSSY, Lambert([0.8, 0.5, 0.2])], ids=["glossy", "Lambert"])
+def test_a_sun_in_one_texel_is_that_of_the_reference(mesh, transport, brdf):
+    place = (2, 3, 5)
+    texel = np.ravel_multi_index(place, (6, SIZE, SIZE))
+    light = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[place].set(jnp.array([300.0, 200, 100])))
+    found, excess, _ = bright_texels.split(light, count=COUNT)
+    assert found[0] == texel
+    color = np.asarray(bright_texels.radiance(transport, brdf, found, excess, eye=EYE))
+    expected = np.asarray(reference.radiance(mesh, brdf, light, eye=EYE, error=np.inf))
+    # Nine sixteenths are kept as eight; no vertex here sees that much of this texel.
+    assert 0.5 not in np.asarray(transport.visible(jnp.array([texel])))
+    np.testing.assert_allclose(color, expected, atol=1e-5 * expected.max())
+    assert np.count_nonzero(expected.any(1)) > 5
+
+
+def test_radiance_is_linear_in_the_excess(transport, sky, random, close):
+    texel, excess, _ = bright_texels.split(sky, count=COUNT)
+    other = jnp.asarray(random.normal(size=excess.shape), jnp.float32)
+    first, second = (bright_texels.radiance(transport, GLOSSY, texel, each, eye=EYE) for each in (excess, other))
+    close(bright_texels.radiance(transport, GLOSSY, texel, 2 * excess - other, eye=EYE), 2 * first - second)
+
+
+def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
+    texel, excess, _ = bright_texels.split(sky, count=COUNT)
+    color = bright_texels.radiance(transport, GLOSSY, texel, excess, eye=EYE)
+    close(bright_texels.radiance(transport, GLOSSY, texel[::-1], excess[::-1], eye=EYE), color)
+    same = jnp.full(COUNT, texel[0])
+    once = bright_texels.radiance(transport, GLOSSY, same, excess * jnp.eye(COUNT)[0][:, None], eye=EYE)
+    close(bright_texels.radiance(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
+
+
+def test_eyes_below_the_horizon_see_what_grazing_eyes_see(transport, sky, close):
+    texel, excess, _ = bright_texels.split(sky, count=COUNT)
+    lit = np.flatnonzero(np.asarray(bright_texels.irradiance(transport, texel, excess)).any(1))
+    for vertex in lit[:3]:
+        tangent, _, normal = transport.frame[vertex]
+        beneath, grazing = (
+            bright_texels.radiance(
+                transport, GLOSSY, texel, excess, eye=transport.position[vertex] + tangent + height * normal
+            )
+            for height in (-3, 0.005)
+        )
+        close(beneath[vertex], grazing[vertex])
+        assert np.asarray(beneath[vertex]).any()
+
+
+@pytest.mark.parametrize("place", ["on a vertex", "far away", "in the plane"])
+def test_eyes_in_odd_places_have_finite_radiance_and_slopes(transport, sky, place):
+    texel, excess, _ = bright_texels.split(sky, count=COUNT)
+    eye = {
+        "on a vertex": transport.position[7],
+        "far away": jnp.array([1e15, 1e15, -1e15]),
+        "in the plane": jnp.array([5.0, 0, 2]),
+    }[place]
+    value, slope = weighed(GLOSSY, excess, eye, texel, transport, jnp.ones((39, 3)))
+    assert np.isfinite(value)
+    assert all(np.isfinite(np.asarray(each)).all() for each in jax.tree.leaves(slope))
+
+
+def test_slopes_are_those_of_the_reference(transport, sky, random, close):
+    """Of the BRDF's parameters, the excess and the eye."""
+    texel, excess, _ = bright_texels.split(sky, count=COUNT)
+    weight = jnp.asarray(random.normal(size=(39, 3)), jnp.float32)
+
+    def theirs(brdf, excess, eye):
+        return jnp.vdot(weight, exact(transport, brdf, whole(texel, excess), eye))
+
+    _, found = weighed(GLOSSY, excess, EYE, texel, transport, weight)
+    expected = jax.jit(jax.grad(theirs, (0, 1, 2)))(GLOSSY, excess, EYE)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert np.any(other)
+        close(one, other, tolerance=SLOPE)
+
+
+def test_texels_and_excess_of_whole_numbers_count_as_such_and_those_of_another_light_are_refused(
+    transport, close, unchecked
+):
+    """Whole numbers gave black, texels of a finer light those of others."""
+    texel = jnp.arange(16)
+    whole = jnp.full((16, 3), 2)
+    close(
+        bright_texels.radiance(transport, GLOSSY, texel, whole, eye=EYE),
+        bright_texels.radiance(transport, GLOSSY, texel, 2.0 * jnp.ones((16, 3)), eye=EYE),
+    )
+    most = 6 * transport.size**2
+    for call in (
+        partial(bright_texels.irradiance, transport),
+        lambda *given: bright_texels.radiance(transport, GLOSSY, *given, eye=EYE),
+    ):
+        with pytest.raises(ValueError, match=f"the texels must be between 0 and {most - 1}, got 1 of 16"):
+            call(texel + most - 15, jnp.ones((16, 3)))
+        with pytest.raises(ValueError, match="the excess must be finite"):
+            call(texel, jnp.full((16, 3), jnp.nan))

@@ -1,0 +1,221 @@
+"""The reference against itself: batches, selections, linearity, closed forms. Mitsuba judges it elsewhere."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import reference
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.scene import Environment
+from jaxprt.scene.environment import rotate
+from jaxprt.sphere import cubemap, directions
+
+SIZE = 8
+EYE = jnp.array([2.0, 3.0, 4.0])
+HORIZON = 1e-2  # Texels of 8 x 8 faces that the horizon cuts: measured .7 % at worst.
+GRADIENT = 1e-2  # Differences of sums in float32 over a step of a fortieth.
+TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
+CENTERS = np.inf  # The error that leaves one point to each texel: sums are then equal, not close.
+GLOSSY = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=0.3, nu=20, nv=60)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(6)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A ball over the ground: 121 vertices, two blocks."""
+    ground = prt.scene.builtin.plane(cells=5)
+    ground = eqx.tree_at(lambda m: m.position, ground, 2 * ground.position - jnp.array([0, 1.2, 0]))
+    return prt.scene.mesh.join([prt.scene.builtin.sphere(rings=8, sectors=12), ground])
+
+
+def some_light(random, *batch):
+    return Environment(jnp.asarray(random.uniform(0, 2, size=(*batch, 6, SIZE, SIZE, 3)), jnp.float32))
+
+
+def hemisphere(random, count):
+    """Visibility, positions, frames."""
+    normal = directions.normalize(jnp.asarray(random.normal(size=(count, 3)), jnp.float32))
+    seen = jnp.asarray(random.integers(17, size=(count, 6 * SIZE**2)), jnp.uint8)
+    return (
+        seen,
+        jnp.asarray(random.normal(size=(count, 3)), jnp.float32),
+        directions.frame(normal, jnp.zeros((count, 3))),
+    )
+
+
+def test_white_furnace_leaves_a_convex_white_body_invisible():
+    mesh = prt.scene.builtin.sphere(rings=8, sectors=12)
+    color = reference.radiance(mesh, Lambert(1.0), Environment(jnp.ones((6, SIZE, SIZE, 3))), eye=EYE)
+    np.testing.assert_allclose(color, 1, atol=HORIZON)
+
+
+def test_integration_equals_a_loop_over_texels_in_float64(random, close):
+    seen, position, frame = hemisphere(random, 4)
+    light = some_light(random)
+    direction = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
+    area = np.asarray(cubemap.vector_area(size=SIZE), np.float64).reshape(-1, 3)
+    table = np.asarray(light.radiance, np.float64).reshape(-1, 3)
+    expected = np.zeros((4, 3))
+    for vertex in range(4):
+        axes = np.asarray(frame[vertex], np.float64)
+        wo = axes @ np.asarray(EYE - position[vertex], np.float64)
+        wo = wo / np.linalg.norm(wo)
+        if wo[2] < 0.01:  # seen as grazing
+            wo = np.append(wo[:2] / np.linalg.norm(wo[:2]) * np.sqrt(1 - 1e-4), 0.01)
+        wo = jnp.asarray(wo, jnp.float32)
+        for texel in range(len(direction)):
+            cosine = max(0, area[texel] @ axes[2]) * float(seen[vertex, texel]) / 16
+            if cosine:
+                expected[vertex] += [0.0, 0.0, 0.0] + cosine * table[texel]
+        # The BRDF of all texels in one call; its own tests judge it.
+        value = np.asarray(GLOSSY(jnp.asarray(direction @ axes.T, jnp.float32), jnp.broadcast_to(wo, direction.shape)))
+        flux = np.maximum(area @ axes[2], 0) * np.asarray(seen[vertex], np.float64) / 16
+        irradiance = (flux[:, None] * table).sum(0)
+        np.testing.assert_allclose(expected[vertex], irradiance, rtol=1e-12)
+        expected[vertex] = (flux[:, None] * table * value).sum(0)
+    close(reference.integrate(seen, position, frame, GLOSSY, light, EYE, error=CENTERS), expected)
+
+
+def test_lights_in_a_batch_equal_one_by_one(mesh, random, close):
+    light = some_light(random, 2, 2)
+    vertex = np.arange(0, 121, 3)
+    together = reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex, error=CENTERS)
+    assert together.shape == (2, 2, len(vertex), 3)
+    for i, j in np.ndindex(2, 2):
+        one = Environment(light.radiance[i, j])
+        close(together[i, j], reference.radiance(mesh, GLOSSY, one, eye=EYE, vertex=vertex, error=CENTERS))
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 121])
+def test_vertices_do_not_depend_on_who_else_is_asked_for(mesh, random, close, count):
+    light = some_light(random)
+    vertex = random.permutation(121)[:count]
+    whole = np.asarray(reference.radiance(mesh, GLOSSY, light, eye=EYE))
+    close(reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex), whole[vertex])
+
+
+def test_vertices_may_be_chosen_by_a_mask(mesh, random):
+    light, mask = some_light(random), random.random(len(mesh.position)) < 0.2
+    masked = reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=mask)
+    np.testing.assert_array_equal(masked, reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=np.flatnonzero(mask)))
+
+
+@pytest.mark.parametrize(
+    "vertex", [np.array(3), np.zeros((2, 2), int), np.zeros(5, bool), np.array([0.0]), np.array([999])]
+)
+def test_vertices_that_cannot_be_are_refused(mesh, random, vertex):
+    with pytest.raises(ValueError, match=r"vertex must be a mask .* or whole numbers below"):
+        reference.radiance(mesh, GLOSSY, some_light(random), eye=EYE, vertex=vertex)
+
+
+def test_radiance_is_linear_in_light_and_albedo(random, close):
+    arrays = hemisphere(random, 5)
+    first, second = some_light(random), some_light(random)
+
+    def of(light, albedo=0.5):
+        return reference.integrate(*arrays, Lambert(albedo), light, EYE, error=CENTERS)
+
+    close(of(Environment(2 * first.radiance - second.radiance)), 2 * of(first) - of(second))
+    close(of(first, [0.1, 0.2, 0.3]), of(first, 1.0) * jnp.array([0.1, 0.2, 0.3]))
+
+
+def test_each_channel_of_the_light_reaches_only_itself(random):
+    arrays, light = hemisphere(random, 5), some_light(random)
+    whole = reference.integrate(*arrays, GLOSSY, light, EYE, error=CENTERS)
+    for channel in range(3):
+        alone = Environment(light.radiance * (jnp.arange(3) == channel))
+        color = reference.integrate(*arrays, GLOSSY, alone, EYE, error=CENTERS)
+        np.testing.assert_array_equal(color[:, channel], whole[:, channel])
+        assert not np.delete(np.asarray(color), channel, axis=1).any()
+
+
+def test_eyes_below_the_horizon_see_what_grazing_eyes_see(random, close):
+    (seen, position, frame), light = hemisphere(random, 6), some_light(random)
+    for vertex in range(3):
+        tangent, _, normal = frame[vertex]
+        beneath, grazing = (
+            reference.integrate(seen, position, frame, GLOSSY, light, position[vertex] + tangent + height * normal)
+            for height in (-3, 0.005)
+        )
+        close(beneath[vertex], grazing[vertex])
+
+
+def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
+    arrays, light = hemisphere(random, 3), some_light(random)
+    close(
+        reference.integrate(*arrays, Lambert(0.5), light, EYE, error=CENTERS),
+        reference.integrate(*arrays, Lambert([0.5, 0.5, 0.5]), light, EYE, error=CENTERS),
+    )
+    gray = Environment(light.radiance[..., :1])
+    assert reference.integrate(*arrays, Lambert(0.5), gray, EYE, error=CENTERS).shape == (3, 1)
+    close(
+        reference.integrate(*arrays, GLOSSY, gray, EYE, error=CENTERS),
+        reference.integrate(*arrays, GLOSSY, Environment(jnp.repeat(gray.radiance, 3, -1)), EYE, error=CENTERS),
+    )
+
+
+def test_blocked_vertices_are_black_and_shadows_only_darken(mesh, random):
+    light = some_light(random)
+    alone = prt.scene.mesh.split(mesh)[0]
+    shadowed = np.asarray(reference.radiance(alone, Lambert(0.5), light, eye=EYE, occluder=mesh))
+    free = np.asarray(reference.radiance(alone, Lambert(0.5), light, eye=EYE))
+    assert (shadowed <= free * (1 + 1e-5) + 1e-5).all()
+    assert (shadowed < 0.9 * free).any()
+
+
+@pytest.mark.parametrize("brdf", [Lambert(0.5), GLOSSY], ids=["lambert", "glossy"])
+def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close):
+    light = some_light(random)
+    turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    fields = (mesh.position, mesh.normal, mesh.tangent)
+    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields))
+    vertex = np.arange(0, 121, 2)
+    close(
+        reference.radiance(turned, brdf, rotate(light, turn), eye=turn @ EYE, vertex=vertex, error=CENTERS),
+        reference.radiance(mesh, brdf, light, eye=EYE, vertex=vertex, error=CENTERS),
+        tolerance=TURNED,
+    )
+
+
+def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
+    light, model = some_light(random), Lambert([0.2, 0.5, 0.9])
+    expected = reference.radiance(mesh, model, light, eye=EYE)
+    close(reference.radiance(mesh, lambda wi, wo: model(wi, wo), light, eye=EYE), expected)
+    close(reference.radiance(mesh, model.__call__, light, eye=EYE), expected)
+
+
+@pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
+def test_values_without_one_row_per_direction_are_refused(mesh, random, value):
+    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] here, got \["):
+        reference.radiance(mesh, value, some_light(random), eye=EYE)
+
+
+def test_the_gradient_in_parameters_of_a_brdf_equals_finite_differences(mesh, random):
+    light = some_light(random)
+
+    def total(nu):
+        brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=nu, nv=30)
+        return jnp.sum(reference.radiance(mesh, brdf, light, eye=EYE))
+
+    slope = float(jax.grad(total)(20.0))
+    assert abs(slope - float(total(20.5) - total(19.5))) < GRADIENT * abs(slope)
+
+
+def test_an_eye_and_a_light_that_are_not_finite_are_refused(mesh, random):
+    light = some_light(random)
+    with pytest.raises(ValueError, match="the eye must be finite, got 1 of 3"):
+        reference.radiance(mesh, GLOSSY, light, eye=EYE.at[1].set(jnp.nan))
+    with pytest.raises(ValueError, match="the light must be finite, got 1152 of 1152"):
+        reference.radiance(mesh, GLOSSY, jax.tree.map(lambda x: x * jnp.nan, light), eye=EYE)
+
+
+def test_lights_whose_faces_are_no_power_of_two_are_refused(mesh):
+    with pytest.raises(ValueError, match="power of two"):
+        reference.radiance(mesh, Lambert(0.5), Environment(jnp.ones((6, 6, 6, 3))), eye=EYE)

@@ -1,0 +1,162 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.compile import apart, linear
+
+
+def product(fixed, x):
+    return fixed["matrix"] @ x
+
+
+def transposed(fixed, y):
+    return fixed["transpose"] @ y
+
+
+@pytest.fixture
+def matrix(x64):
+    return jnp.asarray(np.random.default_rng(0).normal(size=(3, 4)))
+
+
+@pytest.fixture
+def x(x64):
+    return jnp.asarray(np.random.default_rng(1).normal(size=(4, 2)))
+
+
+def ours(x, matrix):
+    return jnp.sum(jnp.sin(linear(product, transposed, {"matrix": matrix, "transpose": matrix.T}, x)))
+
+
+def theirs(x, matrix):
+    return jnp.sum(jnp.sin(matrix @ x))
+
+
+def twice(function):
+    return jax.jacfwd(jax.grad(function))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: f,
+        jax.jit,
+        jax.grad,
+        lambda f: jax.jit(jax.grad(f)),
+        jax.hessian,
+        twice,
+        lambda f: jax.jacrev(jax.grad(f)),
+        lambda f: twice(lambda x, matrix: jnp.sum(jax.grad(f)(x, matrix) ** 2)),
+        lambda f: jax.grad(f, 1),
+        lambda f: jax.jacobian(jax.grad(f), 1),
+        lambda f: jax.jacobian(jax.grad(f, 1), 0),
+        lambda f: lambda x, matrix: jax.linearize(partial(f, matrix=matrix), x)[1](x),
+    ],
+)
+def test_a_map_and_its_transpose_have_the_derivatives_of_the_map(change, x, matrix):
+    np.testing.assert_allclose(change(ours)(x, matrix), change(theirs)(x, matrix), rtol=1e-12, atol=1e-13)
+
+
+def second(x, matrix):
+    """The Hessian of `theirs` by x."""
+    return -np.einsum("mi,mj,mk,jl->ijkl", matrix, np.sin(matrix @ x), matrix, np.eye(2))
+
+
+# Derivatives of `theirs`, in NumPy: nothing to compile.
+CHANGES = [
+    (lambda f: f, lambda x, matrix: np.sum(np.sin(matrix @ x))),
+    (jax.grad, lambda x, matrix: matrix.T @ np.cos(matrix @ x)),
+    (lambda f: jax.grad(f, 1), lambda x, matrix: np.cos(matrix @ x) @ x.T),
+    (twice, second),
+]
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0), (2, 1)])
+@pytest.mark.parametrize(("change", "one"), CHANGES)
+def test_batches_are_loops(axes, change, one, x, matrix):
+    random = np.random.default_rng(2)
+    batch = [
+        np.asarray(each) if axis is None else random.normal(size=(*each.shape[:axis], 5, *each.shape[axis:]))
+        for each, axis in zip((x, matrix), axes, strict=True)
+    ]
+    expected = [
+        one(*(b if a is None else np.take(b, n, a) for b, a in zip(batch, axes, strict=True))) for n in range(5)
+    ]
+    found = jax.vmap(change(ours), axes)(*map(jnp.asarray, batch))
+    np.testing.assert_allclose(found, np.stack(expected), rtol=1e-12, atol=1e-13)
+
+
+def test_a_batch_of_values_has_a_gradient(x, matrix):
+    batch = jnp.stack([x, 2 * x, -x])
+    values = jax.vmap(theirs, (0, None))(batch, matrix)
+    expected = 2 * values[:, None, None] * jax.vmap(jax.grad(theirs), (0, None))(batch, matrix)
+    found = jax.grad(lambda batch: jnp.sum(jax.vmap(ours, (0, None))(batch, matrix) ** 2))(batch)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_given_transpose_is_what_makes_the_gradient(x, matrix):
+    fixed = {"matrix": matrix, "transpose": 7 * matrix.T}
+    slope = jax.grad(lambda x: jnp.sum(linear(product, transposed, fixed, x)))(x)
+    np.testing.assert_allclose(slope, 7 * matrix.T @ jnp.ones((3, 2)), rtol=1e-12)
+
+
+def test_the_gradient_has_the_type_of_its_argument(matrix):
+    single = jnp.ones((4, 2), jnp.float32)
+    assert jax.grad(ours)(single, matrix).dtype == jnp.float32
+
+
+@partial(apart, static=("power",))
+def step(x, y, *, power):
+    return x**power * y["y"], x - y["y"]
+
+
+def plain(x, y, *, power):
+    return x**power * y["y"], x - y["y"]
+
+
+def called(function, x):
+    first, second = function(x, y={"y": jnp.cos(x)}, power=3)
+    return jnp.sum(first * second)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda f: f, jax.jit, jax.grad, lambda f: jax.jit(jax.grad(f)), jax.hessian, lambda f: jax.vmap(f)]
+)
+def test_a_step_apart_is_the_step(change, x64):
+    found, expected = change(partial(called, step)), jax.jit(change(partial(called, plain)))
+    for value in (1.5, 0.0, -1.0, 1e-30, 1e30):
+        x = jnp.asarray(np.full((3, 2), value))
+        np.testing.assert_allclose(found(x), expected(x), rtol=1e-12)
+
+
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf])
+def test_a_step_apart_is_taken_whatever_comes_first(value):
+    doubled = jax.jit(apart(lambda x: 2 * jnp.where(jnp.isfinite(x), x, 1)))
+    np.testing.assert_array_equal(doubled(jnp.array([value, 3.0])), [2, 6])
+
+
+def test_steps_take_whole_numbers_and_nothing():
+    assert jax.jit(apart(lambda x: x + 1))(jnp.array([-1, 4])).tolist() == [0, 5]
+    assert jax.jit(apart(lambda x: x + 1))(jnp.zeros((0, 3))).shape == (0, 3)
+
+
+def test_on_cpus_a_step_inside_a_program_is_a_branch_of_its_own():
+    text = jax.jit(apart(lambda x: jnp.sin(x) + 1)).lower(jnp.ones(3)).as_text()
+    assert ("case" in text) == (jax.default_backend() == "cpu")
+
+
+def test_a_gradient_outside_any_program_is_compiled_once():
+    traces = []
+
+    def counted(x):
+        traces.append(x)
+        return jnp.sin(x) ** 2
+
+    step = apart(counted)
+    slope = jax.grad(lambda x: jnp.sum(step(x)))
+    first = slope(jnp.ones(3))
+    before = len(traces)
+    np.testing.assert_array_equal(slope(jnp.ones(3)), first)
+    assert len(traces) == before

@@ -1,0 +1,444 @@
+"""The block loop: the same bits from every executor, after every accident."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import warnings
+import zlib
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import bounces, harmonic, lobe, separable, visibility
+from jaxprt.files.arrays import BlockStore, Layout
+from jaxprt.systems.separable import precompute
+
+SIZE = 4  # Vertices to a block.
+
+
+@dataclass(frozen=True)
+class Squares(visibility.blocks.Job):
+    """Numbers that depend on the vertex; may kill the process that computes a block, once."""
+
+    vertices: int = 30
+    name: str = "squares"
+    trap: str | None = None  # A file; who meets it at block 3 removes it and dies.
+
+    @property
+    def header(self):
+        return {"name": self.name, "vertices": self.vertices}
+
+    @property
+    def layout(self):
+        return {"index": Layout((2, SIZE, 3), 1, "uint16"), "value": Layout((2, SIZE), 1, "float32")}
+
+    def run(self, block):
+        if block == 3 and self.trap and os.path.exists(self.trap):
+            os.unlink(self.trap)
+            os.kill(os.getpid(), signal.SIGKILL)
+        vertex = np.arange(block * SIZE, (block + 1) * SIZE)
+        index = (vertex[None, :, None] * [[[7]], [[11]]] + np.arange(3)).astype(np.uint16)
+        return {"index": index, "value": np.sqrt(vertex + np.array([[1.0], [2.0]])).astype(np.float32)}, 10
+
+    def expected(self):
+        vertex = np.arange(self.vertices)
+        index = (vertex[None, :, None] * [[[7]], [[11]]] + np.arange(3)).astype(np.uint16)
+        return {"index": index, "value": np.sqrt(vertex + np.array([[1.0], [2.0]])).astype(np.float32)}
+
+
+@dataclass(frozen=True)
+class Counting(Squares):
+    """Notes which blocks were computed, in this process."""
+
+    log: list = field(default_factory=list)
+
+    def run(self, block):
+        self.log.append(block)
+        return super().run(block)
+
+
+def check(result, job=None):
+    job = job or Squares()
+    for name, expected in job.expected().items():
+        np.testing.assert_array_equal(result[name], expected)
+        assert result[name].dtype == expected.dtype
+
+
+def finished(path):
+    return sorted(int(file.name) for file in (path / "checksum" / "c").glob("*"))
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """Two processes that do not share this one's memory."""
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """A mesh of three blocks, and a BRDF for it."""
+    brdf = prt.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
+    return prt.scene.builtin.sphere(rings=12, sectors=14), brdf
+
+
+def relit(sphere, **options):
+    mesh, brdf = sphere
+    transport = precompute(mesh, brdf, **({"keep": 12, "size": 8, "progress": False} | options))
+    return [np.asarray(each) for each in (transport.index, transport.value, transport.rms, transport.frame)]
+
+
+@pytest.fixture(scope="module")
+def expected(sphere):
+    return relit(sphere)
+
+
+def same(first, second):
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("vertices", [1, 3, 4, 5, 30, 32])
+def test_results_are_cut_to_the_vertices(vertices):
+    job = Squares(vertices)
+    check(visibility.blocks.compute(job, progress=False), job)
+
+
+def test_a_progress_bar_ends_full_and_tells_the_rays(capsys):
+    visibility.blocks.compute(Squares(), label="squares")
+    told = capsys.readouterr().err
+    assert "squares: 100%" in told
+    assert "30.0/30.0" in told
+    assert "Mrays/s" in told
+
+
+def test_threads_and_processes_give_the_same_bits_as_none(sphere, expected, pool, tmp_path):
+    with ThreadPoolExecutor(3) as threads:
+        same(relit(sphere, executor=threads), expected)
+    same(relit(sphere, executor=pool, path=tmp_path / "a.prt"), expected)
+    same(relit(sphere, path=tmp_path / "a.prt"), expected)
+    check(visibility.blocks.compute(Squares(), executor=pool, progress=False))
+
+
+@pytest.fixture(scope="module")
+def client():
+    """Dask with two worker processes and without a dashboard."""
+    distributed = pytest.importorskip("distributed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Dask warns of ports, and of packages that it would like.
+        cluster = distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0, silence_logs=50
+        )
+        client = distributed.Client(cluster)
+        yield client
+        client.close()
+        cluster.close()
+
+
+# Dask's event loops end after the test that used them; that is theirs to tidy.
+quiet = [
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore:.*:UserWarning:distributed.*"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*"),
+]
+
+
+class TestDask:
+    pytestmark = quiet
+
+    def test_workers_give_the_same_bits(self, sphere, expected, client):
+        same(relit(sphere, executor=client.get_executor()), expected)
+
+    def test_a_killed_worker_is_survived_or_told_and_the_rest_is_done_by_a_second_call(self, client, tmp_path):
+        trap = tmp_path / "trap"
+        trap.touch()
+        job, path = Squares(trap=str(trap)), tmp_path / "a.prt"
+        try:
+            check(visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False))
+        except RuntimeError as error:
+            told = str(error)
+        else:
+            told = str(path)
+        assert str(path) in told
+        assert not trap.exists()
+        check(visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False))
+        assert finished(path) == list(range(8))
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_a_killed_worker_process_is_told_and_a_second_call_goes_on(tmp_path, stored):
+    trap, path = tmp_path / "trap", tmp_path / "a.prt" if stored else None
+    trap.touch()
+    job = Squares(trap=str(trap))
+    message = r"a worker died after \d+ of 30 vertices; they are kept in .*a\.prt: call again" if stored else "lost"
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as mortal,
+        pytest.raises(RuntimeError, match=message),
+    ):
+        visibility.blocks.compute(job, path=path, executor=mortal, progress=False)
+    assert not trap.exists()
+    check(visibility.blocks.compute(job, path=path, progress=False))
+
+
+def test_an_error_in_a_worker_is_passed_on_and_finished_blocks_stay(tmp_path):
+    class Broken(Squares):
+        def run(self, block):
+            if block == 7:
+                raise ZeroDivisionError("block 7")
+            return super().run(block)
+
+    with ThreadPoolExecutor(1) as one, pytest.raises(ZeroDivisionError, match="block 7"):
+        visibility.blocks.compute(Broken(), path=tmp_path / "a.prt", executor=one, progress=False)
+    job = Counting()
+    check(visibility.blocks.compute(job, path=tmp_path / "a.prt", progress=False))
+    assert job.log == [*range(len(finished(tmp_path / "a.prt")))][8 - len(job.log) :]
+
+
+# Forks before any thread of JAX runs, so that many deaths cost one start of Python.
+MOMENTS = """
+import os, signal, sys, time
+import zarr
+from tests.visibility.test_blocks import Squares
+from jaxprt.visibility import blocks
+
+path, kind = sys.argv[1:3]
+for moment in map(float, sys.argv[3:]):
+    child = os.fork()
+    if not child:
+        if kind == "time":
+            signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+            signal.setitimer(signal.ITIMER_REAL, moment)
+        else:
+            calls = [0]
+            name = {"write": "__setitem__", "create": "create_array"}[kind]
+            owner = {"write": zarr.Array, "create": zarr.Group}[kind]
+            original = getattr(owner, name)
+
+            def counted(*arguments, **options):
+                calls[0] += 1
+                if calls[0] == moment:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return original(*arguments, **options)
+
+            setattr(owner, name, counted)
+        blocks.compute(Squares(), path=path, progress=False)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "moments"),
+    [
+        ("create", [1, 2, 3]),
+        # Before the first array of the first block, its second, its checksum, and later ones.
+        ("write", [1, 2, 3, 4, 6, 11]),
+        ("time", [0.002, 0.005, 0.01, 0.015, 0.02, 0.03]),
+    ],
+)
+def test_a_process_killed_at_any_moment_leaves_a_store_that_goes_on_to_the_same_bits(tmp_path, kind, moments):
+    path = tmp_path / "a.prt"
+    command = [sys.executable, "-W", "ignore", "-c", MOMENTS, str(path), kind, *map(str, moments)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    codes = [int(line) for line in done.stdout.split()]
+    assert len(codes) == len(moments)
+    assert set(codes) <= {-9, 0}
+    assert codes[0] == -9
+    check(visibility.blocks.compute(Squares(), path=path, progress=False))
+    check(visibility.blocks.compute(Counting(log=(log := [])), path=path, progress=False))
+    assert not log
+
+
+KILLED = """
+import os, signal, sys
+import numpy as np
+from jaxprt.separable.factorization import SeparableBrdf
+from jaxprt.files.arrays import BlockStore
+from jaxprt.separable.wavelets import precompute
+import jaxprt as prt
+
+brdf = prt.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
+write, calls = BlockStore.write, []
+
+def mortal(*arguments):
+    calls.append(0)
+    if len(calls) == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return write(*arguments)
+
+BlockStore.write = mortal
+mesh = prt.scene.builtin.sphere(rings=12, sectors=14)
+precompute(mesh, brdf, keep=12, size=8, progress=False, path=sys.argv[1])
+"""
+
+
+def test_precomputation_killed_and_resumed_equals_one_in_peace(sphere, expected, tmp_path):
+    path = tmp_path / "a.prt"
+    command = [sys.executable, "-c", KILLED, str(path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert len(finished(path)) == 1
+    same(relit(sphere, path=path), expected)
+    same(relit(sphere, path=path), expected)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "deleted", "checksum", "bytes"])
+def test_damaged_blocks_and_no_others_are_computed_again(tmp_path, damage):
+    path = tmp_path / "a.prt"
+    visibility.blocks.compute(Squares(), path=path, progress=False)
+    file = path / ("checksum/c/5" if damage == "checksum" else "value/c/0/5")
+    content = file.read_bytes()
+    if damage == "deleted":
+        file.unlink()
+    else:
+        changed = {"truncated": content[:7], "checksum": bytes(4), "bytes": bytes(b ^ 255 for b in content)}[damage]
+        file.write_bytes(changed)
+    for again in ([5], []):
+        job = Counting()
+        check(visibility.blocks.compute(job, path=path, progress=False))
+        assert job.log == again
+
+
+def test_finished_stores_are_read_without_computing_and_while_another_process_writes(tmp_path):
+    path, first = tmp_path / "a.prt", Counting()
+    check(visibility.blocks.compute(first, path=path, progress=False))
+    assert sorted(first.log) == list(range(8))
+    job = Counting()
+    with BlockStore(path, job.header, job.layout, 8).writing():
+        check(visibility.blocks.compute(job, path=path, progress=False))
+    assert not job.log
+
+
+def test_unfinished_stores_that_are_being_written_are_refused_at_once(tmp_path):
+    job = Counting()
+    with (
+        BlockStore(tmp_path / "a.prt", job.header, job.layout, 8).writing(),
+        pytest.raises(BlockingIOError, match=r"a\.prt is being written by another process"),
+    ):
+        visibility.blocks.compute(job, path=tmp_path / "a.prt", progress=False)
+    assert not job.log
+
+
+def test_precomputation_refuses_the_store_of_anything_else(sphere, tmp_path):
+    mesh, brdf = sphere
+    path = tmp_path / "deep" / "down" / "a.prt"
+    relit(sphere, path=path)
+    other = eqx.tree_at(lambda m: m.position, mesh, mesh.position.at[5, 1].add(1e-3))
+    darker = eqx.tree_at(lambda b: b.light_map, brdf, brdf.light_map * 0.5)
+    for wrong, options, name in (
+        ((other, brdf), {}, "mesh"),
+        ((mesh, darker), {}, "brdf"),
+        (sphere, {"keep": 13}, "keep"),
+        (sphere, {"size": 4}, "size"),
+        (sphere, {"vertex": np.arange(156)[::-1]}, "mesh"),
+        (sphere, {"vertex": np.arange(20)}, "mesh"),
+        (sphere, {"occluder": prt.scene.builtin.plane(cells=1)}, "mesh"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.prt holds arrays made from something else \(.*{name}: there"):
+            relit(wrong, path=path, **options)
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(ValueError, match="file exists but is not a readable store"):
+        relit(sphere, path=tmp_path / "file")
+    assert not [file for file in path.rglob("*") if file.suffix in (".pkl", ".pickle")]
+
+
+def rounded(tree):
+    """The same up to the last bit of every number, as another kind of processor computes it."""
+
+    def last_bit(leaf):
+        floating = getattr(leaf, "dtype", np.dtype(int)).kind == "f"
+        return np.nextafter(np.asarray(leaf), np.inf, dtype=leaf.dtype) if floating else leaf
+
+    return jax.tree.map(last_bit, tree)
+
+
+def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_with_other_parameters(
+    sphere, expected, tmp_path, monkeypatch
+):
+    mesh, brdf = sphere
+    path = tmp_path / "a.prt"
+    relit(sphere, path=path)
+    starts, frame = visibility.start_points, visibility.rays.directions.frame
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *each: rounded(starts(*each)))
+    monkeypatch.setattr(visibility.rays.directions, "frame", lambda *each: rounded(frame(*each)))
+    monkeypatch.setattr(separable.wavelets, "compress", None)  # Nothing is computed again.
+    other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
+    same(relit((mesh, other), path=path)[:2], expected[:2])
+    again = prt.separable.factor(prt.brdf.AshikhminShirley(nu=10.5), terms=2, resolution=8)
+    with pytest.raises(ValueError, match=r"\(brdf: there and now differ by .* of the norm\).* jaxprt\.files\.save"):
+        relit((mesh, again), path=path)
+    monkeypatch.setattr(separable.wavelets.sparse, "ALGORITHM", {"visibility": 1, "separable": 2})
+    with pytest.raises(
+        ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
+    ):
+        relit(sphere, path=path)
+
+
+def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(sphere, monkeypatch):
+    mesh, brdf = sphere
+    rows, white = np.ones((156, 1, 4, 4), np.float32), np.ones(1, np.float32)
+    more = {"region": np.zeros(156, int), "member": np.arange(156)[None], "white": white, "scale": white}
+    more |= {"bases": (brdf,), "response": (np.ones((156, 6, 2), np.float32),), "components": 1}
+    kinds = [
+        (separable.wavelets._Job, {"brdf": brdf, "keep": 3}),
+        (visibility.stored._Job, {}),
+        (lobe.pyramid._Job, {}),
+        (harmonic.transfer._MatrixJob, {"degree": 1}),
+        (harmonic.transfer._VectorJob, {"degree": 1}),
+        (harmonic.interreflection._BounceJob, {"brdf": (), "rows": rows}),
+        (harmonic.interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": np.ones((1, 1), int)}),
+        (bounces.jobs.ResponseJob, {"basis": brdf, "edge": 1}),
+        (bounces.jobs.TransferJob, more | {"modes": 1}),
+        (bounces.jobs.AgainJob, more | {"function": np.arange(1)}),
+    ]
+    before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
+    starts = visibility.start_points
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *each: rounded(starts(*each)))
+    turned = eqx.tree_at(lambda m: m.face, mesh, mesh.face[::-1])
+    for job, (kind, fields) in zip(before, kinds, strict=True):
+        again = kind.make(mesh, None, None, 8, **rounded(fields))
+        assert json.dumps(again.header) == json.dumps(job.header)
+        assert job.header["algorithm"]["visibility"] == 1
+        assert len(job.header["algorithm"]) == 2
+        assert kind.make(turned, None, None, 8, **fields).header["mesh"] != job.header["mesh"]
+        for name, told in again.near.items():
+            assert np.linalg.norm(np.subtract(told, job.near[name])[2:]) < 0.1 * told[0] * told[1]
+    assert len({json.dumps(job.header) for job in before}) == len(before)
+
+
+def test_the_view_maps_and_the_error_of_the_brdf_do_not_matter_to_the_store(sphere, expected, tmp_path):
+    mesh, brdf = sphere
+    relit(sphere, path=tmp_path / "a.prt")
+    same(relit((mesh, eqx.tree_at(lambda b: b.view_map, brdf, brdf.view_map * 2)), path=tmp_path / "a.prt"), expected)
+
+
+def test_the_key_of_a_scene_tells_surfaces_and_regions_apart_and_no_tangents_or_types():
+    mesh = prt.scene.builtin.plane(cells=1)
+    key = visibility.blocks.scene_key(mesh)
+    for name in ("position", "normal", "face", "region", "tangent"):
+        moved = eqx.tree_at(lambda m, name=name: getattr(m, name), mesh, replace_fn=lambda x: x.at[0].add(1))
+        assert (visibility.blocks.scene_key(moved) == key) == (name == "tangent")
+    assert (
+        visibility.blocks.scene_key(eqx.tree_at(lambda m: m.position, mesh, np.asarray(mesh.position, np.float64)))
+        == key
+    )
+
+
+def test_fingerprints_tell_values_shapes_and_types_apart():
+    array = np.arange(6, dtype=np.float32)
+    different = [array, array.reshape(2, 3), array.astype(np.float64), array + 1, array[:5], array[::-1]]
+    assert len({visibility.blocks.fingerprint(each) for each in different}) == len(different)
+    assert visibility.blocks.fingerprint(array, array) != visibility.blocks.fingerprint(array)
+    assert visibility.blocks.fingerprint(array[::2]) == visibility.blocks.fingerprint(array[::2].copy())
+    assert zlib.crc32(b"") == 0  # The checksum that stands for nothing written is also that of no bytes.
