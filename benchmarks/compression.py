@@ -29,7 +29,7 @@ from jaxprt.scene import Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, combine, light_tuple, view_tuple
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
 BRDF = AshikhminShirley()
@@ -54,7 +54,7 @@ GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
 class Part:
     """One object: its visibility, BRDF, factored BRDF and transport."""
 
-    def __init__(self, visible: DirectTransport | LobeTransport, brdf, factored, transport: ClusteredTransport):
+    def __init__(self, visible: StoredVisibility | LobeTransport, brdf, factored, transport: ClusteredTransport):
         self.visible, self.brdf, self.factored, self.transport = visible, brdf, factored, transport
 
 
@@ -153,7 +153,7 @@ class Exact(NamedTuple):
         return np.array([np.sum((np.asarray(radiance)[self.facing[view]] - exact) ** 2), np.sum(exact**2)])
 
 
-def exact_radiance(visible: DirectTransport, brdf, lights: list[Environment], views: np.ndarray) -> Exact:
+def exact_radiance(visible: StoredVisibility, brdf, lights: list[Environment], views: np.ndarray) -> Exact:
     """What an object sends to all views under all lights."""
     batch = Environment(jnp.stack([light.radiance for light in lights]))
     result = np.zeros((len(lights), len(views), len(visible.position), 3), np.float32)

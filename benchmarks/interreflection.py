@@ -178,7 +178,8 @@ def frames(scene: Scene, published: Published):
             bounce = bounces.light_side(tensor, triple.light)
         if matter:
             comes = bounces.arriving(transport, tensor, bounce, now)
-        reflected = bounces.combine(transport, comes, bounces.view_side(transport, view))
+        surfaces = dynamic.mix(transport, brdfs, now)
+        reflected = bounces.combine(transport, comes, bounces.view_side(transport, surfaces, eye=view.eye))
         return dynamic.combine(transport, sun, view, samples=samples[number if matter else 0]) + reflected
 
     yield "V", lambda: frame(False, False), published.fps[0]
@@ -189,8 +190,9 @@ def frames(scene: Scene, published: Published):
 def reflected(scene: Scene, tensor: bounces.TransferTensor, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of one bounce and of two bounces, in one triple."""
     triple, now = scene.triples[number], scene.materials[number]
-    view = dynamic.view_side(scene.transport, scene.brdfs, now, eye=jnp.asarray(triple.eye))
-    seen, lit = bounces.view_side(scene.transport, view), bounces.light_side(tensor, triple.light)
+    surfaces = dynamic.mix(scene.transport, scene.brdfs, now)
+    seen = bounces.view_side(scene.transport, surfaces, eye=jnp.asarray(triple.eye))
+    lit = bounces.light_side(tensor, triple.light)
     both, once = (
         bounces.combine(scene.transport, bounces.arriving(scene.transport, tensor, each, now), seen)
         for each in (lit, bounces.relight.LitTransfer(lit.first, None))

@@ -18,8 +18,11 @@ Conventions, everywhere in this package:
 
 from jaxprt import brdf, decompose, files, image, inverse, plan, scene, sphere, visibility
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt.systems.protocol import Blend, System, memory, radiance, total
 
 __all__ = [
+    "Blend",
+    "System",
     "bounces",
     "brdf",
     "bright_texels",
@@ -30,11 +33,14 @@ __all__ = [
     "image",
     "inverse",
     "lobe",
+    "memory",
     "plan",
+    "radiance",
     "reference",
     "scene",
     "separable",
     "sphere",
+    "total",
     "visibility",
 ]
 __version__ = "0.1.0"

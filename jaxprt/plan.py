@@ -30,7 +30,7 @@ from jaxprt.systems import lobe as lobe_system
 from jaxprt.systems import separable as separable_system
 from jaxprt.systems.lobe import LobeBrdf, LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf, combine, light_tuple, view_tuple
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
 _MEMBERS = 225  # vertices in a cluster
@@ -135,7 +135,7 @@ class Ready(eqx.Module):
         samples: Points along the edge of each, from `jaxprt.bright_texels.samples_for`.
     """
 
-    visible: DirectTransport
+    visible: StoredVisibility
     brdf: Callable
     factored: SeparableBrdf
     transport: ClusteredTransport
@@ -355,7 +355,7 @@ def _views(mesh: Mesh) -> np.ndarray:
     return ((low + high) / 2 + 1.6 * np.linalg.norm(high - low) * around).astype(np.float32)
 
 
-def _exact(visible: DirectTransport, judged: np.ndarray, brdf, environments, views) -> np.ndarray:
+def _exact(visible: StoredVisibility, judged: np.ndarray, brdf, environments, views) -> np.ndarray:
     """Radiance [light, view, vertex, color] of some vertices by all texels."""
     batch = Environment(jnp.stack([light.radiance for light in environments]))
     seen, position, frame = jnp.asarray(visible.seen(judged)), visible.position[judged], visible.frame[judged]
@@ -372,7 +372,7 @@ def _fitted(step: _Sizes, members: int, size: int) -> _Sizes:
     return _Sizes(terms, resolution, vectors, min(modes, keep, vectors * terms), keep, min(count, 6 * size * size - 1))
 
 
-def _ready(visible: DirectTransport, brdf: Callable, sizes: Plan | _Sizes, samples: int, **options) -> Ready:
+def _ready(visible: StoredVisibility, brdf: Callable, sizes: Plan | _Sizes, samples: int, **options) -> Ready:
     """Transport in these sizes; the options are those of `clustered.precompute`."""
     factored = separable_system.factor(brdf, terms=sizes.terms, resolution=sizes.resolution)
     limits = {name: getattr(sizes, name) for name in ("vectors", "modes", "keep")}

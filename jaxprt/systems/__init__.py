@@ -1,6 +1,6 @@
 """The systems, their yardstick, and single bright texels beside any of them."""
 
-from jaxprt.systems import adaptive, bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt.systems import adaptive, bounces, bright_texels, dynamic, harmonic, lobe, protocol, reference, separable
 
 __all__ = [
     "adaptive",
@@ -9,6 +9,7 @@ __all__ = [
     "dynamic",
     "harmonic",
     "lobe",
+    "protocol",
     "reference",
     "separable",
 ]

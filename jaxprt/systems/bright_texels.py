@@ -3,17 +3,19 @@
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
+from jaxprt.systems.protocol import Blend, System
 
 _ROW = 32  # texels of which the brightest is looked at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
@@ -41,6 +43,91 @@ class Visibility(Protocol):
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
         """Share of some texels that each vertex sees."""
         ...
+
+
+class BrightLight(eqx.Module):
+    """A light whose brightest texels stand apart.
+
+    Attributes:
+        rest: The light without them, as the other system has it.
+        texel: Numbers of the texels.
+        excess: Radiance by which each stands out.
+    """
+
+    rest: PyTree
+    texel: Int[Array, " t"]
+    excess: Float[Array, "t c"]
+
+
+class BrightView(eqx.Module):
+    """A view of a system with single texels.
+
+    Attributes:
+        rest: The view, as the other system has it.
+        eye: Position of the viewer in world units.
+        blend: What the vertices are made of, where that is free.
+    """
+
+    rest: PyTree
+    eye: Float[Array, "3"]
+    blend: Blend | None
+
+
+class BrightTexels(System):
+    """Any system with the brightest texels of the light summed one by one, exactly.
+
+    Attributes:
+        system: What relights the rest of the light.
+        visibility: Of single texels, of the same vertices: `StoredVisibility`, or `LobeTransport`.
+        brdf: The BRDF itself; with a `Blend` one whose channels are those of the system.
+        count: Number of texels.
+        samples: Points along the edge of each, from `samples_for`.
+    """
+
+    system: System
+    visibility: Any
+    brdf: Callable
+    count: int = eqx.field(static=True, default=16)
+    samples: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        """Refuses what is no system or no visibility, and visibility of other vertices."""
+        source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
+        require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
+        require.kind("the visibility", self.visibility, Visibility, source=source)
+        require.length("the vertices of the visibility", self.visibility.position, self.system.vertices)
+
+    def light(self, environment: Environment) -> BrightLight:
+        """The light, split; the rest as the system has it."""
+        texel, excess, rest = split(environment, count=self.count)
+        return BrightLight(self.system.light(rest), texel, excess)
+
+    def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
+        """What arrives of the rest."""
+        return BrightLight(self.system.shade(light.rest, materials), light.texel, light.excess)
+
+    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> BrightView:
+        """The view, as the system has it."""
+        return BrightView(self.system.view(eye, materials), jnp.asarray(eye), materials)
+
+    def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
+        """Radiance: that of the system, and that of the texels."""
+        require.kind("the light", light, BrightLight, source="BrightTexels.light")
+        require.kind("the view", view, BrightView, source="BrightTexels.view")
+        rest = self.system.combine(light.rest, view.rest)
+        options = {"eye": view.eye, "samples": self.samples, "blend": view.blend}
+        return rest + radiance(self.visibility, self.brdf, light.texel, light.excess, **options)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return self.system.vertices
+
+    @property
+    def shared_light(self) -> tuple | None:
+        """That of the system, and the number of texels."""
+        rest = self.system.shared_light
+        return rest and (BrightTexels, self.count, rest)
 
 
 @partial(jax.jit, static_argnames=("count",))
@@ -83,11 +170,12 @@ def radiance(
     *,
     eye: Float[Array, "3"],
     samples: int = 1,
+    blend: Blend | None = None,
 ) -> Float[Array, "v e"]:
     """Radiance that vertices send to the eye, of light from some texels.
 
     Args:
-        transport: Visibility of the vertices: `DirectTransport`, or the bits of `LobeTransport`.
+        transport: Visibility of the vertices: `StoredVisibility`, or the bits of `LobeTransport`.
         brdf: A model: a pytree that is callable, (wi, wo) -> value [*b c] in 1/sr on local directions.
         texel: Numbers of the texels.
         excess: Radiance of each, as `split` returns it.
@@ -95,6 +183,8 @@ def radiance(
         samples: Points along the edge of a texel at which the BRDF is taken: the texel's center, or a Gauss rule. A
             BRDF that varies over a texel, like a mirror, needs more than one; `samples_for` tells how many. The time
             grows with the square.
+        blend: What each vertex is made of, over the channels of the BRDF. If it has parameters, `brdf` is a function
+            of them that makes a BRDF, as of `jaxprt.lobe.tabulate` with knots.
 
     Returns:
         Linear radiance per vertex in the light's units; that of the grazing view where the eye is below a vertex's
@@ -113,7 +203,7 @@ def radiance(
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)
     require.position("the eye", eye)
-    return _radiance(transport, brdf, texel, excess, eye, samples=samples)
+    return _radiance(transport, brdf, texel, excess, eye, blend, samples=samples)
 
 
 def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -125,16 +215,34 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
 
 
 @partial(jax.jit, static_argnames=("samples",))
-def _radiance(transport: Visibility, brdf: Callable, texel: Array, excess: Array, eye: Array, *, samples: int) -> Array:
+def _radiance(
+    transport: Visibility,
+    brdf: Callable,
+    texel: Array,
+    excess: Array,
+    eye: Array,
+    blend: Blend | None,
+    *,
+    samples: int,
+) -> Array:
     frame = jnp.moveaxis(transport.frame, 0, 2)
     wo = directions.view(transport.frame, transport.position, eye).T
+    parameter = () if blend is None else blend.parameter
+
+    def one(wi, wo, *parameter):
+        return brdf(*parameter)(wi, wo) if parameter else brdf(wi, wo)
+
     # Vertices last, which XLA's CPU code turns into vectors of them.
-    value = jax.vmap(jax.vmap(brdf, in_axes=(1, 1), out_axes=1), in_axes=(1, None), out_axes=1)
+    own = (0,) * len(parameter)
+    by_vertex = jax.vmap(one, in_axes=(1, 1, *own), out_axes=1)
+    value = jax.vmap(by_vertex, in_axes=(1, None, *(None for _ in own)), out_axes=1)
 
     def group(argument):
         direction, area, excess, visible = argument
         wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
-        sent = value(wi, wo) * (jnp.maximum(_along(frame[2], area[:, None]), 0) * visible)
+        sent = value(wi, wo, *parameter) * (jnp.maximum(_along(frame[2], area[:, None]), 0) * visible)
+        if blend is not None:
+            return jnp.einsum("ktv,tc,vkc->cv", sent, *_weighted(excess, blend.weight))
         return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
 
     direction, area = (each.reshape(-1, 3).astype(excess.dtype) for each in _points(texel, transport.size, samples))
@@ -248,6 +356,12 @@ def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
 def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
     """Components along an axis of each vertex."""
     return axis[0] * direction[..., 0] + axis[1] * direction[..., 1] + axis[2] * direction[..., 2]
+
+
+def _weighted(excess: Array, weight: Array) -> tuple[Array, Array]:
+    """Light and weights in as many colors as either has."""
+    colors = max(excess.shape[1], weight.shape[2])
+    return jnp.broadcast_to(excess, (len(excess), colors)), jnp.broadcast_to(weight, (*weight.shape[:2], colors))
 
 
 def _alike(sent: Array, excess: Array) -> tuple[Array, Array]:

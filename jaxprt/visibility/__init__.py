@@ -2,12 +2,12 @@
 
 from jaxprt.visibility import blocks, hits, rays, stored
 from jaxprt.visibility.rays import LEVELS, Occluder, exhaustive, fractional, start_points
-from jaxprt.visibility.stored import DirectTransport, precompute
+from jaxprt.visibility.stored import StoredVisibility, precompute
 
 __all__ = [
     "LEVELS",
-    "DirectTransport",
     "Occluder",
+    "StoredVisibility",
     "blocks",
     "exhaustive",
     "fractional",

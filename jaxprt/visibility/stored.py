@@ -28,7 +28,7 @@ _HALF = rays.BLOCK // 2
 _MIDDLE = 8  # sixteen of the seventeen levels fit four bits: 9 becomes 8
 
 
-class DirectTransport(eqx.Module):
+class StoredVisibility(eqx.Module):
     """Visibility of every texel from every vertex, in four bits.
 
     Attributes:
@@ -74,7 +74,7 @@ def precompute(
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
-) -> DirectTransport:
+) -> StoredVisibility:
     """Traces what each vertex sees, and keeps it.
 
     12 kB a vertex at 6 x 64 x 64.
@@ -102,7 +102,7 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = rays.place(mesh, vertex)
-    return DirectTransport(jax.device_put(result["level"]), position, jax.device_put(job.frame))
+    return StoredVisibility(jax.device_put(result["level"]), position, jax.device_put(job.frame))
 
 
 def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:

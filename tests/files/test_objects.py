@@ -34,7 +34,8 @@ def classes():
             continue
         for name, kind in inspect.getmembers(importlib.import_module(info.name), inspect.isclass):
             data = issubclass(kind, eqx.Module) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
-            if data and kind.__module__ == info.name and not name.startswith("_"):
+            public = kind.__module__ == info.name and not name.startswith("_")
+            if data and public and not inspect.isabstract(kind):
                 yield kind
 
 
@@ -66,6 +67,8 @@ def value(hint, random, name=""):
     plain = {int: 3, float: 0.1, str: "name", np.ndarray: np.arange(3), typing.Any: {"a": [1.5, None, (True,)]}}
     if hint in plain:
         return plain[hint]
+    if hint is prt.System:
+        hint = prt.harmonic.DiffuseSystem  # Any system will do.
     if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
         return filled(hint, random)
     return {"coordinates": hemisphere.polar_coordinates, "chart": navigation._log_roughness}.get(
@@ -249,7 +252,7 @@ def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_p
     path = tmp_path / "a.prt"
     prt.files.save(path, scene[0])
     monkeypatch.setattr(separable.sparse, "ALGORITHM", 77, raising=False)
-    with pytest.raises(ValueError, match=r"algorithm in jaxprt.separable.sparse, this jaxprt has version 77"):
+    with pytest.raises(ValueError, match=r"algorithm in jaxprt.systems.separable.sparse, this jaxprt has version 77"):
         prt.files.load(path)
     monkeypatch.undo()
     group = zarr.open_group(path, mode="r+")

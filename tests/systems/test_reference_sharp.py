@@ -11,7 +11,7 @@ from jaxprt import bright_texels, reference
 from jaxprt.brdf import AshikhminShirley, CookTorrance
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, directions
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 SIZE = 8
 STATED = 1e-3
@@ -102,7 +102,7 @@ def test_single_texels_by_as_many_points_as_their_brdf_needs_are_the_integral(sc
     seen, position, frame, light, eye = scene
     level = np.zeros((6 * SIZE**2, 32), np.uint8)
     level[:, :4] = np.asarray(seen - (seen > 8)).T
-    transport = DirectTransport(jnp.asarray(level), position, frame)
+    transport = StoredVisibility(jnp.asarray(level), position, frame)
     sun = jax.tree.map(lambda each: each[1], light)
     texel, excess, _ = bright_texels.split(sun, count=1)
     brdf = SHARP["m = 0.05"]

@@ -263,9 +263,9 @@ def test_a_process_killed_at_any_moment_leaves_a_store_that_goes_on_to_the_same_
 KILLED = """
 import os, signal, sys
 import numpy as np
-from jaxprt.separable.factorization import SeparableBrdf
+from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.files.arrays import BlockStore
-from jaxprt.separable.wavelets import precompute
+from jaxprt.systems.separable import precompute
 import jaxprt as prt
 
 brdf = prt.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)

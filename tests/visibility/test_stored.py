@@ -10,7 +10,7 @@ import pytest
 from jaxprt import visibility
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join
-from jaxprt.visibility import DirectTransport, precompute
+from jaxprt.visibility import StoredVisibility, precompute
 
 SIZE = 8
 ALL = 6 * SIZE**2
@@ -154,4 +154,4 @@ def test_it_is_a_pytree_whose_leaves_are_its_arrays(transport):
     leaves, form = jax.tree.flatten(transport)
     assert len(leaves) == 3
     same(jax.tree.unflatten(form, leaves), transport)
-    assert isinstance(transport, DirectTransport)
+    assert isinstance(transport, StoredVisibility)

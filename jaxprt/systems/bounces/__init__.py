@@ -1,11 +1,13 @@
 """Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
 
-from jaxprt.systems.bounces import functions, gather, jobs, relight, tensor
+from jaxprt.systems.bounces import functions, gather, jobs, relight, system, tensor
 from jaxprt.systems.bounces.functions import factor
 from jaxprt.systems.bounces.relight import arriving, combine, light_side, radiance, view_side
+from jaxprt.systems.bounces.system import BouncesSystem
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, precompute
 
 __all__ = [
+    "BouncesSystem",
     "SecondBounce",
     "TransferTensor",
     "arriving",
@@ -18,6 +20,7 @@ __all__ = [
     "precompute",
     "radiance",
     "relight",
+    "system",
     "tensor",
     "view_side",
 ]

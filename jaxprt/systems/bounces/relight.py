@@ -26,7 +26,7 @@ from jaxprt.systems import dynamic
 from jaxprt.systems.bounces import functions
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.tensor import TransferTensor
-from jaxprt.systems.dynamic import DynamicBrdf, DynamicTransport, DynamicView, Material
+from jaxprt.systems.dynamic import DynamicBrdf, DynamicTransport, Material, RegionBrdf
 from jaxprt.systems.separable import SeparableBrdf
 
 
@@ -105,7 +105,7 @@ def radiance(
     lit = dynamic.light_side(transport, light, texels=texels)
     direct = dynamic.combine(transport, lit, view, samples=samples)
     arrived = arriving(transport, tensor, light_side(tensor, light), materials)
-    return direct + combine(transport, arrived, view_side(transport, view))
+    return direct + combine(transport, arrived, view_side(transport, dynamic.mix(transport, brdfs, materials), eye=eye))
 
 
 def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
@@ -187,25 +187,29 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
     return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
 
 
-def view_side(transport: DynamicTransport, view: DynamicView) -> tuple[ReflectedView, ...]:
+def view_side(
+    transport: DynamicTransport, surfaces: Sequence[RegionBrdf], *, eye: Float[Array, "3"]
+) -> tuple[ReflectedView, ...]:
     """What changes with the view and the materials.
 
     Args:
-        transport: As of `radiance`.
-        view: From `jaxprt.dynamic.view_side`.
+        transport: As in `radiance`.
+        surfaces: What each region reflects with, from `jaxprt.dynamic.mix`.
+        eye: Position of the viewer in world units.
     """
+    require.position("the eye", eye)
     result = []
-    for own, each in zip(transport.region, view.region, strict=True):
+    for own, each in zip(transport.region, surfaces, strict=True):
         position, frame = own.seen.position, own.seen.frame
         if isinstance(each.brdf, SeparableBrdf):
             one = jnp.ones((1, 1), position.dtype)
-            result.append(ReflectedView(_by_terms(each.brdf, position, frame, view.eye), one, 0 * position[:, :1].T))
+            result.append(ReflectedView(_by_terms(each.brdf, position, frame, eye), one, 0 * position[:, :1].T))
             continue
         assert each.diffuse is not None
         assert each.specular is not None
-        coefficient, base = _by_lobes(each.brdf.lobe, position, frame, view.eye)
+        coefficient, base = _by_lobes(each.brdf.lobe, position, frame, eye)
         if each.brdf.terms.terms:
-            coefficient = coefficient + _by_terms(each.brdf.terms, position, frame, view.eye)
+            coefficient = coefficient + _by_terms(each.brdf.terms, position, frame, eye)
         specular = each.specular.T
         result.append(ReflectedView(coefficient, specular, each.diffuse.T + base * specular))
     return tuple(result)

@@ -1,30 +1,45 @@
 """The dynamic system: materials that change at run time, direct light (Sun et al. 2007)."""
 
-from jaxprt.systems.dynamic import brdf_set, published, reflected, relight, transport
+from jaxprt.systems.dynamic import brdf_set, published, reflected, relight, system, transport
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed, factor, separate
 from jaxprt.systems.dynamic.published import factor_tensor
-from jaxprt.systems.dynamic.relight import DynamicLight, DynamicView, Material, combine, light_side, radiance, view_side
+from jaxprt.systems.dynamic.relight import (
+    DynamicLight,
+    DynamicView,
+    Material,
+    RegionBrdf,
+    combine,
+    light_side,
+    mix,
+    radiance,
+    view_side,
+)
+from jaxprt.systems.dynamic.system import DynamicSystem
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport, precompute
 
 __all__ = [
     "DynamicBrdf",
     "DynamicLight",
+    "DynamicSystem",
     "DynamicTransport",
     "DynamicView",
     "Material",
     "Mixed",
+    "RegionBrdf",
     "RegionTransport",
     "brdf_set",
     "combine",
     "factor",
     "factor_tensor",
     "light_side",
+    "mix",
     "precompute",
     "published",
     "radiance",
     "reflected",
     "relight",
     "separate",
+    "system",
     "transport",
     "view_side",
 ]

@@ -68,22 +68,32 @@ class DynamicLight(eqx.Module):
     matte: tuple[Float[Array, "_ c"], ...]
 
 
+class RegionBrdf(eqx.Module):
+    """What a region reflects with at present: the BRDF that its material makes of its set.
+
+    Attributes:
+        brdf: The BRDF.
+        diffuse: Albedo of each row or of all; None in a region that does not change.
+        specular: What all but the diffuse part is multiplied by, of each row or of all; None likewise.
+    """
+
+    brdf: Mixed | SeparableBrdf
+    diffuse: Float[Array, "_ d"] | None
+    specular: Float[Array, "_ e"] | None
+
+
 class RegionView(eqx.Module):
     """What a view and a material are for one region.
 
     Attributes:
-        brdf: The BRDF.
+        surface: What the region reflects with.
         factor: Of each row and term without the diffuse one, if there are others.
         looked: Where rows read the light for their lobes, if there are any.
-        diffuse: Albedo of each row or of all; None in a region that does not change.
-        specular: What all but the diffuse part is multiplied by, of each row or of all; likewise.
     """
 
-    brdf: Mixed | SeparableBrdf
+    surface: RegionBrdf
     factor: Float[Array, "q r c"] | None
     looked: LobeView | None
-    diffuse: Float[Array, "_ d"] | None
-    specular: Float[Array, "_ e"] | None
 
 
 class DynamicView(eqx.Module):
@@ -140,7 +150,7 @@ def radiance(
 def light_side(transport: DynamicTransport, light: Environment, *, texels: int = 16) -> DynamicLight:
     """What changes with the light.
 
-    Arguments and errors as of `radiance`.
+    Arguments and errors are those of `radiance`.
     """
     size = transport.size
     if not isinstance(light, Environment):
@@ -167,28 +177,46 @@ def view_side(
 ) -> DynamicView:
     """What changes with the view and the materials.
 
-    Arguments and errors as of `radiance`.
+    Arguments and errors are those of `radiance`.
     """
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
     require.position("the eye", eye)
+    region = []
+    for own, surface in zip(transport.region, mix(transport, brdfs, materials), strict=True):
+        brdf = surface.brdf
+        if isinstance(brdf, SeparableBrdf):
+            region.append(RegionView(surface, separable.view_tuple(own.terms, brdf, eye), None))
+            continue
+        looked = None if brdf.lobe is None else lobe.look(own.seen, brdf.lobe, eye=eye)
+        factor = separable.view_tuple(own.terms, brdf.terms, eye) if brdf.terms.terms else None
+        region.append(RegionView(surface, factor, looked))
+    return DynamicView(eye, tuple(region))
+
+
+def mix(
+    transport: DynamicTransport,
+    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    materials: Sequence[Material | None],
+) -> tuple[RegionBrdf, ...]:
+    """What each region reflects with: what changes with the materials alone.
+
+    Arguments and errors are those of `radiance`.
+    """
     count = len(transport.region)
     if len(brdfs) != count or len(materials) != count:
         raise ValueError(
             f"there must be a BRDF and a material for each of {count} regions, got {len(brdfs)} and {len(materials)}"
         )
-    region = []
+    result = []
     for number, (own, brdf, material) in enumerate(zip(transport.region, brdfs, materials, strict=True)):
         _check(number, own, brdf, material, len(transport.place))
         if isinstance(brdf, SeparableBrdf):
-            region.append(RegionView(brdf, separable.view_tuple(own.terms, brdf, eye), None, None, None))
+            result.append(RegionBrdf(brdf, None, None))
             continue
         assert material is not None
-        mixed = _mixed(brdf, material.share)
-        looked = None if mixed.lobe is None else lobe.look(own.seen, mixed.lobe, eye=eye)
         diffuse, specular = (_by_row(each, own.vertex) for each in (material.diffuse, material.specular))
-        factor = separable.view_tuple(own.terms, mixed.terms, eye) if mixed.terms.terms else None
-        region.append(RegionView(mixed, factor, looked, diffuse, specular))
-    return DynamicView(eye, tuple(region))
+        result.append(RegionBrdf(_mixed(brdf, material.share), diffuse, specular))
+    return tuple(result)
 
 
 def combine(
@@ -204,18 +232,16 @@ def combine(
     """
     result = []
     for own, met, matte, each in zip(transport.region, light.met, light.matte, view.region, strict=True):
-        if isinstance(each.brdf, SeparableBrdf):
-            single = bright_texels.radiance(
-                own.seen, each.brdf, light.texel, light.excess, eye=view.eye, samples=samples
-            )
+        brdf, diffuse, specular = each.surface.brdf, each.surface.diffuse, each.surface.specular
+        model = brdf.brdf if isinstance(brdf, Mixed) and brdf.brdf is not None else brdf
+        single = bright_texels.radiance(own.seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
+        if isinstance(brdf, SeparableBrdf):
             result.append(separable.combine(met, each.factor) + single)
             continue
-        model = each.brdf if each.brdf.brdf is None else each.brdf.brdf
-        single = bright_texels.radiance(own.seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
         glossy = None
         if each.looked is not None:
             glossy = lobe.combine(light.blurred, _glossy(each.looked)), each.looked.diffuse.T
-        result.append(_sum(met, each.factor, glossy, single, matte, each.diffuse, each.specular))
+        result.append(_sum(met, each.factor, glossy, single, matte, diffuse, specular))
     return _gathered(tuple(result), transport.place)
 
 

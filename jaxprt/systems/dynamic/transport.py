@@ -21,7 +21,7 @@ from jaxprt.systems import lobe, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 _MEMBERS = 230  # vertices of a cluster in a large region
 _CLUSTERS = 64  # of a smaller one, as long as they have
@@ -142,7 +142,7 @@ def precompute(
 
 
 def compress(
-    visible: DirectTransport,
+    visible: StoredVisibility,
     brdf: DynamicBrdf | SeparableBrdf,
     vectors: int,
     modes: int,

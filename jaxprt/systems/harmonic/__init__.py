@@ -1,6 +1,6 @@
 """The harmonic system: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002)."""
 
-from jaxprt.systems.harmonic import interreflection, relight, table, transfer
+from jaxprt.systems.harmonic import interreflection, relight, system, table, transfer
 from jaxprt.systems.harmonic.interreflection import interreflect, interreflect_diffuse
 from jaxprt.systems.harmonic.relight import (
     combine,
@@ -15,11 +15,14 @@ from jaxprt.systems.harmonic.relight import (
     view_coefficients,
     world_view,
 )
+from jaxprt.systems.harmonic.system import DiffuseSystem, HarmonicSystem
 from jaxprt.systems.harmonic.table import HarmonicBrdf, tabulate
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, precompute, precompute_diffuse
 
 __all__ = [
+    "DiffuseSystem",
     "HarmonicBrdf",
+    "HarmonicSystem",
     "TransferMatrix",
     "TransferVector",
     "combine",
@@ -34,6 +37,7 @@ __all__ = [
     "project",
     "radiance",
     "relight",
+    "system",
     "table",
     "tabulate",
     "transfer",

@@ -1,14 +1,17 @@
 """The lobe system: BRDFs as mixtures of von Mises-Fisher lobes, visibility in pyramids."""
 
-from jaxprt.systems.lobe import em, published, pyramid, relight, table
+from jaxprt.systems.lobe import em, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, compress, precompute
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter, radiance
-from jaxprt.systems.lobe.table import LobeBrdf, Lobes, Remainder, tabulate
+from jaxprt.systems.lobe.remainder import Remainder
+from jaxprt.systems.lobe.system import LobeSystem
+from jaxprt.systems.lobe.table import LobeBrdf, Lobes, tabulate
 
 __all__ = [
     "LobeBrdf",
     "LobeLight",
+    "LobeSystem",
     "LobeTransport",
     "LobeView",
     "Lobes",
@@ -24,6 +27,8 @@ __all__ = [
     "pyramid",
     "radiance",
     "relight",
+    "remainder",
+    "system",
     "table",
     "tabulate",
 ]

@@ -23,7 +23,7 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems import harmonic
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
@@ -219,7 +219,7 @@ def precompute(
     return LobeTransport(level, vector, position, jax.device_put(job.frame), size)
 
 
-def compress(direct: DirectTransport) -> LobeTransport:
+def compress(direct: StoredVisibility) -> LobeTransport:
     """The same from visibility that is known, without rays.
 
     Raises:

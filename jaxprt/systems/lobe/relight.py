@@ -125,13 +125,21 @@ def prefilter(light: Environment) -> LobeLight:
 
 
 @require.arguments(brdf=_brdf)
-def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) -> LobeView:
+def look(transport: LobeTransport, brdf: LobeBrdf, *parameter: Float[Array, " v"], eye: Float[Array, "3"]) -> LobeView:
     """Where each vertex reads the light for a view, and what it sees there.
 
-    The first half of `radiance`, with its arguments.
+    Args:
+        transport: Visibility pyramids.
+        brdf: A table of lobes.
+        parameter: Those of each vertex, for a table over some.
+        eye: Position of the viewer in world units.
+
+    Raises:
+        TypeError: The BRDF is no table of lobes.
+        ValueError: The number of parameters is not that of the table, or the eye is not one finite position.
     """
     require.position("the eye", eye)
-    lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye)
+    lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye, *parameter)
     place, share = _taps(
         face, s, t, spread, lobe.concentration, transport.share(face, s, t, spread), size=transport.size
     )
@@ -139,9 +147,11 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *, eye: Float[Array, "3"]) ->
 
 
 @apart
-def _places(position: Array, frame: Array, brdf: LobeBrdf, eye: Array) -> tuple[Lobes, tuple[Array, ...]]:
+def _places(
+    position: Array, frame: Array, brdf: LobeBrdf, eye: Array, *parameter: Array
+) -> tuple[Lobes, tuple[Array, ...]]:
     """Lobes of each vertex, and face, place on it and spread of each."""
-    lobe = brdf.lookup(directions.view(frame, position, eye))
+    lobe = brdf.lookup(directions.view(frame, position, eye), *parameter)
     world = [sum(lobe.mean[j] * frame[:, j, i] for j in range(3)) for i in range(3)]
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 

@@ -8,6 +8,7 @@ fixed widths around the mirror direction, is `jaxprt.lobe.published.mirror_lobes
 """
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import ClassVar
@@ -28,7 +29,6 @@ _STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
 _ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0))
 _DEGREE = 24  # of the natural light by which a table is judged
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
-_GRAZING = 1e-3
 _TINY = 1e-12
 
 
@@ -109,14 +109,21 @@ class LobeBrdf(eqx.Module):
             result = mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
         return result
 
-    def lookup(self, wo: Float[Array, "v 3"]) -> Lobes:
+    def lookup(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> Lobes:
         """Lobes for some views, interpolated between the nodes; without weight where the view is below the horizon.
 
+        Args:
+            wo: Directions to the viewer.
+            parameter: The parameters of each view, for a table over some; between knots as `mean` has it.
+
         Raises:
-            ValueError: The table has parameters: choose them first, by `at`.
+            ValueError: The number of parameters is not that of the table: `at` chooses them for all views alike.
         """
-        if self.knot:
-            raise ValueError(f"the table has {len(self.knot)} parameters, which `at` must choose first")
+        if len(parameter) != len(self.knot):
+            raise ValueError(
+                f"the table needs {len(self.knot)} parameters for each view, or `at` to choose them for all, "
+                f"got {len(parameter)}"
+            )
         resolution = self.scale.shape[-1]
         square = wo[:, 0] ** 2 + wo[:, 1] ** 2
         pole = square < _TINY
@@ -128,7 +135,15 @@ class LobeBrdf(eqx.Module):
             axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
         nodes = self.scale.shape[1:]
         rows = [each.reshape(-1, *nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
-        value = grid.read(jnp.concatenate(rows), axis)
+        place = [
+            grid.neighbors(grid.place(knot, each), size=len(knot))
+            for knot, each in zip(self.knot, parameter, strict=True)
+        ]
+        value = (
+            _between_knots(self, jnp.concatenate(rows), place, axis)
+            if place
+            else grid.read(jnp.concatenate(rows), axis)
+        )
         mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
         x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
@@ -144,6 +159,39 @@ class LobeBrdf(eqx.Module):
         batch = wo.shape[:-1]
         value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
         return value.T.reshape(*batch, len(self.weight))
+
+
+def _between_knots(table: LobeBrdf, row: Array, knot: list, axis: list) -> Float[Array, "r v"]:
+    """Rows of a table for views that each have parameters of their own: between knots first, then between nodes."""
+    sizes, nodes = row.shape[1 : 1 + len(knot)], row.shape[1 + len(knot) :]
+    flat = row.reshape(len(row), -1)
+
+    def read(index: Array, node: Array, left: list) -> Array:
+        """Rows at a node, between the knots of the parameters that are left."""
+        if not left:
+            return flat.at[:, index * math.prod(nodes) + node].get(mode="promise_in_bounds")
+        size, (low, upper) = left[0]
+        first, second = (read(index * size + low + up, node, left[1:]) for up in (0, 1))
+        return _merged(first, second, upper, lobes=table.lobes)
+
+    total = jnp.zeros((), row.dtype)
+    for corner in itertools.product((0, 1), repeat=len(axis)):
+        node, weight = jnp.zeros((), jnp.int32), jnp.ones((), row.dtype)
+        for up, size, (low, share) in zip(corner, nodes, axis, strict=True):
+            node, weight = node * size + low + up, weight * (share if up else 1 - share)
+        total = total + weight * read(jnp.zeros((), jnp.int32), node, list(zip(sizes, knot, strict=True)))
+    return total
+
+
+def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
+    """Rows of lobes between those of two knots, as `mean` has it."""
+    count = (3 * lobes, 4 * lobes, first.shape[0] - (first.shape[0] - 4 * lobes) // (lobes + 1))
+    parts = [jnp.split(each, count) for each in (first, second)]
+    strong = [jnp.sum(each[2].reshape(-1, lobes, each[2].shape[1]), 0) for each in parts]
+    low, high = jnp.maximum((1 - upper) * strong[0], 0) + _TINY, jnp.maximum(upper * strong[1], 0) + _TINY
+    high = high / (low + high)
+    shares = jnp.tile(high, (3, 1)), high, upper, upper
+    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, shares, strict=True)])
 
 
 @jax.jit
@@ -165,22 +213,6 @@ def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
     scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)
     return LobeBrdf(place, scale, weight, diffuse, table.knot[1:], table.error)
-
-
-class Remainder(eqx.Module):
-    """What the lobes leave of a BRDF, itself a BRDF of either sign, for low-rank terms.
-
-    Attributes:
-        brdf: The BRDF.
-        lobe: Its lobes; the diffuse part counts as one of them.
-    """
-
-    brdf: Callable
-    lobe: LobeBrdf
-
-    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-        """Value in 1/sr: the BRDF less the lobes over the cosine, which counts as at least 0.001."""
-        return self.brdf(wi, wo) - self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
 
 
 def tabulate(

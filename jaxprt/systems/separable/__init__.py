@@ -1,6 +1,16 @@
 """The separable system: BRDFs as sums of products, light and transport in Haar wavelets (Wang, Tran, Luebke 2004)."""
 
-from jaxprt.systems.separable import clustered, errors, factorization, published, quantized, relight, sparse, wavelets
+from jaxprt.systems.separable import (
+    clustered,
+    errors,
+    factorization,
+    published,
+    quantized,
+    relight,
+    sparse,
+    system,
+    wavelets,
+)
 from jaxprt.systems.separable.clustered import ClusteredTransport
 from jaxprt.systems.separable.errors import light_errors, sample_error
 from jaxprt.systems.separable.factorization import SeparableBrdf, factor, join
@@ -19,12 +29,14 @@ from jaxprt.systems.separable.relight import (
     view_tuple,
 )
 from jaxprt.systems.separable.sparse import SparseTransport
+from jaxprt.systems.separable.system import SeparableSystem
 from jaxprt.systems.separable.wavelets import precompute
 
 __all__ = [
     "ClusteredTransport",
     "QuantizedTransport",
     "SeparableBrdf",
+    "SeparableSystem",
     "SparseTransport",
     "Transport",
     "choose_by_area",
@@ -48,6 +60,7 @@ __all__ = [
     "relight",
     "sample_error",
     "sparse",
+    "system",
     "view_tuple",
     "wavelets",
 ]

@@ -26,7 +26,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import haar
 from jaxprt.systems.separable import wavelets
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
-from jaxprt.visibility import DirectTransport
+from jaxprt.visibility import StoredVisibility
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}
@@ -157,7 +157,7 @@ def _read(transport: ClusteredTransport) -> Array:
 
 
 def precompute(
-    direct: DirectTransport,
+    direct: StoredVisibility,
     brdf: SeparableBrdf,
     *,
     clusters: int = 160,
@@ -348,7 +348,7 @@ def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) ->
 class _Job(ClusterJob):
     """Transport of the terms of a BRDF; see `blocks.Job`."""
 
-    direct: DirectTransport
+    direct: StoredVisibility
     brdf: SeparableBrdf
     member: np.ndarray
     vectors: int

@@ -68,13 +68,13 @@ def towards_eye(region):
 
 def test_what_lobes_send_of_harmonics_is_their_integral(transport, brdfs, tensor):
     """Free lobes of a mixed material over their whole sphere, the diffuse part over the hemisphere."""
-    view = dynamic.view_side(transport, brdfs, [material(0.4, [0.6, 0.5, 0.3]), None], eye=EYE)
-    seen = bounces.view_side(transport, view)[0]
+    surfaces = dynamic.mix(transport, brdfs, [material(0.4, [0.6, 0.5, 0.3]), None])
+    seen = bounces.view_side(transport, surfaces, eye=EYE)[0]
     own = transport.region[0]
     random = np.random.default_rng(1).normal(size=(16, 3)).astype(np.float32)
     coefficient, specular, diffuse = (np.asarray(each) for each in (seen.coefficient, seen.specular, seen.diffuse))
     found = np.sum(random[..., None] * coefficient, 0) * specular + 0.7 * diffuse
-    table = view.region[0].brdf.lobe
+    table = surfaces[0].brdf.lobe
     wo = towards_eye(own)
     facing = np.flatnonzero(wo[:, 2] > 0.2)[::9]
     nodes, area = map(np.asarray, hemisphere.arcs(jnp.array([0.0, 0.0, 1.0]), rings=96, sectors=192))
@@ -96,8 +96,7 @@ def test_what_lobes_send_of_harmonics_is_their_integral(transport, brdfs, tensor
 def test_what_a_factored_brdf_sends_of_harmonics_is_its_integral(mesh):
     glossy = separable.factor(CookTorrance(diffuse=0.3, specular=0.5, roughness=0.5, f0=0.3), terms=6, resolution=16)
     transport = dynamic.precompute(mesh, [glossy, glossy], size=8, progress=False)
-    view = dynamic.view_side(transport, [glossy, glossy], [None, None], eye=EYE)
-    seen = bounces.view_side(transport, view)[0]
+    seen = bounces.view_side(transport, dynamic.mix(transport, [glossy, glossy], [None, None]), eye=EYE)[0]
     own = transport.region[0]
     wo, coefficient, value = towards_eye(own), np.asarray(seen.coefficient), jax.jit(lambda wi, wo: glossy(wi, wo))
     nodes, area = hemisphere.arcs(jnp.array([0.0, 0.0, 1.0]), rings=96, sectors=192)
@@ -135,7 +134,9 @@ def test_stages_make_the_radiance(transport, tensor, brdfs):
     lit = bounces.light_side(tensor, lamp)
     arrived = bounces.arriving(transport, tensor, lit, now)
     color = dynamic.combine(transport, dynamic.light_side(transport, lamp), view)
-    color = color + bounces.combine(transport, arrived, bounces.view_side(transport, view))
+    color = color + bounces.combine(
+        transport, arrived, bounces.view_side(transport, dynamic.mix(transport, brdfs, now), eye=EYE)
+    )
     whole = bounces.radiance(transport, tensor, brdfs, now, lamp, eye=EYE)
     np.testing.assert_allclose(color, whole, rtol=1e-6, atol=1e-7)
 
@@ -174,7 +175,7 @@ def test_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, 
 def test_reflected_radiance_by_light_and_material_is_finite_differences(transport, tensor, brdfs):
     """What the view and the direct light add is differentiated in `test_dynamic` and, with this, in `test_contract`."""
     lamp, direction = light(), light(1).radiance - 0.5
-    view = bounces.view_side(transport, dynamic.view_side(transport, brdfs, [material(), None], eye=EYE))
+    view = bounces.view_side(transport, dynamic.mix(transport, brdfs, [material(), None]), eye=EYE)
 
     def mean(step, color, share):
         now, lights = [Material(share, color, 0.6), None], Environment(lamp.radiance + step * direction)

@@ -196,6 +196,6 @@ def test_a_table_with_parameters_is_refused(transport, tables, light):
     table = lobe.LobeBrdf(
         *map(jnp.asarray, (mean, scale, weight, diffuse)), (jnp.log(jnp.array([0.1, 0.3])),), tables["sharp"].error
     )
-    with pytest.raises(ValueError, match=r"has 1 parameters, which `at` must choose first"):
+    with pytest.raises(ValueError, match=r"needs 1 parameters for each view, or `at` to choose"):
         lobe.radiance(transport, table, light, eye=EYE)
     assert np.isfinite(lobe.radiance(transport, table.at(jnp.asarray(-1.7)), light, eye=EYE)).all()

@@ -429,7 +429,7 @@ def test_a_wrong_number_of_parameters_is_refused(quick):
         quick("glossy").at(jnp.asarray(1.0))
     with pytest.raises(ValueError, match="the table has 1 parameters, got 0"):
         quick("varying", resolution=4).at()
-    with pytest.raises(ValueError, match="the table has 1 parameters, which `at` must choose first"):
+    with pytest.raises(ValueError, match="the table needs 1 parameters for each view, or `at` to choose"):
         quick("varying", resolution=4).lookup(upper(0, 2))
 
 

@@ -1,0 +1,129 @@
+"""The harmonic system: its four verbs."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.brdf.models import scalar
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import harmonics
+from jaxprt.systems import protocol
+from jaxprt.systems.harmonic.relight import combine, project, transferred_light, view_coefficients
+from jaxprt.systems.harmonic.table import HarmonicBrdf
+from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
+from jaxprt.systems.protocol import Blend
+
+
+class HarmonicSystem(protocol.System):
+    """Transfer matrices and the harmonics of a BRDF, under low-frequency light.
+
+    A `Blend` weights the channels of the table, and has the parameters of each vertex for a table over some.
+
+    Attributes:
+        transport: Transfer matrices, from `jaxprt.harmonic.precompute` or `jaxprt.harmonic.interreflect`.
+        brdf: The table, from `jaxprt.harmonic.tabulate`.
+        laplacian: Share of the light's squared Laplacian that a window against ringing leaves, from 0 to 1; 1 leaves
+            the light as it is. See `jaxprt.sphere.harmonics.least_laplacian`.
+    """
+
+    transport: TransferMatrix
+    brdf: HarmonicBrdf
+    laplacian: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
+
+    def __check_init__(self):
+        """Refuses transport and BRDFs of other systems or of unlike degrees."""
+        require.kind("the transport", self.transport, TransferMatrix, source="jaxprt.harmonic.precompute")
+        require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
+        if self.brdf.degree != self.degree:
+            raise ValueError(f"the BRDF must have the transport's degree {self.degree}, got {self.brdf.degree}")
+
+    @property
+    def degree(self) -> int:
+        """Highest degree of the harmonics."""
+        return harmonics.degree_of(self.transport.matrix.shape[-1])
+
+    def light(self, environment: Environment) -> Float[Array, "lm c v"]:
+        """Harmonics of the light that arrives at each vertex, in its own frame."""
+        coefficient = _projected(environment, self.degree)
+        window = harmonics.least_laplacian(coefficient, self.laplacian)
+        return transferred_light(self.transport, harmonics.convolve(coefficient, window))
+
+    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
+        """The BRDF's harmonics for each vertex's view: `jaxprt.harmonic.view_coefficients`."""
+        protocol.check_blend(materials)
+        parameter = () if materials is None else materials.parameter
+        row = view_coefficients(self.brdf, self.transport.position, self.transport.frame, *parameter, eye=eye)
+        if materials is None:
+            return row
+        materials.check(self.vertices, row.shape[1])
+        return jnp.einsum("ikv,vkc->icv", row, materials.weight)
+
+    def combine(self, light: Float[Array, "lm c v"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
+        """Radiance: the dot product of light and BRDF."""
+        require.array("the light", light, "lm c v", source="HarmonicSystem.light")
+        require.array("the view", view, "lm c v", source="HarmonicSystem.view")
+        return combine(light, view)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.transport.position)
+
+
+class DiffuseSystem(protocol.System):
+    """Transfer vectors: ideal diffuse vertices, which look the same from everywhere.
+
+    A `Blend` has one channel, the albedo of each vertex; it takes the place of `albedo`.
+
+    Attributes:
+        transport: Transfer vectors, from `jaxprt.harmonic.precompute_diffuse`.
+        albedo: One for all vertices, gray or a color.
+    """
+
+    transport: TransferVector
+    albedo: Float[Array, " c"]
+
+    def __check_init__(self):
+        """Refuses other transport, and an albedo that is no color."""
+        source = "jaxprt.harmonic.precompute_diffuse"
+        require.kind("the transport", self.transport, TransferVector, source=source)
+        require.array("the albedo", self.albedo, "1", "3")
+        require.at_least("the albedo", self.albedo, 0.0)
+
+    def light(self, environment: Environment) -> Float[Array, "lm c"]:
+        """Harmonics of the light: `jaxprt.harmonic.project`."""
+        return _projected(environment, harmonics.degree_of(self.transport.vector.shape[0]))
+
+    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
+        """The vectors times the albedo; the eye changes nothing."""
+        protocol.check_blend(materials)
+        require.position("the eye", eye)
+        if materials is None:
+            return self.transport.vector * self.albedo[:, None]
+        materials.check(self.vertices, 1)
+        return self.transport.vector * materials.weight[:, 0].T
+
+    def combine(self, light: Float[Array, "lm c"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
+        """Radiance: the dot product of light and transfer."""
+        require.array("the light", light, "lm c", source="DiffuseSystem.light")
+        require.array("the view", view, "lm c v", source="DiffuseSystem.view")
+        return combine(light, view)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.transport.position)
+
+    @property
+    def shared_light(self) -> tuple:
+        """The coefficients depend on the environment alone."""
+        return DiffuseSystem, self.transport.vector.shape[0]
+
+
+def _projected(environment: Environment, degree: int) -> Float[Array, "lm c"]:
+    """Harmonics of one environment."""
+    require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
+    if environment.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(environment.radiance.shape)}")
+    return project(environment, degree=degree)

@@ -1,0 +1,68 @@
+"""The lobe system: its four verbs."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.scene.environment import Environment
+from jaxprt.systems import protocol
+from jaxprt.systems.lobe.pyramid import LobeTransport
+from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter
+from jaxprt.systems.lobe.table import LobeBrdf
+from jaxprt.systems.protocol import Blend
+
+
+class LobeSystem(protocol.System):
+    """Visibility pyramids, and a BRDF as a table of lobes. Light, view and BRDF are free.
+
+    A `Blend` weights the channels of the table, and chooses the parameters of each vertex in a table over some.
+
+    Attributes:
+        transport: Visibility pyramids, from `jaxprt.lobe.precompute`.
+        brdf: The table, from `jaxprt.lobe.tabulate`.
+    """
+
+    transport: LobeTransport
+    brdf: LobeBrdf
+
+    def __check_init__(self):
+        """Refuses transport and BRDFs of other systems."""
+        require.kind("the transport", self.transport, LobeTransport, source="jaxprt.lobe.precompute")
+        require.kind("the BRDF", self.brdf, LobeBrdf, source="jaxprt.lobe.tabulate")
+
+    def light(self, environment: Environment) -> LobeLight:
+        """The light blurred to a dozen widths: `jaxprt.lobe.prefilter`."""
+        lit = prefilter(environment)
+        if lit.size != self.transport.size:
+            raise ValueError(
+                f"the light's faces must have the transport's {self.transport.size} texels, got {lit.size}"
+            )
+        return lit
+
+    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> LobeView:
+        """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.look`."""
+        protocol.check_blend(materials)
+        if materials is None:
+            return look(self.transport, self.brdf, eye=eye)
+        materials.check(self.vertices, len(self.brdf.weight))
+        seen = look(self.transport, self.brdf, *materials.parameter, eye=eye)
+        weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight)
+        diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight)
+        return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
+
+    def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
+        """Radiance: the blurred light read at the places of the view."""
+        require.kind("the light", light, LobeLight, source="LobeSystem.light")
+        require.kind("the view", view, LobeView, source="LobeSystem.view")
+        return combine(light, view)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.transport.position)
+
+    @property
+    def shared_light(self) -> tuple:
+        """The blurred light depends on the environment alone."""
+        return LobeSystem, self.transport.size

@@ -1,0 +1,379 @@
+"""What every system promises through its four verbs, checked for all of them.
+
+To add a system, add a line to ``MADE``: it gets the scene's name and makes a system, with its materials, for that mesh.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
+from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.scene import Environment, Mesh, builtin
+from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.systems import protocol
+
+pytestmark = pytest.mark.usefixtures("coarse")
+
+SIZE = 8
+EYE = jnp.array([1.5, 2.0, 2.5])
+GLOSSY = CookTorrance(diffuse=0.5, specular=0.5, roughness=0.5, f0=0.4)
+MODELS = {
+    "white": Lambert(1.0),
+    "glossy": GLOSSY,
+    "channels": lambda wi, wo: jnp.concatenate([GLOSSY(wi, wo), 0.5 * GLOSSY(wi, wo), Lambert(1.0)(wi, wo)], -1),
+}
+
+
+class Case(NamedTuple):
+    """A system, its materials, and the radiance that it stands for."""
+
+    system: prt.System
+    materials: Any
+    mesh: Mesh
+
+
+class Promise(NamedTuple):
+    """How a system is made, and what it may err by.
+
+    ``white`` is what it may be off in a white furnace, ``error`` under a light from the exact sum, both relative; None
+    where it has no such answer. ``linear`` systems add up lights exactly; those with bright texels choose which.
+    """
+
+    make: Callable[[str, str], tuple[prt.System, Any]]
+    white: float | None
+    error: float | None
+    linear: bool = True
+
+
+@functools.cache
+def seen(name: str) -> visibility.StoredVisibility:
+    """What the vertices of a scene see; rays are traced once for all systems."""
+    return visibility.precompute(mesh(name), size=SIZE, progress=False)
+
+
+@functools.cache
+def mesh(name: str) -> Mesh:
+    """Scenes: a sphere on a ground (two regions), an open sphere, and one triangle."""
+    ball = builtin.sphere(rings=6, sectors=10)
+    if name == "triangle":
+        return make_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]]))
+    if name == "ball":
+        return ball
+    floor = builtin.plane(cells=6)
+    floor = eqx.tree_at(lambda m: m.position, floor, floor.position * 2 - jnp.array([0.0, 1.01, 0.0]))
+    return join([ball, floor])
+
+
+@functools.cache
+def factored(model: str) -> separable.SeparableBrdf:
+    """Terms of a BRDF."""
+    return separable.factor(MODELS[model], terms=6, resolution=16)
+
+
+@functools.cache
+def members() -> dynamic.DynamicBrdf:
+    """A set of two BRDFs without diffuse parts."""
+    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
+    free = functools.partial(lobe.tabulate, lobes=4, resolution=8)
+    return dynamic.factor(each, dynamic.separate(each, separator=free))
+
+
+def sparse(name: str, model: str) -> tuple[prt.System, Any]:
+    brdf = factored(model)
+    transport = separable.precompute(mesh(name), brdf, keep=6 * SIZE**2, size=SIZE, progress=False)
+    return separable.SeparableSystem(transport, brdf), None
+
+
+def quantized(name: str, model: str) -> tuple[prt.System, Any]:
+    system, _ = sparse(name, model)
+    return separable.SeparableSystem(separable.quantized.quantize(system.transport), system.brdf), None
+
+
+def clustered(name: str, model: str) -> tuple[prt.System, Any]:
+    brdf, visible = factored(model), seen(name)
+    members = max(1, len(visible.position) // 24)
+    sizes = {"clusters": members, "vectors": min(24, len(visible.position) // members), "modes": 64, "keep": 384}
+    sizes["modes"] = min(sizes["modes"], sizes["vectors"] * brdf.terms)
+    transport = separable.clustered.precompute(visible, brdf, **sizes, progress=False)
+    return separable.SeparableSystem(transport, brdf), None
+
+
+def matrices(name: str, model: str) -> tuple[prt.System, Any]:
+    transport = harmonic.precompute(mesh(name), degree=4, size=SIZE, progress=False)
+    return harmonic.HarmonicSystem(transport, harmonic.tabulate(MODELS[model], degree=4, error=0.5)), None
+
+
+def vectors(name: str, model: str) -> tuple[prt.System, Any]:
+    transport = harmonic.precompute_diffuse(mesh(name), degree=4, size=SIZE, progress=False)
+    return harmonic.DiffuseSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
+
+
+def lobes(name: str, model: str) -> tuple[prt.System, Any]:
+    return lobe.LobeSystem(lobe.compress(seen(name)), lobe.tabulate(MODELS[model], lobes=6, resolution=8)), None
+
+
+def bright(name: str, model: str) -> tuple[prt.System, Any]:
+    system, _ = lobes(name, model)
+    return bright_texels.BrightTexels(system, system.transport, MODELS[model], count=8), None
+
+
+def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
+    brdfs = [members()] * (1 + (name == "scene"))
+    transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, vectors=16, modes=32, keep=384, progress=False)
+    white = model == "white"
+    material = dynamic.Material(np.full(2, 0.5), 1.0 if white else 0.5, 0.0 if white else 0.5)
+    return dynamic.DynamicSystem(transport, brdfs), [material] * len(brdfs)
+
+
+def reflected(name: str, model: str) -> tuple[prt.System, Any]:
+    direct, materials = changing(name, model)
+    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
+    basis = [bounces.factor(each, terms=6)] * len(materials)
+    options = {"components": 8, "modes": 12, "edge": 2, "size": 4, "progress": False}
+    return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
+
+
+def total(name: str, model: str) -> tuple[prt.System, Any]:
+    indirect, materials = reflected(name, model)
+    return prt.total(indirect.direct, indirect), materials
+
+
+MADE = {
+    "separable": Promise(sparse, 0.01, 0.1),
+    "separable, quantized": Promise(quantized, 0.01, 0.1),
+    "separable, clustered": Promise(clustered, 0.02, 0.1),
+    "harmonic": Promise(matrices, 0.02, 0.25),
+    "harmonic, diffuse": Promise(vectors, 0.02, None),
+    "lobe": Promise(lobes, 0.02, 0.1),
+    "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
+    "dynamic": Promise(changing, 0.02, None, linear=False),
+    "bounces": Promise(reflected, None, None),
+    "dynamic and bounces": Promise(total, None, None, linear=False),
+}
+each_system = pytest.mark.parametrize("name", MADE)
+
+
+@functools.cache
+def made(name: str, scene: str = "scene", model: str = "glossy") -> Case:
+    """A system, made once."""
+    return Case(*MADE[name].make(scene, model), mesh(scene))
+
+
+def light(seed: int = 0, *, lamps: int = 2) -> Environment:
+    """Soft light with some brighter texels."""
+    random = np.random.default_rng(seed)
+    radiance = random.uniform(0.2, 1.0, (6, SIZE, SIZE, 3))
+    radiance.reshape(-1, 3)[random.permutation(6 * SIZE**2)[:lamps]] += 5.0
+    return Environment(jnp.asarray(radiance, jnp.float32))
+
+
+def shown(case: Case, environment: Environment) -> np.ndarray:
+    """Radiance of all vertices."""
+    return np.asarray(prt.radiance(case.system, environment, eye=EYE, materials=case.materials))
+
+
+@each_system
+def test_a_white_surface_in_a_white_furnace_is_white(name):
+    if MADE[name].white is None:
+        pytest.skip("direct light alone fills a furnace")
+    case = made(name, "ball", "white")
+    facing = np.sum(np.asarray(case.mesh.normal) * (np.asarray(EYE) - np.asarray(case.mesh.position)), 1) > 0.3
+    color = shown(case, Environment(jnp.ones((6, SIZE, SIZE, 3))))[facing]
+    np.testing.assert_allclose(np.sqrt(np.mean((color - 1) ** 2)), 0, atol=MADE[name].white)
+
+
+@each_system
+def test_radiance_is_that_of_the_exact_sum_vertex_by_vertex(name, close):
+    if MADE[name].error is None:
+        pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
+    case, environment = made(name), light()
+    exact = prt.reference.integrate(
+        jnp.asarray(seen("scene").seen(np.arange(case.system.vertices))),
+        seen("scene").position,
+        seen("scene").frame,
+        GLOSSY,
+        environment,
+        EYE,
+    )
+    facing = np.sum(np.asarray(case.mesh.normal) * (np.asarray(EYE) - np.asarray(case.mesh.position)), 1) > 0.2
+    close(shown(case, environment)[facing], np.asarray(exact)[facing], tolerance=MADE[name].error)
+
+
+@each_system
+def test_radiance_is_linear_in_the_light(name, close):
+    case, first, second = made(name), light(1), light(2)
+    once = shown(case, first)
+    close(shown(case, Environment(3 * first.radiance)), 3 * once, tolerance=1e-5)
+    if MADE[name].linear:
+        both = shown(case, Environment(first.radiance + second.radiance))
+        close(both, once + shown(case, second), tolerance=1e-5)
+
+
+@each_system
+def test_no_light_makes_no_radiance(name):
+    assert not shown(made(name), Environment(jnp.zeros((6, SIZE, SIZE, 3)))).any()
+
+
+@each_system
+def test_stages_give_the_whole_inside_a_program_and_outside(name, close):
+    system, materials, _ = made(name)
+    whole = shown(made(name), light())
+    arriving = system.shade(system.light(light()), materials)
+    close(system.combine(arriving, system.view(EYE, materials)), whole)
+    compiled = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))
+    close(compiled(system, light(), materials), whole, tolerance=2e-5)
+
+
+@each_system
+def test_a_batch_of_lights_is_each_light_by_itself(name, close):
+    case = made(name)
+    batch = Environment(jnp.stack([light(seed).radiance for seed in (3, 4)])[None])
+    color = shown(case, batch)
+    assert color.shape == (1, 2, case.system.vertices, 3)
+    close(color[0, 1], shown(case, light(4)))
+
+
+@each_system
+def test_gradients_in_the_light_are_the_radiance_of_its_change(name, close):
+    if not MADE[name].linear:
+        pytest.skip("which texels are bright is chosen; the systems' own tests have their gradients")
+    system, materials, _ = made(name)
+    weight = np.random.default_rng(5).normal(size=(system.vertices, 3)).astype(np.float32)
+
+    def total(radiance):
+        return jnp.vdot(weight, prt.radiance(system, Environment(radiance), eye=EYE, materials=materials))
+
+    slope, change = jax.grad(total)(light(6).radiance), light(7).radiance
+    close(jnp.vdot(slope, change), np.vdot(weight, shown(made(name), light(7))), tolerance=1e-4)
+
+
+@each_system
+def test_gradients_in_the_eye_are_finite(name):
+    system, materials, _ = made(name)
+    lit = system.shade(system.light(light()), materials)
+    slope = jax.grad(lambda eye: jnp.sum(system.combine(lit, system.view(eye, materials))))(EYE)
+    assert np.isfinite(slope).all()
+
+
+@each_system
+def test_a_saved_system_relights_bit_for_bit(name, tmp_path):
+    case = made(name)
+    if name.endswith("bright texels"):
+        assert isinstance(case.system.brdf, CookTorrance)
+    prt.files.save(tmp_path / "system", case.system)
+    loaded = prt.files.load(tmp_path / "system")
+    np.testing.assert_array_equal(shown(case._replace(system=loaded), light()), shown(case, light()))
+
+
+@each_system
+def test_memory_counts_every_array_once(name):
+    system = made(name).system
+    arrays = {id(each): each.nbytes for each in jax.tree.leaves(system)}
+    assert prt.memory(system) == sum(arrays.values()) > 0
+
+
+@each_system
+def test_a_mesh_of_one_triangle_is_lit(name):
+    case = made(name, "triangle")
+    color = shown(case, light())
+    assert color.shape == (3, 3)
+    assert np.isfinite(color).all()
+    assert color.any() == (name != "bounces")
+
+
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_of_another_kind_is_refused_by_what_makes_it(name):
+    system, materials, _ = made(name)
+    with pytest.raises(TypeError, match=r"light must be .*Environment, which jaxprt.scene.load_environment makes"):
+        prt.radiance(system, light().radiance, eye=EYE, materials=materials)
+    with pytest.raises((TypeError, ValueError), match="eye must be"):
+        system.view(np.zeros(2, np.float32), materials)
+    with pytest.raises(TypeError, match="light must be"):
+        system.combine(light(), system.view(EYE, materials))
+    with pytest.raises(TypeError, match="materials must be"):
+        system.view(EYE, 3)
+
+
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_lights_of_another_size_are_refused(name):
+    if "harmonic" in name or name == "bounces":
+        pytest.skip("takes lights of any size that it can reduce")
+    with pytest.raises(ValueError, match=r"light('s faces)? must"):
+        made(name).system.light(Environment(jnp.ones((6, 16, 16, 3))))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_only_systems_are_relit():
+    with pytest.raises(TypeError, match=r"system must be one of jaxprt, such as .*, got SparseTransport"):
+        prt.radiance(made("separable").system.transport, light(), eye=EYE)
+    with pytest.raises(ValueError, match=r"as many vertices, got \[3, 101\]"):
+        prt.total(made("lobe", "triangle").system, made("lobe").system)
+    with pytest.raises(ValueError, match="at least one"):
+        prt.radiance(made("lobe").system, Environment(jnp.ones((0, 6, SIZE, SIZE, 3))), eye=EYE)
+
+
+BLENDED = ["separable", "harmonic", "lobe", "lobe, bright texels"]
+
+
+@pytest.mark.parametrize("name", BLENDED)
+@pytest.mark.usefixtures("unchecked")
+def test_a_blend_weights_the_channels_of_each_vertex(name, close):
+    system, _ = MADE[name].make("scene", "channels")
+    random = np.random.default_rng(0)
+    weight = jnp.asarray(random.uniform(size=(system.vertices, 3, 3)), jnp.float32)
+    mixed = prt.radiance(system, light(), eye=EYE, materials=prt.Blend(weight))
+    unit = [prt.Blend(jnp.zeros_like(weight).at[:, k].set(1)) for k in range(3)]
+    one = [prt.radiance(system, light(), eye=EYE, materials=each) for each in unit]
+    close(mixed, np.einsum("kvc,vkc->vc", np.stack(one), weight), tolerance=2e-5)
+    with pytest.raises(ValueError, match=r"must have weights \[101 vertices, 3 channels, c\], got \[101, 2, 3\]"):
+        system.view(EYE, prt.Blend(weight[:, :2]))
+
+
+@pytest.mark.parametrize("name", ["harmonic", "lobe"])
+def test_a_blend_chooses_the_parameter_of_each_vertex(name, close):
+    knot = [np.log([0.4, 0.6])]
+
+    def rough(m):
+        return CookTorrance(diffuse=0.5, specular=0.5, roughness=jnp.exp(m), f0=0.4)
+
+    transport = made(name).system.transport
+    if name == "lobe":
+        table = lobe.tabulate(rough, lobes=4, resolution=8, knot=knot)
+        system, fixed = lobe.LobeSystem(transport, table), lobe.LobeSystem(transport, table.at(jnp.asarray(-0.7)))
+    else:
+        table = harmonic.tabulate(rough, degree=4, error=0.5, knot=knot)
+        system, fixed = harmonic.HarmonicSystem(transport, table), None
+    count = system.vertices
+    ones = jnp.ones((count, 1, 1))
+    value = np.where(np.arange(count) % 2, -0.7, np.log(0.6)).astype(np.float32)
+    color, same = (
+        prt.radiance(system, light(), eye=EYE, materials=prt.Blend(ones, (jnp.asarray(each),)))
+        for each in (value, np.full(count, -0.7, np.float32))
+    )
+    close(np.asarray(color)[1::2], np.asarray(same)[1::2])
+    assert np.abs(np.asarray(color)[::2] - np.asarray(same)[::2]).max() > 1e-3
+    if fixed is not None:
+        close(same, prt.radiance(fixed, light(), eye=EYE), tolerance=2e-5)
+    for wrong in ((), (jnp.asarray(value), jnp.asarray(value))):
+        with pytest.raises(ValueError, match="parameters"):
+            system.view(EYE, prt.Blend(ones, wrong))
+    with pytest.raises(ValueError, match="parameters of the blend must be finite"):
+        prt.Blend(ones, (jnp.full(count, jnp.nan),))
+
+
+def test_systems_of_equal_lights_say_so():
+    first, second = made("lobe").system, made("lobe", "ball").system
+    assert first.shared_light == second.shared_light is not None
+    assert made("separable").system.shared_light is None
+    assert made("lobe, bright texels").system.shared_light != first.shared_light
+    assert protocol.System.shared_light.fget(first) is None
