@@ -94,6 +94,8 @@ HOST = {
     "brdf.measured.load_lafortune": "reads a file",
     "brdf.models.color": "converts a parameter where it enters",
     "brdf.models.scalar": "the same",
+    "brdf.models.both_above": "gives truth values",
+    "brdf.models.half_vector": "tested through the models",
     "brdf.grid": "gives indices beside shares; tested through the tables that are read by it",
     "systems.harmonic.table.tabulate": "checks values, and chooses the quadrature by them",
     "systems.separable.factorization.marked": "NumPy on the host",

@@ -38,16 +38,17 @@ def _lobes(value) -> Array:
     return value[..., None] if value.ndim == 1 else value
 
 
-def _lit(wi: Array, wo: Array) -> Array:
+def both_above(wi: Array, wo: Array) -> Array:
+    """Whether both directions are above the horizon, [*b 1]."""
     return (wi[..., 2:] > 0) & (wo[..., 2:] > 0)
 
 
-def _half_vector(wi: Array, wo: Array) -> tuple[tuple[Array, ...], Array, Array, Array]:
+def half_vector(wi: Array, wo: Array) -> tuple[tuple[Array, ...], Array, Array, Array]:
     """Components of the half vector, its cosine with either direction, and both cosines, none of them below _GRAZING.
 
     Component by component: XLA's CPU code fuses that, but neither reductions over three nor slices of vectors.
     """
-    lit = _lit(wi, wo)
+    lit = both_above(wi, wo)
     x, y = (jnp.where(lit, wi[..., i : i + 1] + wo[..., i : i + 1], 0) for i in (0, 1))
     cos_i, cos_o = (jnp.maximum(jnp.where(lit, w[..., 2:], 1), _GRAZING) for w in (wi, wo))
     z = cos_i + cos_o
@@ -117,7 +118,7 @@ class Lambert(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        return jnp.where(_lit(wi, wo), self.albedo / jnp.pi, 0)
+        return jnp.where(both_above(wi, wo), self.albedo / jnp.pi, 0)
 
 
 class Phong(Model):
@@ -147,7 +148,7 @@ class Phong(Model):
         drop = sum((mirror - wo)[..., i : i + 1] ** 2 for i in range(3)) / 2
         lobe = _power(jnp.log1p(-jnp.minimum(drop, 1 - _GRAZING)), self.exponent) * (drop < 1)
         peak = (self.exponent + 2) / (2 * jnp.pi)
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + self.specular * peak * lobe, 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + self.specular * peak * lobe, 0)
 
 
 class BlinnPhong(Model):
@@ -172,11 +173,11 @@ class BlinnPhong(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        half, *_ = _half_vector(wi, wo)
+        half, *_ = half_vector(wi, wo)
         n = self.exponent
         peak = (n + 2) * (n + 4) / (8 * jnp.pi * (jnp.exp2(-n / 2) + n))
         lobe = self.specular * peak * _power(_log_cos(half), n)
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
 class AshikhminShirley(Model):
@@ -200,7 +201,7 @@ class AshikhminShirley(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        half, cos_d, cos_i, cos_o = _half_vector(wi, wo)
+        half, cos_d, cos_i, cos_o = half_vector(wi, wo)
         slope = _slope(half)
         tilt = self.nu * half[0] ** 2 + self.nv * half[1] ** 2
         # (n.h)^e with e = tilt / slope, which has no value at the normal itself: there -tilt / 2 is the limit.
@@ -210,7 +211,7 @@ class AshikhminShirley(Model):
         lobe = peak * jnp.exp(exponent) / (cos_d * jnp.maximum(cos_i, cos_o))
         base = 28 / (23 * jnp.pi) * self.diffuse * (1 - self.specular)
         base = base * (1 - (1 - cos_i / 2) ** 5) * (1 - (1 - cos_o / 2) ** 5)
-        return jnp.where(_lit(wi, wo), lobe * _schlick(self.specular, cos_d) + base, 0)
+        return jnp.where(both_above(wi, wo), lobe * _schlick(self.specular, cos_d) + base, 0)
 
 
 class Ward(Model):
@@ -236,9 +237,9 @@ class Ward(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        half, cos_d, _, _ = _half_vector(wi, wo)
+        half, cos_d, _, _ = half_vector(wi, wo)
         lobe = self.specular * _beckmann(half, self.along, self.across) / (4 * cos_d**2)
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
 class WardDuer(Model):
@@ -263,10 +264,10 @@ class WardDuer(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        half, _, cos_i, cos_o = _half_vector(wi, wo)
+        half, _, cos_i, cos_o = half_vector(wi, wo)
         gauss = _beckmann(half, self.along, self.across) * half[2] ** 4
         lobe = self.specular * gauss / (4 * cos_i * cos_o)
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + lobe, 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
 class CookTorrance(Model):
@@ -292,12 +293,12 @@ class CookTorrance(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        half, cos_d, cos_i, cos_o = _half_vector(wi, wo)
+        half, cos_d, cos_i, cos_o = half_vector(wi, wo)
         # G / (cos_i cos_o), with the smaller cosine canceled where G < 1.
         groove = 2 * half[2] / (cos_d * jnp.maximum(cos_i, cos_o))
         groove = jnp.minimum(1 / (cos_i * cos_o), groove)
         lobe = _beckmann(half, self.roughness, self.roughness) * groove * _schlick(self.f0, cos_d) / jnp.pi
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + self.specular * lobe, 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + self.specular * lobe, 0)
 
 
 class Lafortune(Model):
@@ -332,4 +333,4 @@ class Lafortune(Model):
         x, y, z = jnp.split((wi * wo)[..., None, :], 3, -1)
         base = self.cx * x + self.cy * y + self.cz * z
         lobe = _power(jnp.log(jnp.maximum(base, _GRAZING)), self.exponent) * (base > 0)
-        return jnp.where(_lit(wi, wo), self.diffuse / jnp.pi + jnp.sum(lobe, -2), 0)
+        return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + jnp.sum(lobe, -2), 0)
