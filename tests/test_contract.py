@@ -510,6 +510,30 @@ EXAMPLES = {
             draw.upper(5),
         )
     ),
+    "brdf.microfacet.GGX": example(
+        lambda draw: call(brdf.GGX(draw.uniform(3), draw.uniform(2), draw.uniform()), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.microfacet.GGXInterface": example(
+        lambda draw: call(
+            brdf.GGXInterface(draw.uniform(3), draw.uniform(3), draw.uniform(2)), draw.upper(5), draw.upper(5)
+        )
+    ),
+    "brdf.microfacet.SchlickDiffuse": example(
+        lambda draw: call(brdf.SchlickDiffuse(draw.uniform(3)), draw.upper(5), draw.upper(5))
+    ),
+    "brdf.microfacet.MetallicRoughness": example(
+        lambda draw: call(
+            brdf.MetallicRoughness(
+                draw.uniform(5, 3),
+                *(draw.uniform(5) for _ in range(4)),
+                draw.uniform(3),
+                draw.uniform(5),
+                draw.uniform(),
+            ),
+            draw.upper(5),
+            draw.upper(5),
+        )
+    ),
     "brdf.cylinders.PoulinFournier": example(
         lambda draw: call(
             brdf.PoulinFournier(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)

@@ -1,8 +1,9 @@
 """BRDFs: analytic models and measured data."""
 
-from jaxprt.brdf import cylinders, measured, models, navigation, scattered
+from jaxprt.brdf import cylinders, measured, microfacet, models, navigation, scattered
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
+from jaxprt.brdf.microfacet import GGX, GGXInterface, MetallicRoughness, SchlickDiffuse
 from jaxprt.brdf.models import (
     AshikhminShirley,
     BlinnPhong,
@@ -16,14 +17,18 @@ from jaxprt.brdf.models import (
 from jaxprt.brdf.scattered import load_scattered
 
 __all__ = [
+    "GGX",
     "AshikhminShirley",
     "BlinnPhong",
     "CookTorrance",
+    "GGXInterface",
     "Lafortune",
     "Lambert",
+    "MetallicRoughness",
     "Phong",
     "PoulinFournier",
     "PoulinFournierGrooves",
+    "SchlickDiffuse",
     "Ward",
     "WardDuer",
     "cylinders",
@@ -32,6 +37,7 @@ __all__ = [
     "load_npf",
     "load_scattered",
     "measured",
+    "microfacet",
     "models",
     "navigation",
     "scattered",

@@ -1,0 +1,277 @@
+"""Microfacet BRDFs with the GGX distribution, and the metallic-roughness material of glTF 2.0.
+
+The surface consists of small mirrors. The reflection of a pair of directions with the half vector h is
+
+    F D V,    D = 1 / (pi a_x a_y ((h_x / a_x)^2 + (h_y / a_y)^2 + h_z^2)^2),
+              V = 1 / (2 (cos_o |(a_x x_i, a_y y_i, z_i)| + cos_i |(a_x x_o, a_y y_o, z_o)|)).
+
+D is the distribution of normals of Trowbridge and Reitz, named GGX by Walter et al. V = G / (4 cos_i cos_o) contains
+the height-correlated masking and shadowing G of Smith's model. F is the Fresnel reflectance at the mirrors.
+
+`roughness` is the perceptual roughness of glTF in this whole file: alpha = roughness^2, and alpha is what Mitsuba's
+`roughconductor` calls `alpha`. An alpha below 0.001 (a roughness below 0.0316) counts as 0.001. The gradient in
+roughness is zero there.
+
+Light that meets the surface twice is lost: with F = 1 and roughness 1 the surface reflects 31 % at normal incidence.
+
+References: Walter, Marschner, Li, Torrance 2007, "Microfacet models for refraction through rough surfaces", for D;
+Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BRDFs", equations 85, 86 and 99, for the
+anisotropic D and G; Burley 2012, "Physically based shading at Disney", for alpha = roughness^2.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.brdf.models import Lambert, Model, both_above, color, half_vector, scalar
+
+_SMOOTHEST = 1e-3  # least alpha: a perfect mirror has no density
+
+
+def _both_axes(value) -> Array:
+    """One number for both tangent axes, or two numbers, as an array [2]."""
+    return jnp.broadcast_to(jnp.asarray(value, jnp.result_type(float)), (2,))
+
+
+def _alpha(roughness: Array) -> Array:
+    return jnp.maximum(roughness**2, _SMOOTHEST)
+
+
+def _lobe(wi: Array, wo: Array, along: Array, across: Array, rotation: Array | float) -> tuple[Array, Array]:
+    """D V for alpha along a tangent axis and across it, [*b 1], and the cosine of the directions at the mirrors.
+
+    Component by component, as `half_vector` is.
+    """
+    (x, y, z), cos_d, cos_i, cos_o = half_vector(wi, wo)
+    cosine, sine = jnp.cos(rotation), jnp.sin(rotation)
+
+    def turned(x, y):
+        return cosine * x + sine * y, cosine * y - sine * x
+
+    def stretched(w, cosine):
+        x, y = turned(w[..., 0:1], w[..., 1:2])
+        return jnp.sqrt((along * x) ** 2 + (across * y) ** 2 + cosine**2)
+
+    x, y = turned(x, y)
+    # In this form alpha = 0.001 keeps the digits that 1 + (alpha^2 - 1) cos^2 would lose.
+    tilt = (x / along) ** 2 + (y / across) ** 2 + z**2
+    distribution = 1 / (jnp.pi * along * across * tilt**2)
+    visibility = 0.5 / (cos_o * stretched(wi, cos_i) + cos_i * stretched(wo, cos_o))
+    return distribution * visibility, cos_d
+
+
+def _schlick_weight(cos_d: Array) -> Array:
+    """Schlick's (1 - v.h)^5, which no rounding makes negative."""
+    return (1 - jnp.minimum(cos_d, 1)) ** 5
+
+
+def _fresnel(cos_d: Array, eta: Array, k: Array) -> Array:
+    """Fresnel's reflectance of unpolarized light for the complex index of refraction eta + i k."""
+    cos_d = jnp.minimum(cos_d, 1)
+    cosine, sine = cos_d**2, 1 - cos_d**2
+    # a + i b is the root of (eta + i k)^2 - sine. With a^2 - b^2 negative, a = eta k / b loses no digits.
+    real, cross = eta**2 - k**2 - sine, eta * k
+    size = jnp.sqrt(jnp.maximum(real**2 + 4 * cross**2, 1e-24))
+    larger = jnp.sqrt((size + jnp.abs(real)) / 2)
+    twice = 2 * cos_d * jnp.where(real < 0, cross / larger, larger)
+    parallel = size * cosine + sine**2
+    s_polarized = (size + cosine - twice) / (size + cosine + twice)
+    p_polarized = s_polarized * (parallel - twice * sine) / (parallel + twice * sine)
+    return (s_polarized + p_polarized) / 2
+
+
+class GGX(Model):
+    """GGX with Schlick's Fresnel term: a metal by its color f0 at normal incidence. Conserves energy for f0 <= 1.
+
+    F = f0 + (1 - f0) (1 - v.h)^5. Dielectrics over a diffuse base are `MetallicRoughness` with metallic 0.
+
+    Attributes:
+        f0: Fresnel reflectance at normal incidence; gray or a color.
+        roughness: Roughness along the tangent and along the bitangent; one number stands for both.
+        rotation: Angle in radians from the tangent, counterclockwise about the normal, to the first of the two axes
+            that `roughness` is given for.
+    """
+
+    least: ClassVar = {"rotation": -jnp.inf}
+
+    f0: Float[Array, " c"] = eqx.field(converter=color, default=0.9)
+    roughness: Float[Array, "2"] = eqx.field(converter=_both_axes, default=0.4)
+    rotation: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        along, across = _alpha(self.roughness)
+        lobe, cos_d = _lobe(wi, wo, along, across, self.rotation)
+        return jnp.where(both_above(wi, wo), lobe * (self.f0 + (1 - self.f0) * _schlick_weight(cos_d)), 0)
+
+
+class GGXInterface(Model):
+    """GGX with Fresnel's equations: the interface between air and a conductor or a dielectric. Conserves energy.
+
+    Dielectrics have k = 0. What they transmit is lost.
+
+    Attributes:
+        eta: Real part of the index of refraction relative to air; gray or a color.
+        k: Imaginary part, the extinction coefficient.
+        roughness: Roughness along the tangent and along the bitangent; one number stands for both.
+
+    Reference: Born and Wolf, "Principles of optics", sections 1.5.2 and 14.2, for Fresnel's equations.
+    """
+
+    eta: Float[Array, " c"] = eqx.field(converter=color, default=1.5)
+    k: Float[Array, " c"] = eqx.field(converter=color, default=0.0)
+    roughness: Float[Array, "2"] = eqx.field(converter=_both_axes, default=0.4)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        along, across = _alpha(self.roughness)
+        lobe, cos_d = _lobe(wi, wo, along, across, 0.0)
+        return jnp.where(both_above(wi, wo), lobe * _fresnel(cos_d, self.eta, self.k), 0)
+
+
+class SchlickDiffuse(Model):
+    """Diffuse base under a layer with Schlick's Fresnel term: albedo (1 - (1 - v.h)^5) / pi. Conserves energy.
+
+    Attributes:
+        albedo: Share of the light that is reflected where the layer reflects none; gray or a color.
+    """
+
+    albedo: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        _, cos_d, _, _ = half_vector(wi, wo)
+        return jnp.where(both_above(wi, wo), self.albedo / jnp.pi * (1 - _schlick_weight(cos_d)), 0)
+
+
+class MetallicRoughness(Model):
+    """The metallic-roughness material of glTF 2.0, with its extensions for ior, specular and anisotropy.
+
+    With w = (1 - v.h)^5, F0 = min(((1 - ior) / (1 + ior))^2 specular_color, 1) and D, V as this module has them,
+
+        dielectric = specular (F0 + (1 - F0) w) D V + (1 - specular max_c(F0 + (1 - F0) w)) base_color / pi,
+        metal = (base_color + (1 - base_color) w) D V,
+        value = (1 - metallic) dielectric + metallic metal,
+
+    where max_c is the largest of the colors. G is height-correlated. Appendix B notes that this is more accurate than
+    its own sample implementation, which multiplies the masking of one direction by that of the other.
+
+    The metal conserves energy for base_color <= 1. The specification's coupling of the dielectric to its diffuse base
+    does not: a smooth white dielectric reflects 1.93 times the light that arrives from the horizon.
+
+    Parameters may have leading axes that broadcast against those of the directions: base_color [v 3] and roughness [v]
+    give each of v pairs of directions a material of its own. Where min and max_c have kinks, derivatives are those of
+    one side or their mean.
+
+    Attributes:
+        base_color: Albedo of the dielectric, and reflectance of the metal at normal incidence; [c] or [*b c], linear.
+        metallic: Share of the metal, from 0 to 1; [] or [*b], as all the following but specular_color.
+        roughness: Perceptual roughness; alpha = roughness^2.
+        ior: Index of refraction of the dielectric. 0 makes F0 = specular_color.
+        specular: Weight of the dielectric's reflection, from 0 to 1.
+        specular_color: Color of the dielectric's reflection at normal incidence; [c] or [*b c].
+        anisotropy: Strength from 0 to 1: along the axis, alpha rises to alpha + (1 - alpha) anisotropy^2.
+        rotation: Angle in radians from the tangent, counterclockwise about the normal, to the axis along which
+            highlights are stretched.
+
+    Raises:
+        ValueError: A color has neither 1 nor 3 channels, or the leading axes of the parameters do not broadcast.
+
+    Reference: glTF 2.0 specification, appendix B; KHR_materials_ior, KHR_materials_specular,
+    KHR_materials_anisotropy.
+    """
+
+    least: ClassVar = {"rotation": -jnp.inf}
+
+    base_color: Float[Array, "*#b #c"] = eqx.field(converter=color, default=1.0)
+    metallic: Float[Array, "*#b"] = eqx.field(converter=scalar, default=1.0)
+    roughness: Float[Array, "*#b"] = eqx.field(converter=scalar, default=1.0)
+    ior: Float[Array, "*#b"] = eqx.field(converter=scalar, default=1.5)
+    specular: Float[Array, "*#b"] = eqx.field(converter=scalar, default=1.0)
+    specular_color: Float[Array, "*#b #c"] = eqx.field(converter=color, default=1.0)
+    anisotropy: Float[Array, "*#b"] = eqx.field(converter=scalar, default=0.0)
+    rotation: Float[Array, "*#b"] = eqx.field(converter=scalar, default=0.0)
+
+    def __check_init__(self):
+        for name in ("metallic", "specular", "anisotropy"):
+            require.within(f"{name} of MetallicRoughness", getattr(self, name), 0, 1)
+        shape = {name: each.shape for name, each in vars(self).items()}
+        for name in ("base_color", "specular_color"):
+            if shape[name][-1] not in (1, 3):
+                raise ValueError(f"{name} of MetallicRoughness must have 1 or 3 channels, got shape {shape[name]}")
+            shape[name] = shape[name][:-1]
+        try:
+            np.broadcast_shapes(*shape.values())
+        except ValueError as error:
+            leading = ", ".join(f"{name} {each}" for name, each in shape.items() if each)
+            raise ValueError(f"leading axes of MetallicRoughness must broadcast, got {leading}") from error
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the BRDF in 1/sr."""
+        along, across = self._alphas()
+        lobe, cos_d = _lobe(wi, wo, along[..., None], across[..., None], self.rotation[..., None])
+        weight = _schlick_weight(cos_d)
+        under, mirror, rim, bare = self._coefficients()
+        diffuse = (under * (1 - weight) + bare) / jnp.pi
+        return jnp.where(both_above(wi, wo), diffuse + lobe * (mirror + rim * weight), 0)
+
+    def terms(self) -> tuple[Model, Model, Model, Model]:
+        """Four gray BRDFs that depend on roughness, anisotropy and rotation alone.
+
+        Their sum with the weights `coefficient()` is the whole material:
+
+            K1 = (1 - w) / pi    SchlickDiffuse(1), the base under a full layer
+            K2 = D V             GGX(1), the lobe of a perfect mirror's microfacets
+            K3 = D V w           GGX(0), its part that only Fresnel's rise at grazing angles reflects
+            K4 = 1 / pi          Lambert(1), the base where `specular` < 1 uncovers it
+
+        So one table per term serves all textures of color, metallic, ior and specular. Use `needed` to leave out terms.
+
+        Raises:
+            ValueError: Roughness, anisotropy or rotation differ between vertices.
+        """
+        for name in ("roughness", "anisotropy", "rotation"):
+            if (shape := getattr(self, name).shape) != ():
+                raise ValueError(
+                    f"{name} of MetallicRoughness must be one number for all vertices, got an array of shape "
+                    f"{list(shape)}; split the vertices into groups of one {name} each"
+                )
+        axes = jnp.sqrt(jnp.stack(self._alphas()))
+        return SchlickDiffuse(1.0), GGX(1.0, axes, self.rotation), GGX(0.0, axes, self.rotation), Lambert(1.0)
+
+    def coefficient(self) -> Float[Array, "*b 4 c"]:
+        """Weights of the four `terms`, none of them negative for colors up to 1."""
+        return jnp.stack(jnp.broadcast_arrays(*self._coefficients()), -2)
+
+    def needed(self) -> tuple[int, ...]:
+        """Indices of the `terms` whose weight is not zero everywhere. All, where values are traced by JAX.
+
+        A metal needs no diffuse terms, a material with `specular` 1 needs no Lambert term:
+
+            keep = material.needed()
+            term = [material.terms()[k] for k in keep]
+            weight = material.coefficient()[..., keep, :]
+        """
+        each = enumerate(self._coefficients())
+        return tuple(k for k, weight in each if isinstance(weight, Tracer) or np.any(np.asarray(weight)))
+
+    def _alphas(self) -> tuple[Array, Array]:
+        """Alpha along the axis and across it."""
+        alpha = _alpha(self.roughness)
+        return alpha + (1 - alpha) * self.anisotropy**2, alpha
+
+    def _coefficients(self) -> tuple[Array, Array, Array, Array]:
+        base, metallic, specular = self.base_color, self.metallic[..., None], self.specular[..., None]
+        f0 = jnp.minimum(((1 - self.ior) / (1 + self.ior))[..., None] ** 2 * self.specular_color, 1)
+        dielectric = 1 - metallic
+        layer = dielectric * specular
+        # The largest color of F0 + (1 - F0) w is that of F0, whatever w is.
+        under = layer * base * (1 - jnp.max(f0, -1, keepdims=True))
+        mirror = layer * f0 + metallic * base
+        rim = layer * (1 - f0) + metallic * (1 - base)
+        return under, mirror, rim, dielectric * (1 - specular) * base
