@@ -1,6 +1,7 @@
 """Image files: EXR by OpenEXR, everything else by OpenImageIO."""
 
 import pathlib
+import tempfile
 import typing
 
 import numpy as np
@@ -51,6 +52,35 @@ def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], 
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():
         raise ValueError(f"{path} must be an image file, got a {'directory' if path.is_dir() else 'special file'}")
+    return _read(path, decoded=None)
+
+
+def decode_image(content: bytes, *, name: str, decoded: bool = True) -> Float32[np.ndarray, "h w c"]:
+    """Reads an image whose file is in memory, such as one inside a GLB file, as `read_image` reads one on disk.
+
+    Args:
+        content: The bytes of the file.
+        name: What to call the image in messages.
+        decoded: Decode whole numbers from sRGB, as colors are stored, whatever the file says of itself. False returns
+            them over the largest of their type, as roughness or normals are stored.
+
+    Returns:
+        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels.
+
+    Raises:
+        ValueError: The bytes are empty, of an unknown format, damaged, or of channels other than these.
+    """
+    # OpenImageIO reads from memory in C++ only.
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "image"
+        path.write_bytes(content)
+        try:
+            return _read(path, decoded=decoded)[0]
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), name)) from error
+
+
+def _read(path: pathlib.Path, *, decoded: bool | None) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     with path.open("rb") as file:
         start = file.read(2048)
     form = next((form for magic, form in _MAGIC if start.startswith(magic)), None)
@@ -61,7 +91,7 @@ def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], 
         return _read_exr(path)
     if form == "hdr" and b"32-bit_rle_xyze" in start:
         raise ValueError(f"{path} must hold RGB (32-bit_rle_rgbe), got XYZ (32-bit_rle_xyze): convert it first")
-    return _read_other(path, form)
+    return _read_other(path, form, decoded=decoded)
 
 
 def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
@@ -176,7 +206,9 @@ def _shift(span: slice, origin: int) -> slice:
     return slice(span.start - origin, span.stop - origin)
 
 
-def _read_other(path: pathlib.Path, form: str) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+def _read_other(
+    path: pathlib.Path, form: str, *, decoded: bool | None
+) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # Else colors come multiplied by alpha.
     reader = OpenImageIO.ImageInput.open(str(path), config)
@@ -199,7 +231,8 @@ def _read_other(path: pathlib.Path, form: str) -> tuple[Float32[np.ndarray, "h w
         raise ValueError(f"{path} must be stored upright (orientation 1), got orientation {attributes['Orientation']}")
     image = np.asarray(image, np.float32).reshape(spec.height, spec.width, spec.nchannels)
     space = str(attributes.get("oiio:ColorSpace", ""))
-    if spec.format.basetype in (OpenImageIO.UINT8, OpenImageIO.UINT16) and not space.lower().startswith("lin"):
+    whole = spec.format.basetype in (OpenImageIO.UINT8, OpenImageIO.UINT16)
+    if whole and (decoded if decoded is not None else not space.lower().startswith("lin")):
         colors = spec.nchannels - (spec.nchannels in (2, 4))
         image[..., :colors] = _decode_srgb(image[..., :colors])
     return image, attributes

@@ -1,20 +1,29 @@
 """What is looked at: meshes, environments, cameras, embedded scenes."""
 
-from jaxprt.scene import builtin, camera, environment, interiors, mesh, occluder, texture
+from jaxprt.scene import builtin, camera, environment, interiors, material, mesh, occluder, texture
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
+from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
+from jaxprt.scene.scene import Part, Scene
+from jaxprt.scene.scene_file import load_scene
 
 __all__ = [
     "Camera",
     "Environment",
     "Mesh",
+    "Part",
+    "Scene",
+    "Texture",
+    "TexturedMaterial",
     "builtin",
     "camera",
     "environment",
     "interiors",
     "load_environment",
     "load_mesh",
+    "load_scene",
+    "material",
     "mesh",
     "occluder",
     "texture",

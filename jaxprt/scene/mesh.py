@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
 from jaxprt.scene import mesh_file
+from jaxprt.scene.geometry import Geometry
 from jaxprt.sphere import directions
 
 _CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alone is as near to it as this.
@@ -44,12 +45,11 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     """Loads a PLY, OBJ, STL, OFF, GLB or glTF file.
 
     Vertices and faces keep the file's order; nothing is merged. Polygons become fans of triangles. Where an OBJ's
-    corners differ in normal or texture coordinates, a vertex is split. All geometries of a scene are
-    placed by their nodes and joined. Materials and images are neither needed nor read, save for glTF's names; texture
-    coordinates are, and are 0 where only some geometries of the file have them or they are not finite. All
-    faces of an OBJ's material or group must have them; a glTF's geometry needs a material, and its transforms of
-    textures are not applied. Where an OBJ's faces name texture coordinates that the file does not have, its material
-    is loaded without them, with a warning.
+    corners differ in normal or texture coordinates, a vertex is split. All meshes of a glTF's default scene are
+    placed by their nodes and joined; its tangents are kept. Materials and images are not read: `load_scene` reads
+    them. Texture coordinates are read, and are 0 where only some geometries of the file have them or they are not
+    finite. All faces of an OBJ's material or group must have them. Where an OBJ's faces name texture coordinates that
+    the file does not have, its material is loaded without them, with a warning.
 
     Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
     by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither
@@ -60,7 +60,8 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
         groups: Number the regions by an OBJ's objects and groups or a glTF's nodes, instead of by material.
 
     Returns:
-        The mesh; an OBJ's regions are numbered in the order of their first appearance, a glTF's as trimesh has them.
+        The mesh; an OBJ's regions are numbered in the order of their first appearance, a glTF's in the order of its
+        materials, those without material last, or with `groups` in the order of its nodes.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -68,9 +69,14 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
             name missing vertices. An OBJ that was cut off between two faces cannot be told from a whole one.
     """
     path = pathlib.Path(path)
-    position, face, normal, region, texture = mesh_file.read(path, groups=groups)
+    return from_file(mesh_file.read(path, groups=groups), path)
+
+
+def from_file(geometry: Geometry, path: pathlib.Path) -> Mesh:
+    """The mesh of what was read from a file, with normals and checks as in `load_mesh`."""
+    position, face, normal, tangent, _, texture, _, _, region = geometry
     welded = path.suffix.lower() != ".stl"
-    return _make(position, face, normal, None, region, texture, name=str(path), welded=welded)
+    return _make(position, face, normal, tangent, region, texture, name=str(path), welded=welded)
 
 
 def make_mesh(

@@ -1,7 +1,6 @@
-"""Meshes in files: what trimesh reads of each format, with the damage that it passes over refused."""
+"""Meshes in files: what trimesh reads of each format, with the damage that it passes over refused, and glTF."""
 
 import io
-import json
 import pathlib
 import re
 import warnings
@@ -10,20 +9,23 @@ from typing import Any
 import numpy as np
 import trimesh
 
-WHOLE = {5121: 255, 5123: 65535}  # glTF's component types of whole numbers, and what stands for 1
+from jaxprt.scene import gltf_file, gltf_geometry
+from jaxprt.scene.geometry import Geometry, joined
+
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
-def read(path: pathlib.Path, *, groups: bool) -> tuple[np.ndarray | None, ...]:
-    """Positions, faces, normals (NaN where the file has none), regions, and texture coordinates if it has them."""
+def read(path: pathlib.Path, *, groups: bool) -> Geometry:
+    """The triangles of a file in the world, with regions."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
     if not path.is_file():
         raise FileNotFoundError(f"there is no mesh file {path}")
-    scene = _load(path, suffix, groups)
-    scale = _texture_scale(path) if suffix in (".glb", ".gltf") else 1
-    return _concatenate(scene, suffix, groups, scale, str(path))
+    if suffix in (".glb", ".gltf"):
+        with gltf_file.damage_named(path):
+            return gltf_geometry.read(gltf_file.Document(path), groups=groups).geometry
+    return _concatenate(_load(path, suffix, groups), suffix, str(path))
 
 
 def _load(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
@@ -129,27 +131,12 @@ def _absolute(index: str, count: int) -> str:
     return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
 
 
-def _texture_scale(path: pathlib.Path) -> int:
-    """By what the whole numbers are too large, with which a glTF may store texture coordinates; else 1."""
-    content = path.read_bytes()
-    if path.suffix.lower() == ".glb":
-        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-    header = json.loads(content)
-    parts = [part["attributes"] for mesh in header.get("meshes", []) for part in mesh["primitives"]]
-    kinds = {header["accessors"][part["TEXCOORD_0"]]["componentType"] for part in parts if "TEXCOORD_0" in part}
-    if len(kinds) > 1 and kinds & WHOLE.keys():
-        raise ValueError(f"{path}: texture coordinates must all be of one type, got component types {sorted(kinds)}")
-    return WHOLE.get(kinds.pop(), 1) if kinds else 1
-
-
-def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, scale: int, name: str):
-    """Positions, faces, normals, regions and texture coordinates of all geometries in their places."""
-    parts, labels, textured = [], {}, False
-    first = 0
+def _concatenate(scene: trimesh.Scene, suffix: str, name: str) -> Geometry:
+    """All geometries of a scene, one region each."""
+    parts = []
     nodes = list(scene.graph.nodes_geometry)
     for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
-        transform, key = scene.graph[node]
-        geometry = scene.geometry[key]
+        geometry = scene.geometry[scene.graph[node][1]]
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
         position, face = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
@@ -157,28 +144,14 @@ def _concatenate(scene: trimesh.Scene, suffix: str, groups: bool, scale: int, na
             raise ValueError(f"{name} must have three coordinates per vertex, got the shape {position.shape}")
         # Asked for by name, normals that the file lacks would be computed.
         normal = geometry._cache.cache.get("vertex_normals", np.full(position.shape, np.nan))
-        if transform is not None and not np.array_equal(transform, np.eye(4)):
-            linear = transform[:3, :3]
-            position = position @ linear.T + transform[:3, 3]
-            # The adjugate also serves a node that is scaled to nothing.
-            cofactor = np.stack([np.cross(linear[i - 2], linear[i - 1]) for i in range(3)])
-            mirrored = np.linalg.det(linear) < 0
-            normal = normal @ cofactor.T * (-1 if mirrored else 1)
-            face = face[:, ::-1] if mirrored else face
-        material = getattr(getattr(geometry.visual, "material", None), "name", None)
-        label = node if groups or suffix == ".obj" or not material else (material,)
-        region = np.full(len(position), labels.setdefault(label, len(labels)))
-        texture = np.zeros((len(position), 2))
-        given = getattr(geometry.visual, "uv", None)
+        texture, given = None, getattr(geometry.visual, "uv", None)
         if given is not None and len(given) == len(position):
             # OBJs may have one, and v is 0 then, or a third, which no image needs.
-            textured, own = True, np.asarray(given, np.float64)[:, :2]
-            if scale > 1:  # trimesh has turned whole numbers upside down in their own type, which wraps.
-                own = np.stack([own[:, 0] / scale, 1 - (1 - own[:, 1]) % (scale + 1) / scale], 1)
+            own = np.asarray(given, np.float64)[:, :2]
+            texture = np.zeros((len(position), 2))
             texture[:, : own.shape[1]] = np.where(np.isfinite(own), own, 0)
-        parts.append((position, face + first, normal, region, texture))
-        first += len(position)
+        region = np.full(len(position), len(parts))
+        parts.append(Geometry(position, face, normal, texture=texture, region=region))
     if not parts:
         raise ValueError(f"{name} must hold vertices and faces, got no faces")
-    *fields, texture = (np.concatenate(field) for field in zip(*parts, strict=True))
-    return *fields, texture if textured else None
+    return joined(parts)

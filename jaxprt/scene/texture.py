@@ -1,51 +1,78 @@
 """Images on surfaces: the color of a texture at each vertex, and how it lies there."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxprt.scene.mesh import Mesh
 
+WRAPS = ("repeat", "mirror", "clamp")  # What is beyond the edges: the image again, its mirror image, its border.
 
-@jax.jit
-def lookup(image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"]) -> Float[Array, "*b c"]:
-    """Bilinear interpolation of a texture that repeats in both directions.
+
+@functools.partial(jax.jit, static_argnames="wrap")
+def lookup(
+    image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"], *, wrap: tuple[str, str] = ("repeat", "repeat")
+) -> Float[Array, "*b c"]:
+    """Bilinear interpolation of a texture.
 
     Coordinates are as in OBJ files, and as trimesh gives those of glTF: (0, 0) is the lower left corner of the image
     and (1, 1) the upper right one. Centers of texels lie half a texel inside.
 
     A vertex takes the texture at one place: details finer than the mesh's edges are not averaged but missed. Pictures
     show them by `lookup(image, interpolate(fragments, mesh.face, mesh.texture))` of `image.raster`, for each pixel.
-    Opposite edges of the image are blended, as it repeats: at u = 0 and at u = 1 is the mean of the two.
+    Opposite edges of an image that repeats are blended: at u = 0 and at u = 1 is the mean of the two.
     Linear in the image; in the coordinates differentiable except where they pass the center of a row or column.
 
     Args:
         image: The texture, first row on top; linear values, not sRGB-encoded ones, if it is to be an albedo.
         coordinate: Places u to the right and v up, over width and height: `Mesh.texture`.
+        wrap: What lies beyond the edges, along u and along v: each one of ``WRAPS``.
 
     Returns:
         Values of the image, for example weights of `separable.modulate`.
 
     Raises:
-        ValueError: The image has no axis of colors, or coordinates are no pairs.
+        ValueError: The image has no axis of colors, coordinates are no pairs, or a wrap mode is unknown.
     """
     if image.ndim != 3 or coordinate.shape[-1:] != (2,):
         got = f"{list(image.shape)} and {list(coordinate.shape)}"
         raise ValueError(f"image must be [h, w, c] and coordinates [..., 2], got {got}")
+    if not set(wrap) <= set(WRAPS):
+        raise ValueError(f"wrap must be two of {', '.join(WRAPS)}, got {wrap}")
     height, width = image.shape[:2]
-    u, v = coordinate[..., 0], coordinate[..., 1]
     # Reduced to one period first: multiplied by the width, far coordinates would lose digits.
-    x, y = (u - jnp.floor(u)) * width - 0.5, (1 - (v - jnp.floor(v))) * height - 0.5
+    x = _reduced(coordinate[..., 0], wrap[0]) * width - 0.5
+    y = (1 - _reduced(coordinate[..., 1], wrap[1])) * height - 0.5
     column, row = jnp.floor(x), jnp.floor(y)
     right, down = (x - column)[..., None], (y - row)[..., None]
 
     def texel(below: int, beside: int) -> Array:
-        return image[(row.astype(jnp.int32) + below) % height, (column.astype(jnp.int32) + beside) % width]
+        line = _inside(row.astype(jnp.int32) + below, height, wrap[1])
+        return image[line, _inside(column.astype(jnp.int32) + beside, width, wrap[0])]
 
     upper = (1 - right) * texel(0, 0) + right * texel(0, 1)
     lower = (1 - right) * texel(1, 0) + right * texel(1, 1)
     return (1 - down) * upper + down * lower
+
+
+def _reduced(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
+    """Coordinates within the one period of the image, or the two of an image and its mirror image."""
+    if wrap == "clamp":
+        return jnp.clip(place, 0, 1)
+    return place - jnp.floor(place) if wrap == "repeat" else place - 2 * jnp.floor(place / 2)
+
+
+def _inside(index: Int[Array, "*b"], size: int, wrap: str) -> Int[Array, "*b"]:
+    """Numbers of the texels that stand for those beyond the edges."""
+    if wrap == "clamp":
+        return jnp.clip(index, 0, size - 1)
+    if wrap == "repeat":
+        return index % size
+    index = index % (2 * size)
+    return jnp.minimum(index, 2 * size - 1 - index)
 
 
 def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
@@ -78,3 +105,20 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     total = np.bincount(vertex, weight, len(first))
     mean = np.stack([np.bincount(vertex, along[:, axis], len(first)) for axis in range(3)], -1)
     return mean / np.where(total > 0, total, 1)[:, None]
+
+
+def handedness(mesh: Mesh) -> Float[np.ndarray, " v"]:
+    """On which side of the tangent the image's upper edge lies: 1 or -1 for each vertex.
+
+    It is -1 where the image is mirrored on the surface: there the bitangent of the image is -cross(normal, tangent).
+
+    Raises:
+        ValueError: The mesh has no texture coordinates.
+    """
+    if mesh.texture is None:
+        raise ValueError("the mesh must have texture coordinates, got none: `mesh.make_mesh` takes them")
+    face = np.asarray(mesh.face)
+    place = np.asarray(mesh.texture, np.float64)[face]
+    covered = np.linalg.det(place[:, 1:] - place[:, :1])
+    total = np.bincount(face.ravel(), np.repeat(covered, 3), len(mesh.position))
+    return np.where(total < 0, -1.0, 1.0)

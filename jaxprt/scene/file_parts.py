@@ -1,0 +1,73 @@
+"""From what was read of a file to parts: one for each region, with the frames that its material needs."""
+
+import pathlib
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jaxprt.scene import texture
+from jaxprt.scene.geometry import Geometry
+from jaxprt.scene.material import TexturedMaterial
+from jaxprt.scene.mesh import Mesh, brush, from_file, split
+from jaxprt.scene.scene import Part, numbered
+
+
+def split_parts(
+    geometry: Geometry, names: Sequence[str], materials: Sequence[TexturedMaterial], path: pathlib.Path
+) -> list[Part]:
+    """Parts of what was read from a file.
+
+    Where a material needs tangents that the file does not have, they lie along the texture's coordinate u. Texture
+    coordinates that the file does not have are 0.
+
+    Args:
+        geometry: All that was read; region i becomes part i.
+        names: Names of the regions; equal ones are numbered.
+        materials: Their materials.
+        path: The file.
+    """
+    meshes = split(from_file(geometry, path))
+    if len(meshes) != len(names):
+        raise ValueError(f"{path} must have {len(names)} materials, got {len(meshes)}")
+    return [
+        _part(name, mesh, material, geometry, number)
+        for number, (name, mesh, material) in enumerate(zip(numbered(names), meshes, materials, strict=True))
+    ]
+
+
+def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, region: int) -> Part:
+    own = geometry.region == region
+
+    def rows(value: np.ndarray | None, plain: float) -> np.ndarray | None:
+        """The part's rows of what its vertices have beside the mesh, if they are not all plain."""
+        return None if value is None or (value[own] == plain).all() else value[own]
+
+    second, side = rows(geometry.second, 0), rows(geometry.handedness, 1)
+    sets = {each.set for each in material.textures}
+    if 1 in sets and second is None:
+        second = np.zeros((len(mesh.position), 2))
+    if 0 in sets and mesh.texture is None:
+        zero = _array(np.zeros((len(mesh.position), 2)))
+        mesh = eqx.tree_at(lambda each: each.texture, mesh, zero, is_leaf=lambda each: each is None)
+    source = material.normal_texture or material.anisotropy_texture
+    place = second if source is not None and source.set else mesh.texture
+    if place is not None and (source is not None or material.anisotropy > 0):
+        given = None if geometry.tangent is None else geometry.tangent[own].any(1)
+        mesh, side = _laid(mesh, _array(place), given, side)
+    return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side))
+
+
+def _laid(mesh: Mesh, place: Array, given: np.ndarray | None, side: np.ndarray | None) -> tuple[Mesh, np.ndarray]:
+    """The mesh with tangents along u where none are given, and the handedness of all vertices."""
+    image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, place)
+    given = np.zeros(len(mesh.position), bool) if given is None else given
+    along = np.where(given[:, None], mesh.tangent, texture.dpdu(image))
+    return brush(mesh, along), np.where(given, 1 if side is None else side, texture.handedness(image))
+
+
+def _array(value: np.ndarray | Array | None) -> Array | None:
+    """An array on the device in the precision of meshes."""
+    return None if value is None else jax.device_put(np.asarray(value, np.float32))

@@ -1,0 +1,147 @@
+"""Scenes: meshes with their materials, cameras, and lights."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.scene import mesh as meshes
+from jaxprt.scene.camera import Camera
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.material import Surface, TexturedMaterial
+from jaxprt.scene.mesh import Mesh
+
+
+class Part(eqx.Module):
+    """A mesh of one material.
+
+    What belongs to vertices and not to the material, but matters to textures only, is here and not in the mesh.
+
+    Attributes:
+        name: What to call it; each part of a scene has another name.
+        mesh: The mesh. Its regions are not looked at.
+        material: A material with textures, or any BRDF: a callable (wi, wo) -> value.
+        color: Linear colors of the vertices, which multiply the base color; None for white.
+        second: A second set of texture coordinates, as `Mesh.texture` is the first; None where there is none.
+        handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; None
+            for 1 everywhere.
+
+    Raises:
+        TypeError: The mesh is no mesh, or the material is neither a `TexturedMaterial` nor callable.
+        ValueError: The mesh has no vertices or faces, an array does not have one row per vertex or is not finite, or
+            the material has textures and the mesh does not have the coordinates that they take.
+    """
+
+    name: str = eqx.field(static=True)
+    mesh: Mesh
+    material: TexturedMaterial | Callable
+    color: Float[Array, "v 3"] | None = None
+    second: Float[Array, "v 2"] | None = None
+    handedness: Float[Array, " v"] | None = None
+
+    def __check_init__(self):
+        """Refuses parts without vertices, and what does not belong to their vertices."""
+        require.kind(f"the mesh of part {self.name!r}", self.mesh, Mesh, source="scene.make_mesh or load_mesh")
+        count = len(self.mesh.position)
+        if not count or not len(self.mesh.face):
+            raise ValueError(
+                f"part {self.name!r} must have vertices and faces, got {count} vertices and {len(self.mesh.face)} faces"
+            )
+        for name in ("color", "second", "handedness"):
+            value = getattr(self, name)
+            if value is not None:
+                require.length(f"rows of {name} of part {self.name!r}", value, count)
+                require.finite(f"{name} of part {self.name!r}", value)
+        if not isinstance(self.material, TexturedMaterial):
+            if not callable(self.material):
+                got = type(self.material).__name__
+                raise TypeError(f"the material of part {self.name!r} must be a TexturedMaterial or a BRDF, got {got}")
+            return
+        for each in self.material.textures:
+            if (self.mesh.texture, self.second)[each.set] is None:
+                field = ("mesh.texture", "second")[each.set]
+                raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
+
+    def surface(self) -> Surface:
+        """Parameters of the material at the vertices.
+
+        Raises:
+            TypeError: The material is a BRDF, which has no textures.
+        """
+        require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="load_scene")
+        assert isinstance(self.material, TexturedMaterial)
+        position, place = self.mesh.position, self.mesh.texture
+        place = jnp.zeros((len(position), 2), position.dtype) if place is None else place
+        return self.material.at(place, self.second, color=self.color, handedness=self.handedness)
+
+
+class Scene(eqx.Module):
+    """What is looked at: parts with their materials, from where, and in which light.
+
+    Attributes:
+        parts: The parts, in order.
+        cameras: Cameras, as a file has them; empty if none.
+        environments: Lights, as a file has them; empty if none.
+
+    Raises:
+        TypeError: Something else than parts, cameras and environments is among them.
+        ValueError: There are no parts, or two parts have one name.
+    """
+
+    parts: tuple[Part, ...] = eqx.field(converter=tuple)
+    cameras: tuple[Camera, ...] = eqx.field(converter=tuple, default=())
+    environments: tuple[Environment, ...] = eqx.field(converter=tuple, default=())
+
+    def __check_init__(self):
+        """Refuses scenes without parts, equal names, and objects of other classes."""
+        for name, kind, source in (
+            ("parts", Part, "scene.Part"),
+            ("cameras", Camera, "scene.Camera"),
+            ("environments", Environment, "load_environment"),
+        ):
+            for each in getattr(self, name):
+                require.kind(f"each of the scene's {name}", each, kind, source=source)
+        if not self.parts:
+            raise ValueError("a scene must have at least one part, got none")
+        names = [part.name for part in self.parts]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"each part of a scene must have a name of its own, got several called {twice}")
+
+    def __getitem__(self, name: str) -> Part:
+        """The part of a name.
+
+        Raises:
+            KeyError: No part has it.
+        """
+        for part in self.parts:
+            if part.name == name:
+                return part
+        raise KeyError(f"there is no part {name!r}, only {[part.name for part in self.parts]}")
+
+    @property
+    def mesh(self) -> Mesh:
+        """All parts as one mesh, whose regions are the numbers of the parts; `mesh.split` takes it apart."""
+        return meshes.join(
+            [
+                eqx.tree_at(lambda each: each.region, part.mesh, np.zeros(len(part.mesh.position), np.int32))
+                for part in self.parts
+            ]
+        )
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """The names with numbers after those that came before: "wood", "wood 2", "wood 3"."""
+    taken: set[str] = set()
+    result = []
+    for name in names:
+        number, unique = 1, name
+        while unique in taken:
+            number += 1
+            unique = f"{name} {number}"
+        taken.add(unique)
+        result.append(unique)
+    return result

@@ -1,0 +1,43 @@
+"""Scenes in files of all formats."""
+
+import pathlib
+
+from jaxprt.scene import gltf, mesh_file
+from jaxprt.scene.file_parts import split_parts
+from jaxprt.scene.material import TexturedMaterial
+from jaxprt.scene.scene import Scene
+
+
+def load_scene(path: str | pathlib.Path) -> Scene:
+    """Loads a scene with its materials: a glTF, GLB, PLY, OBJ, STL or OFF file.
+
+    Geometry is read as by `load_mesh`. There is one part for each material that is used, named after it; equal names
+    are numbered. Textures repeat what several materials share only once.
+
+    A glTF file has metallic-roughness materials with textures, normal maps, vertex colors, two sets of texture
+    coordinates, and perspective cameras in their nodes' places, with pictures 512 pixels high. The extensions
+    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform and KHR_mesh_quantization
+    are honored. What else the file has (alpha modes, transmission, skins, animations, lights, orthographic cameras,
+    and so on) is named in one warning. Primitives without material have the default one of the specification, a white
+    rough metal.
+
+    Other files have no materials: one matte gray part, named after the file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene.
+
+    Raises:
+        FileNotFoundError: There is no such file, or it needs another one that does not exist.
+        ValueError: The file is of no known kind, damaged, or has no triangles; an image is no picture; a factor is
+            not finite or out of its range.
+    """
+    path = pathlib.Path(path)
+    if path.suffix.lower() in (".glb", ".gltf") and path.is_file():
+        return gltf.read(path)
+    geometry = mesh_file.read(path, groups=False)
+    count = int(geometry.region.max()) + 1 if geometry.region is not None else 1
+    matte = TexturedMaterial(base_color=0.5, metallic=0.0)
+    return Scene(split_parts(geometry, [path.stem] * count, [matte] * count, path))
