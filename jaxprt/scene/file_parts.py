@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -41,7 +42,7 @@ def split_parts(
 def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, region: int) -> Part:
     own = geometry.region == region
 
-    def rows(value: np.ndarray | None, plain: float) -> np.ndarray | None:
+    def rows(value: np.ndarray | None, plain: int) -> np.ndarray | None:
         """The part's rows of what its vertices have beside the mesh, if they are not all plain."""
         return None if value is None or (value[own] == plain).all() else value[own]
 
@@ -55,15 +56,14 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
     source = material.normal_texture or material.anisotropy_texture
     place = second if source is not None and source.set else mesh.texture
     if place is not None and (source is not None or material.anisotropy > 0):
-        given = None if geometry.tangent is None else geometry.tangent[own].any(1)
-        mesh, side = _laid(mesh, _array(place), given, side)
+        given = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[own] != 0).any(axis=1)
+        mesh, side = _laid(mesh, place, given, side)
     return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side))
 
 
-def _laid(mesh: Mesh, place: Array, given: np.ndarray | None, side: np.ndarray | None) -> tuple[Mesh, np.ndarray]:
+def _laid(mesh: Mesh, place: np.ndarray | Array, given: np.ndarray, side: np.ndarray | None) -> tuple[Mesh, np.ndarray]:
     """The mesh with tangents along u where none are given, and the handedness of all vertices."""
-    image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, place)
-    given = np.zeros(len(mesh.position), bool) if given is None else given
+    image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, jnp.asarray(place, jnp.float32))
     along = np.where(given[:, None], mesh.tangent, texture.dpdu(image))
     return brush(mesh, along), np.where(given, 1 if side is None else side, texture.handedness(image))
 

@@ -238,8 +238,6 @@ def _used(geometry: Geometry) -> Geometry:
     used[geometry.face] = True
     if used.all():
         return geometry
-    number = np.cumsum(used) - 1
-    rest = {
-        name: None if value is None else value[used] for name, value in geometry._asdict().items() if name != "face"
-    }
-    return Geometry(face=number[geometry.face], **rest)
+    rest: dict[str, Any] = geometry._asdict()
+    rest = {name: value[used] for name, value in rest.items() if value is not None and name != "face"}
+    return geometry._replace(face=(np.cumsum(used) - 1)[geometry.face], **rest)

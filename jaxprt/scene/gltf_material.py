@@ -47,7 +47,7 @@ class MaterialReader:
         strength = self._number(extension.get("KHR_materials_emissive_strength", {}), "emissiveStrength", 1.0, owner)
         normal = item.get("normalTexture", {})
         self._note(item)
-        field = {
+        field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
             "roughness": self._number(pbr, "roughnessFactor", 1.0, owner),
@@ -105,9 +105,9 @@ class MaterialReader:
             sampler = self._document.item("samplers", item["sampler"], f"texture {info['index']}")
         if sampler.get("magFilter") == _NEAREST:
             self.ignored.add("nearest filters (textures are interpolated)")
-        wrap = tuple(_WRAP.get(sampler.get(key, 10497), "repeat") for key in ("wrapS", "wrapT"))
+        across, up = (_WRAP.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT"))
         image = self._pixels(item["source"], channels, f"texture {info['index']}", decoded)
-        return Texture(image, self._transform(moved, owner), number, wrap)
+        return Texture(image, self._transform(moved, owner), number, (across, up))
 
     def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array:
         key = (source, decoded, channels)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
@@ -140,10 +141,10 @@ class TexturedMaterial(eqx.Module):
         for name in ("base_color", "metallic", "roughness", "specular", "anisotropy"):
             require.within(f"{name} of TexturedMaterial", getattr(self, name), 0, 1)
         for name in ("emissive", "specular_color", "ior"):
-            require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0)
+            require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0.0)
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
-        if not isinstance(self.ior, jax.core.Tracer) and 0 < np.asarray(self.ior) < 1:
+        if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 
     @property

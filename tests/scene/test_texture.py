@@ -33,12 +33,14 @@ def test_the_texture_repeats_and_its_edges_meet():
     np.testing.assert_allclose(texture.lookup(LABEL, edge)[:, 0], [101.5, 101.5, 100, 100], rtol=1e-5)
 
 
-def test_lookup_is_scipys_periodic_interpolation(close):
+@pytest.mark.parametrize(("wrap", "mode"), [("repeat", "grid-wrap"), ("mirror", "reflect"), ("clamp", "nearest")])
+def test_lookup_is_scipys_interpolation_in_every_wrap_mode(close, wrap, mode):
     random = np.random.default_rng(0)
     image, place = random.normal(size=(5, 7, 3)), random.uniform(-2, 3, size=(4, 50, 2))
     grid = [(1 - place[..., 1]) * 5 - 0.5, place[..., 0] * 7 - 0.5]
-    expected = [scipy.ndimage.map_coordinates(image[..., c], grid, order=1, mode="grid-wrap") for c in range(3)]
-    close(texture.lookup(*(jnp.asarray(each, jnp.float32) for each in (image, place))), np.stack(expected, -1))
+    expected = [scipy.ndimage.map_coordinates(image[..., c], grid, order=1, mode=mode) for c in range(3)]
+    found = texture.lookup(*(jnp.asarray(each, jnp.float32) for each in (image, place)), wrap=(wrap, wrap))
+    close(found, np.stack(expected, -1))
 
 
 def test_an_image_of_one_texel_is_constant():
@@ -146,3 +148,21 @@ def test_lookups_of_other_shapes_are_refused(image, place):
 def test_a_mesh_without_texture_coordinates_has_no_dpdu():
     with pytest.raises(ValueError, match="must have texture coordinates, got none"):
         texture.dpdu(builtin.plane(cells=1))
+
+
+def test_unknown_wrap_modes_are_refused():
+    with pytest.raises(ValueError, match=r"wrap must be two of repeat, mirror, clamp, got \('repeat', 'tile'\)"):
+        texture.lookup(LABEL, jnp.zeros(2), wrap=("repeat", "tile"))
+
+
+def test_handedness_tells_where_an_image_is_mirrored():
+    place = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    square = np.concatenate([place, np.zeros((4, 1))], 1)
+    face = grid_face(rows=2, columns=2)[:, ::-1]
+    corner = square[[0, 1, 3, 2]]
+    for flip, expected in (([1, 1], 1), ([-1, 1], -1), ([-1, -1], 1), ([0, 0], 1)):
+        mesh = make_mesh(corner, face, texture=place[[0, 1, 3, 2]] * flip)
+        assert float(mesh.normal[0, 2]) == 1
+        np.testing.assert_array_equal(texture.handedness(mesh), [expected] * 4)
+    with pytest.raises(ValueError, match="must have texture coordinates, got none"):
+        texture.handedness(builtin.plane(cells=1))

@@ -1,0 +1,597 @@
+"""glTF files written by hand, real ones against trimesh, and damaged ones."""
+
+import base64
+import copy
+import json
+import pathlib
+import struct
+import warnings
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial
+import trimesh
+
+from jaxprt.files import write_png
+from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.mesh import split
+
+KIND = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+TYPE = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+# A unit square in the plane z = 0 that looks to +z, with an upright image on it (v down).
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+FACE = np.array([0, 1, 2, 0, 2, 3], np.uint16)
+PLACE = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+TURN = np.array([[0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1.0]])  # A quarter turn about z, and a shift.
+
+
+class Writer:
+    """A glTF file with one scene of one node, to which objects are added; tests change its header."""
+
+    def __init__(self):
+        self.data = b""
+        self.header: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}]}
+        self.header |= {"nodes": [{"mesh": 0}], "bufferViews": [], "accessors": [], "images": [], "materials": []}
+
+    def add(self, kind: str, item: dict) -> int:
+        self.header.setdefault(kind, []).append(item)
+        return len(self.header[kind]) - 1
+
+    def view(self, content: bytes, **field) -> int:
+        self.data += b"\0" * (-len(self.data) % 4)
+        index = self.add(
+            "bufferViews", {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content), **field}
+        )
+        self.data += content
+        return index
+
+    def accessor(self, value: np.ndarray, **field) -> int:
+        value = np.asarray(value)
+        value = value[:, None] if value.ndim == 1 else value
+        value = value.astype(np.float32) if value.dtype == float else value
+        kind, view = KIND[value.dtype.str[1:]], self.view(value.tobytes())
+        item = {"bufferView": view, "componentType": kind, "count": len(value), "type": TYPE[value.shape[1]]}
+        return self.add("accessors", item | field)
+
+    def square(
+        self, *, face: np.ndarray | None = FACE, material: int | None = None, mode: int = 4, **attribute
+    ) -> dict:
+        """A primitive; attributes are arrays, or numbers of accessors."""
+        value = {"POSITION": SQUARE} | attribute
+        item: dict[str, Any] = {"mode": mode}
+        item["attributes"] = {k: v if isinstance(v, int) else self.accessor(v) for k, v in value.items()}
+        return (
+            item
+            | ({} if face is None else {"indices": self.accessor(face)})
+            | ({} if material is None else {"material": material})
+        )
+
+    def texture(self, folder: pathlib.Path, image: np.ndarray, **field) -> dict:
+        """What refers to a texture, of an image with display values."""
+        write_png(folder / "image.png", np.asarray(image, np.float32))
+        view = self.view((folder / "image.png").read_bytes())
+        source = self.add("images", {"bufferView": view, "mimeType": "image/png"})
+        return {"index": self.add("textures", {"source": source})} | field
+
+    def write(self, path: pathlib.Path) -> pathlib.Path:
+        data = self.data + b"\0" * (-len(self.data) % 4)
+        header = self.header | {"buffers": [{"byteLength": len(data)}]}
+        if path.suffix == ".gltf":
+            uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+            path.write_text(json.dumps(header | {"buffers": [{"byteLength": len(data), "uri": uri}]}))
+            return path
+        text = json.dumps(self.header.get("whole", header)).encode()
+        text += b" " * (-len(text) % 4)
+        content = struct.pack("<4s4I", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A) + text
+        path.write_bytes(content + struct.pack("<2I", len(data), 0x004E4942) + data)
+        return path
+
+
+def one(*primitives, writer: Writer) -> Writer:
+    """The writer with these primitives in one mesh."""
+    writer.add("meshes", {"primitives": list(primitives)})
+    return writer
+
+
+def srgb(value):
+    """IEC 61966-2-1."""
+    return np.where(
+        np.asarray(value) <= 0.04045, np.asarray(value) / 12.92, ((np.asarray(value) + 0.055) / 1.055) ** 2.4
+    )
+
+
+def corners(mesh):
+    return np.asarray(mesh.position)[np.asarray(mesh.face)]
+
+
+@pytest.mark.parametrize("name", ["Duck", "CesiumMilkTruck", "BoxTextured"])
+def test_real_files_have_the_triangles_normals_and_textures_that_trimesh_reads(data, name):
+    path = data / f"scenes/{name}.glb"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load_scene(path)
+    assert [str(each.message).rpartition("are ")[2] for each in caught] == ["animations"] * (name == "CesiumMilkTruck")
+    peer = trimesh.load_scene(path, process=False)
+    found: dict[str, list] = {}
+    for node in peer.graph.nodes_geometry:
+        transform, key = peer.graph[node]
+        geometry = peer.geometry[key]
+        position = trimesh.transform_points(geometry.vertices, transform)
+        normal = geometry.vertex_normals @ transform[:3, :3].T
+        place = geometry.visual.uv if has_uv(geometry) else np.zeros((len(position), 2))
+        row = np.concatenate([position, normal / np.linalg.norm(normal, axis=1, keepdims=True), place], 1)
+        found.setdefault(geometry.visual.material.name, []).append(row[geometry.faces].reshape(-1, 24))
+    assert [part.name for part in scene.parts] == list(found)
+    for part in scene.parts:
+        mesh, theirs = part.mesh, np.concatenate(found[part.name])
+        place = mesh.texture if mesh.texture is not None else np.zeros((len(mesh.position), 2))
+        ours = np.concatenate([mesh.position, mesh.normal, place], 1)[np.asarray(mesh.face)].reshape(-1, 24)
+        assert len(ours) == len(theirs)
+        for tree, other in ((theirs, ours), (ours, theirs)):
+            assert scipy.spatial.KDTree(tree).query(other)[0].max() < 1e-4
+
+
+def has_uv(geometry):
+    return getattr(geometry.visual, "uv", None) is not None
+
+
+def test_factors_of_a_real_file_are_exact_and_colors_of_its_texture_are_at_their_places(data):
+    duck = load_scene(data / "scenes/Duck.glb").parts[0]
+    with pytest.warns(UserWarning, match=r"CesiumMilkTruck\.glb: not honored are animations$"):
+        truck = load_scene(data / "scenes/CesiumMilkTruck.glb")
+    glass = truck["glass"].material
+    np.testing.assert_array_equal(glass.base_color, np.float32([0, 0.04050629958510399, 0.021240700036287308]))
+    assert (float(glass.metallic), float(glass.roughness), glass.textures) == (0, 1, ())
+    assert truck["truck"].material.base_color_texture.image is truck["wheels"].material.base_color_texture.image
+    peer = next(iter(trimesh.load_scene(data / "scenes/Duck.glb", process=False).geometry.values()))
+    expected = srgb(peer.visual.material.to_color(peer.visual.uv)[:, :3] / 255)
+    # trimesh takes the nearest texel, so that vertices on an edge in the image differ.
+    difference = np.abs(np.asarray(duck.surface().base_color) - expected).max(1)
+    assert np.mean(difference > 0.1) < 0.03
+    assert np.median(difference) < 0.01
+
+
+def interleaved(writer):
+    both = np.concatenate([SQUARE, PLACE], 1).astype(np.float32)
+    view = writer.view(both.tobytes(), byteStride=20)
+    field = {"bufferView": view, "componentType": 5126, "count": 4}
+    position = writer.add("accessors", field | {"type": "VEC3"})
+    return {"POSITION": position, "TEXCOORD_0": writer.add("accessors", field | {"type": "VEC2", "byteOffset": 12})}
+
+
+def sparse(writer):
+    index, value = writer.view(np.array([1, 2], np.uint8).tobytes()), writer.view(SQUARE[1:3].tobytes())
+    parts = {"count": 2, "indices": {"bufferView": index, "componentType": 5121}, "values": {"bufferView": value}}
+    wrong = SQUARE.copy()
+    wrong[1:3] = 7
+    return {"POSITION": writer.accessor(wrong, sparse=parts), "TEXCOORD_0": PLACE}
+
+
+def sparse_on_nothing(writer):
+    index, value = writer.view(np.array([1, 2, 3], np.uint16).tobytes()), writer.view(SQUARE[1:].tobytes())
+    parts = {"count": 3, "indices": {"bufferView": index, "componentType": 5123}, "values": {"bufferView": value}}
+    position = writer.add("accessors", {"componentType": 5126, "count": 4, "type": "VEC3", "sparse": parts})
+    return {"POSITION": position, "TEXCOORD_0": PLACE}
+
+
+def whole(kind, most):
+    def build(writer):
+        packed = np.zeros((4, 4), kind)  # Rows of four bytes at least.
+        packed[:, :2] = PLACE * most
+        view = writer.view(packed.tobytes(), byteStride=packed.itemsize * 4)
+        field = {"bufferView": view, "componentType": KIND[packed.dtype.str[1:]], "count": 4, "type": "VEC2"}
+        return {"TEXCOORD_0": writer.add("accessors", field | {"normalized": True})}
+
+    return build
+
+
+def quantized(writer):
+    return {"POSITION": writer.accessor((SQUARE * 127).astype(np.int8), normalized=True), "TEXCOORD_0": PLACE}
+
+
+def shared(writer):
+    """Of eight vertices the square uses four."""
+    twice, place = np.repeat(SQUARE, 2, 0), np.repeat(PLACE, 2, 0)
+    return {"POSITION": twice, "TEXCOORD_0": place, "face": FACE * 2}
+
+
+ENCODINGS = {"interleaved": interleaved, "sparse": sparse, "sparse on nothing": sparse_on_nothing, "shared": shared}
+ENCODINGS |= {"bytes": whole(np.uint8, 255), "shorts": whole(np.uint16, 65535), "quantized": quantized}
+ENCODINGS |= {"fan": lambda writer: {"TEXCOORD_0": PLACE, "face": np.arange(4, dtype=np.uint32), "mode": 6}}
+ENCODINGS |= {"strip": lambda writer: {"TEXCOORD_0": PLACE, "face": np.array([1, 2, 0, 3], np.uint8), "mode": 5}}
+ENCODINGS |= {"floats": lambda writer: {"TEXCOORD_0": PLACE}}
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_all_encodings_of_a_square_are_the_same_square(tmp_path, suffix):
+    for name, build in ENCODINGS.items():
+        writer = Writer()
+        mesh = load_scene(one(writer.square(**build(writer)), writer=writer).write(tmp_path / f"a.{suffix}")).mesh
+        np.testing.assert_allclose(mesh.position, SQUARE, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(mesh.texture, [[0, 0], [1, 0], [1, 1], [0, 1]], atol=1e-6, err_msg=name)
+        np.testing.assert_array_equal(mesh.normal, [[0, 0, 1]] * 4, err_msg=name)
+        edge = corners(mesh)[:, 1:] - corners(mesh)[:, :1]
+        np.testing.assert_allclose(np.cross(edge[:, 0], edge[:, 1]), [[0, 0, 1]] * 2, atol=1e-6, err_msg=name)
+
+
+def test_nodes_are_placed_nested_mirrored_and_repeated(tmp_path, close):
+    writer = Writer()
+    normal = np.tile(np.float32([0.6, 0, 0.8]), (4, 1))
+    tangent = np.tile(np.float32([0.8, 0, -0.6, 1]), (4, 1))
+    one(writer.square(NORMAL=normal, TANGENT=tangent), writer=writer)
+    half = np.sqrt(0.5)
+    writer.header["scenes"] = [{"nodes": []}, {"nodes": [1, 3]}]
+    writer.header["scene"] = 1
+    writer.header["nodes"] = [
+        {"mesh": 0, "scale": [2, 1, -3], "rotation": [half, 0, 0, half], "translation": [1, 2, 3]},
+        {"matrix": TURN.T.ravel().tolist(), "children": [0, 2]},
+        {"mesh": 0},
+        {"mesh": 0, "scale": [1, 1, 0]},
+        {"mesh": 0, "translation": [99, 99, 99]},
+    ]
+    part = load_scene(writer.write(tmp_path / "nodes.glb")).parts[0]
+    # A quarter turn about x takes y to z and z to -y.
+    own = np.array([[2, 0, 0, 1], [0, 0, 3, 2], [0, 1, 0, 3], [0, 0, 0, 1.0]])
+    matrices = [TURN @ own, TURN, np.diag([1, 1, 0, 1.0])]
+    every = [SQUARE @ each[:3, :3].T + each[:3, 3] for each in matrices]
+    close(part.mesh.position, np.concatenate(every), tolerance=1e-6)
+    assert np.linalg.det(matrices[0]) < 0
+    for number, matrix in enumerate(matrices[:2]):
+        outside = normal[0] @ np.linalg.inv(matrix[:3, :3])
+        close(part.mesh.normal[4 * number], outside / np.linalg.norm(outside), tolerance=1e-6)
+        along = matrix[:3, :3] @ tangent[0, :3]
+        close(part.mesh.tangent[4 * number], along / np.linalg.norm(along), tolerance=1e-6)
+        edge = np.diff(corners(part.mesh)[2 * number], axis=0)
+        front = np.cross(*edge) @ (np.array([0, 0, 1]) @ np.linalg.inv(matrix[:3, :3]))
+        assert front > 0  # Faces are counter-clockwise seen from outside.
+    np.testing.assert_array_equal(part.handedness, [-1] * 4 + [1] * 8)
+    # The node that is flattened keeps the direction of its normals.
+    close(part.mesh.normal[8:], np.tile([0.0, 0, 1], (4, 1)), tolerance=1e-6)
+
+
+@pytest.mark.parametrize("scale", [[0, 0, 0], [0, 1, 1], [1e-30, 1e-30, 1e-30]])
+def test_nodes_scaled_to_nothing_have_finite_frames(tmp_path, scale):
+    writer = one((writer := Writer()).square(NORMAL=np.tile(np.float32([0, 0, 1]), (4, 1))), writer=writer)
+    writer.header["nodes"][0]["scale"] = scale
+    mesh = load_scene(writer.write(tmp_path / "flat.glb")).mesh
+    assert mesh.position.shape == (4, 3)
+    frame = np.stack([mesh.normal, mesh.tangent], 1)
+    np.testing.assert_allclose(np.linalg.norm(frame, axis=-1), 1, atol=1e-6)
+
+
+def test_parts_are_materials_by_number_and_their_names_are_numbered(tmp_path):
+    writer = Writer()
+    writer.header["materials"] = [{"name": "wood"}, {"name": "unused"}, {"name": "wood"}, {}]
+    shift = [SQUARE + np.float32([0, 0, i]) for i in range(5)]
+    parts = [writer.square(POSITION=shift[i], material=each) for i, each in enumerate([3, 2, None, 0, 2])]
+    path = one(*parts, writer=writer).write(tmp_path / "names.glb")
+    scene = load_scene(path)
+    assert [part.name for part in scene.parts] == ["wood", "wood 2", "material 3", "default"]
+    heights = [sorted(set(np.asarray(part.mesh.position[:, 2]).tolist())) for part in scene.parts]
+    assert heights == [[3], [1, 4], [0], [2]]
+    for part, again in zip(scene.parts, split(load_mesh(path)), strict=True):
+        np.testing.assert_array_equal(part.mesh.position, again.position)
+    default = scene["default"].material
+    assert (float(default.metallic), float(default.roughness), float(default.ior)) == (1, 1, 1.5)
+    np.testing.assert_array_equal(default.base_color, [1, 1, 1])
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+def test_colors_of_vertices_multiply_the_base_color_and_are_white_elsewhere(tmp_path, kind):
+    most = 1 if kind == "f4" else np.iinfo(kind).max
+    color = (np.array([[0, 0.2, 1, 0], [1, 1, 1, 0], [0.6, 0, 0.4, 1], [1, 0, 0, 1]]) * most).astype(kind)
+    writer = Writer()
+    writer.header["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1, 0.25, 0.3]}}]
+    first = writer.square(material=0, COLOR_0=writer.accessor(color, normalized=kind != "f4"))
+    part = load_scene(one(first, writer.square(material=0), writer=writer).write(tmp_path / "color.glb")).parts[0]
+    expected = np.concatenate([color[:, :3] / most, np.ones((4, 3))]) * [0.5, 1, 0.25]
+    np.testing.assert_allclose(part.surface().base_color, expected, atol=1e-6)
+
+
+IMAGE = np.random.default_rng(0).integers(30, 226, (3, 2, 4)) / 255
+CENTER = np.array([[0.25, 1 / 6], [0.75, 0.5], [0.25, 5 / 6], [0.75, 1 / 6]], np.float32)  # v down
+TEXEL = IMAGE[[0, 1, 2, 0], [0, 1, 0, 1]]
+
+
+def test_all_factors_textures_and_extensions_of_a_material_are_honored(tmp_path, close):
+    writer = Writer()
+    image = writer.texture(tmp_path, IMAGE)
+    material = {
+        "pbrMetallicRoughness": {
+            **{"baseColorFactor": [0.9, 0.8, 0.7, 0.1], "metallicFactor": 0.6, "roughnessFactor": 0.5},
+            **{"baseColorTexture": image, "metallicRoughnessTexture": image},
+        },
+        **{"emissiveFactor": [0.1, 0.2, 0.3], "emissiveTexture": image, "normalTexture": image | {"scale": 0.4}},
+        "extensions": {
+            "KHR_materials_emissive_strength": {"emissiveStrength": 20},
+            "KHR_materials_ior": {"ior": 1.8},
+            "KHR_materials_specular": {
+                **{"specularFactor": 0.3, "specularTexture": image},
+                **{"specularColorFactor": [2, 0.5, 1], "specularColorTexture": image},
+            },
+            "KHR_materials_anisotropy": {
+                **{"anisotropyStrength": 0.7, "anisotropyRotation": 0.3, "anisotropyTexture": image},
+            },
+        },
+    }
+    writer.header["materials"] = [material]
+    tangent = np.tile(np.float32([1, 0, 0, 1]), (4, 1))
+    tangent[2:, 3] = -1
+    normal = np.tile(np.float32([0, 0, 1]), (4, 1))
+    one(writer.square(material=0, TEXCOORD_0=CENTER, NORMAL=normal, TANGENT=tangent), writer=writer)
+    writer.header["extensionsUsed"] = list(material["extensions"])
+    found = load_scene(writer.write(tmp_path / "all.glb")).parts[0].surface()
+    color, side = srgb(TEXEL[:, :3]), tangent[:, 3]
+    close(found.base_color, color * [0.9, 0.8, 0.7])
+    close(found.metallic, 0.6 * TEXEL[:, 2])
+    close(found.roughness, 0.5 * TEXEL[:, 1])
+    close(found.emissive, 20 * color * [0.1, 0.2, 0.3])
+    close(found.ior, np.full(4, 1.8))
+    close(found.specular, 0.3 * TEXEL[:, 3])
+    close(found.specular_color, color * [2, 0.5, 1])
+    close(found.anisotropy, 0.7 * TEXEL[:, 2])
+    direction = 2 * TEXEL[:, 0] - 1 + 1j * (2 * TEXEL[:, 1] - 1)
+    direction = direction / np.abs(direction) * np.exp(0.3j)
+    close(found.direction, np.stack([direction.real, direction.imag * side], 1))
+    slope = (2 * TEXEL[:, :3] - 1) * [0.4, 0.4, 1]
+    slope[:, 1] *= side
+    close(found.normal, slope / np.linalg.norm(slope, axis=1, keepdims=True))
+
+
+def test_texture_transforms_move_either_set_of_coordinates_as_blender_does(tmp_path, close):
+    writer = Writer()
+    offset, angle, scale = np.array([0.1, 0.3]), 0.4, np.array([0.5, 0.7])
+    moved = {"offset": offset.tolist(), "rotation": angle, "scale": scale.tolist(), "texCoord": 1}
+    info = writer.texture(tmp_path, IMAGE, texCoord=0, extensions={"KHR_texture_transform": moved})
+    writer.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
+    path = one(
+        writer.square(material=0, TEXCOORD_0=PLACE, TEXCOORD_1=(65535 * CENTER).astype(np.uint16)), writer=writer
+    ).write(tmp_path / "moved.glb")
+    writer.header["accessors"][2]["normalized"] = True
+    part = load_scene(writer.write(path)).parts[0]
+    close(part.second, [[0, 1]] + CENTER * [[1, -1]], tolerance=1e-4)
+    # glTF-Blender-IO, blender_default/texture_transform_gltf_to_blender: the offset for v up; the turn is plain.
+    cosine, sine = np.cos(angle), np.sin(angle)
+    shift = [offset[0] + scale[1] * sine, 1 - offset[1] - scale[1] * cosine]
+    place = np.asarray(part.second) * scale @ np.array([[cosine, sine], [-sine, cosine]]) + shift
+    texture = part.material.base_color_texture
+    expected = texture.__class__(texture.image).at(jnp.asarray(place, jnp.float32))
+    close(part.surface().base_color, expected, tolerance=1e-5)
+
+
+def test_samplers_repeat_mirror_and_clamp(tmp_path):
+    writer = Writer()
+    info = writer.texture(tmp_path, IMAGE)
+    writer.header["textures"][0]["sampler"] = writer.add("samplers", {"wrapS": 33648, "wrapT": 33071})
+    writer.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
+    place = np.float32([[1.25, 9], [-0.25, -9], [2.25, 1 / 6], [-1.25, 0.5]])
+    part = load_scene(one(writer.square(material=0, TEXCOORD_0=place), writer=writer).write(tmp_path / "a.glb")).parts[
+        0
+    ]
+    expected = srgb(IMAGE[[2, 0, 0, 1], [1, 0, 0, 1], :3])
+    np.testing.assert_allclose(part.surface().base_color, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_normal_maps_without_tangents_have_them_along_the_image(tmp_path, mirrored):
+    writer = Writer()
+    info = writer.texture(tmp_path, np.full((2, 2, 3), [0.5, 1, 0.5]))  # The normal leans to the image's upper edge.
+    writer.header["materials"] = [{"normalTexture": info}]
+    # The image's upper edge is at -x, or its mirror image's.
+    place = np.float32([[0, 0], [0, 1], [1, 1], [1, 0]]) * [-1 if mirrored else 1, 1]
+    part = load_scene(one(writer.square(material=0, TEXCOORD_0=place), writer=writer).write(tmp_path / "a.glb")).parts[
+        0
+    ]
+    x, y, z = np.moveaxis(np.asarray(part.surface().normal), -1, 0)
+    mesh = part.mesh
+    bitangent = np.cross(mesh.normal, mesh.tangent)
+    world = x[:, None] * mesh.tangent + y[:, None] * bitangent + z[:, None] * mesh.normal
+    np.testing.assert_allclose(world, [[-1, 0, 0]] * 4, atol=0.01)
+    np.testing.assert_allclose(mesh.tangent[:, 1], -1 if mirrored else 1, atol=1e-6)
+
+
+def test_cameras_stand_where_their_nodes_are(tmp_path, close):
+    writer = one((writer := Writer()).square(), writer=writer)
+    writer.header["cameras"] = [
+        {"type": "perspective", "perspective": {"yfov": 0.7, "aspectRatio": 1.5, "znear": 1}},
+        {"type": "orthographic", "orthographic": {}},
+    ]
+    writer.header["nodes"] = [
+        {"mesh": 0, "children": [1]},
+        {"matrix": TURN.T.ravel().tolist(), "camera": 0},
+        {"camera": 1},
+    ]
+    writer.header["scenes"][0]["nodes"] = [0, 2]
+    with pytest.warns(UserWarning, match="not honored are orthographic cameras$"):
+        (camera,) = load_scene(writer.write(tmp_path / "camera.glb")).cameras
+    close(camera.eye, np.array([3.0, 4, 5]))
+    forward = np.asarray(camera.target - camera.eye)
+    close(forward / np.linalg.norm(forward), np.array([0.0, 0, -1]), tolerance=1e-6)
+    close(camera.up, np.array([-1.0, 0, 0]), tolerance=1e-6)
+    assert (camera.width, camera.height, float(camera.field_of_view)) == (768, 512, pytest.approx(0.7))
+
+
+def test_what_is_not_honored_is_said_once_by_name(tmp_path):
+    writer = Writer()
+    image = writer.texture(tmp_path, IMAGE)
+    writer.header["materials"] = [
+        {
+            **{"alphaMode": "BLEND", "doubleSided": True, "occlusionTexture": image, "emissiveTexture": image},
+            "extensions": {"KHR_materials_clearcoat": {}, "KHR_materials_ior": {}},
+        }
+    ]
+    parts = [writer.square(material=0, COLOR_1=SQUARE) | {"targets": [{}]}, writer.square(mode=1)]
+    one(*parts, writer=writer)
+    writer.header |= {"animations": [{}], "skins": [{}], "extensionsUsed": ["KHR_lights_punctual"]}
+    with pytest.warns(UserWarning, match="not honored") as caught:
+        load_scene(writer.write(tmp_path / "much.glb"))
+    (message,) = [str(each.message) for each in caught]
+    expected = ["COLOR_1", "KHR_lights_punctual", "KHR_materials_clearcoat", "alpha mode BLEND", "animations"]
+    expected += ["doubleSided", "morph targets", "occlusion textures", "points and lines", "skins"]
+    expected += ["textures of primitives without texture coordinates"]
+    assert message.startswith(f"{tmp_path / 'much.glb'}: not honored are ")
+    for each in expected:
+        assert message.count(each) == 1, each
+    assert "KHR_materials_ior" not in message
+
+
+def test_buffers_and_images_are_read_from_files_beside(tmp_path):
+    writer = Writer()
+    info = writer.texture(tmp_path, IMAGE)
+    writer.header["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
+    one(writer.square(material=0, TEXCOORD_0=CENTER), writer=writer)
+    (tmp_path / "a folder").mkdir()
+    (tmp_path / "a folder" / "all.bin").write_bytes(writer.data)
+    write_png(tmp_path / "a folder" / "ima ge.png", IMAGE.astype(np.float32))
+    header = writer.header | {"buffers": [{"byteLength": len(writer.data), "uri": "a%20folder/all.bin"}]}
+    header["images"] = [{"uri": "a%20folder/ima%20ge.png"}]
+    path = tmp_path / "beside.gltf"
+    path.write_text(json.dumps(header))
+    expected = srgb(TEXEL[:, :3])
+    np.testing.assert_allclose(load_scene(path).parts[0].surface().base_color, expected, atol=1e-6)
+    (tmp_path / "a folder" / "ima ge.png").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"beside\.gltf needs the file .*ima ge\.png for image 0, which does not"
+    ):
+        load_scene(path)
+    assert len(load_mesh(path).position) == 4  # Which needs no images.
+    (tmp_path / "a folder" / "all.bin").write_bytes(writer.data[:99])
+    with pytest.raises(ValueError, match=rf"must have {len(writer.data)} bytes in buffer 0, got 99 bytes"):
+        load_scene(path)
+    (tmp_path / "a folder" / "all.bin").unlink()
+    with pytest.raises(FileNotFoundError, match=r"beside\.gltf needs the file .*all\.bin for buffer 0, which does not"):
+        load_scene(path)
+
+
+def sound(folder):
+    """A file with everything that can be damaged."""
+    writer = Writer()
+    info = writer.texture(folder, IMAGE, extensions={"KHR_texture_transform": {"scale": [1, 2]}})
+    pbr = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0.5, "baseColorTexture": info}
+    writer.header["materials"] = [{"pbrMetallicRoughness": pbr, "normalTexture": info}]
+    one(writer.square(material=0, TEXCOORD_0=PLACE, NORMAL=SQUARE), writer=writer)
+    writer.header["nodes"] = [{"mesh": 0, "children": [1]}, {"camera": 0, "scale": [1, 1, 1]}]
+    writer.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.7}}]
+    return writer
+
+
+DAMAGES = {
+    "accessors.0.count": (
+        5,
+        r"accessor 0, POSITION of primitive 0 of mesh 0, inside buffer view \d of 48 bytes, got 5",
+    ),
+    "accessors.0.byteOffset": (-4, "inside buffer view"),
+    "accessors.0.componentType": (5130, "must have 3 numbers per element .* got type 'VEC3' of component type 5130"),
+    "accessors.0.type": ("VEC2", "must have 3 numbers per element"),
+    "accessors.1.count": (3, r"must have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
+    "accessors.3.componentType": (5126, "must have 1 whole numbers per element"),
+    "accessors.3.bufferView": (99, r"must name one of its \d bufferViews in accessor 3, .* got 99"),
+    "bufferViews.1.byteLength": (10**6, r"must have buffers of at least \d+ bytes for buffer view 1, got \d+ bytes"),
+    "bufferViews.1.buffer": (7, "must name one of its 1 buffers in buffer view 1, got 7"),
+    "meshes.0.primitives.0.indices": ([0], "must name one of its 4 accessors"),
+    "meshes.0.primitives.0.attributes": ({}, "must be an undamaged glTF file, .* KeyError: 'POSITION'"),
+    "meshes.0.primitives.0.material": (3, "must name one of its 1 materials in primitive 0 of mesh 0, got 3"),
+    "nodes.0.children": ([0], "must have nodes that form trees, got node 0 twice, the second time in node 0"),
+    "nodes.1.children": ([0], "must have nodes that form trees, got node 0 twice, the second time in node 1"),
+    "nodes.0.mesh": (1, "must name one of its 1 meshes in node 0, got 1"),
+    "nodes.1.camera": (-1, "must name one of its 1 cameras in node 1, got -1"),
+    "nodes.1.scale": ([0, 0, 0], "must place camera 0 by transforms that can be inverted, got a scale of zero"),
+    "nodes.1.rotation": ([0, 0, 0, 0], "must have a quaternion that is not zero for the rotation of node 1, got zero"),
+    "nodes.1.translation": ([0, float("nan"), 0], "must have 3 finite numbers for the translation of node 1, got"),
+    "scenes.0.nodes": ([4], "must name one of its 2 nodes in scene 0, got 4"),
+    "scenes.0": ({}, "must hold vertices and faces, got no faces"),
+    "scene": (2, "must name one of its 1 scenes in the default scene, got 2"),
+    "materials.0.pbrMetallicRoughness.metallicFactor": (
+        float("nan"),
+        "a finite number for metallicFactor of material 0",
+    ),
+    "materials.0.pbrMetallicRoughness.roughnessFactor": (1.5, "material 0: roughness .* between 0 and 1, .* 1.5"),
+    "materials.0.pbrMetallicRoughness.baseColorFactor": ([1, 1, 1], "4 finite numbers for baseColorFactor"),
+    "materials.0.pbrMetallicRoughness.baseColorTexture.index": (4, "one of its 1 textures in material 0, got 4"),
+    "textures.0.source": (1, "must name one of its 1 images in texture 0, got 1"),
+    "images.0.bufferView": (1, r"damaged.glb: image 0 must be an EXR, .* or BMP image, got one that starts with"),
+    "cameras.0.perspective.yfov": (4, "must have yfov from 0 to pi"),
+    "asset.version": ("1.0", "of version 2, got version 1.0"),
+    "extensionsRequired": (["KHR_draco_mesh_compression"], "geometry that is not compressed, got KHR_draco"),
+    "accessors": ("none", "with a list of accessors, got str"),
+}
+
+
+def changed(header, place, value):
+    """A header with another value at a place "kind.number.key"."""
+    header = copy.deepcopy(header)
+    *way, last = [int(key) if key.isdigit() else key for key in place.split(".")]
+    item: Any = header
+    for key in way:
+        item = item[key]
+    item[last] = value
+    return header
+
+
+@pytest.mark.parametrize("place", DAMAGES)
+def test_damaged_headers_are_refused_by_what_was_required_and_what_came(tmp_path, place):
+    value, message = DAMAGES[place]
+    writer = sound(tmp_path)
+    writer.header = changed(writer.header, place, value)
+    with pytest.raises(ValueError, match=message) as error:
+        load_scene(writer.write(tmp_path / "damaged.glb"))
+    assert "damaged.glb" in str(error.value)
+
+
+def test_indices_beyond_the_vertices_are_refused(tmp_path):
+    writer = one((writer := Writer()).square(face=np.array([0, 1, 2, 0, 2, 9], np.uint8)), writer=writer)
+    message = (
+        r"name vertices 0 to 3 in indices of primitive 0 of mesh 0, got 1 of 6 that name others, the first is 9 at 5"
+    )
+    with pytest.raises(ValueError, match=message):
+        load_scene(writer.write(tmp_path / "far.glb"))
+
+
+def test_positions_that_are_not_finite_are_refused(tmp_path):
+    position = SQUARE.copy()
+    position[2, 1] = np.nan
+    writer = one((writer := Writer()).square(POSITION=position), writer=writer)
+    with pytest.raises(ValueError, match=r"nan\.glb: positions must be finite, got 1 of 4 .* at vertex 2"):
+        load_scene(writer.write(tmp_path / "nan.glb"))
+
+
+def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
+    content = sound(tmp_path).write(tmp_path / "whole.glb").read_bytes()
+    load_scene(tmp_path / "whole.glb")
+    path = tmp_path / "broken.glb"
+    for size in (0, 3, 11, 19, 25, 200, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:size])
+        with pytest.raises(ValueError, match=r"broken\.glb must be an undamaged GLB file"):
+            load_scene(path)
+    path.write_bytes(b"glTX" + content[4:])
+    with pytest.raises(ValueError, match=r"which starts with b'glTF', got .* bytes that start b'glTX'"):
+        load_scene(path)
+    with pytest.raises(FileNotFoundError, match=r"there is no mesh file .*absent\.glb"):
+        load_scene(tmp_path / "absent.glb")
+
+
+def test_any_value_of_the_header_may_be_damaged_without_another_error_than_one_that_names_the_file(tmp_path):
+    writer = sound(tmp_path)
+
+    def places(item, way=()):
+        for key, value in item.items() if isinstance(item, dict) else enumerate(item):
+            yield ".".join(map(str, (*way, key)))
+            if isinstance(value, dict | list):
+                yield from places(value, (*way, key))
+
+    sound_header = writer.header
+    errors = []
+    for place in places(sound_header):
+        for value in (None, -1, 10**30, "text", [], float("inf")):
+            writer.header = changed(sound_header, place, value)
+            path = writer.write(tmp_path / "damaged.glb")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    load_scene(path)
+                except (ValueError, FileNotFoundError) as error:
+                    errors.append((str(error), f"{place} = {value}"))
+    assert not [each for each in errors if "damaged.glb" not in each[0]]
+    assert len(errors) > 250
