@@ -151,6 +151,7 @@ HOST = {
     "scene.gltf_geometry": "reads files",
     "scene.gltf_material": "reads files",
     "scene.gltf": "reads files",
+    "scene.mtl": "reads files",
     "scene.file_parts": "NumPy, where data enters",
     "scene.scene.numbered": "names",
     "scene.scene_file": "reads files",

@@ -2,9 +2,8 @@
 
 import pathlib
 
-from jaxprt.scene import gltf, mesh_file
+from jaxprt.scene import gltf, mesh_file, mtl
 from jaxprt.scene.file_parts import split_parts
-from jaxprt.scene.material import TexturedMaterial
 from jaxprt.scene.scene import Scene
 
 
@@ -21,7 +20,10 @@ def load_scene(path: str | pathlib.Path) -> Scene:
     and so on) is named in one warning. Primitives without material have the default one of the specification, a white
     rough metal.
 
-    Other files have no materials: one matte gray part, named after the file.
+    An OBJ file has the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and of the metallic-roughness
+    statements Pr, Pm, map_Pr, map_Pm and Ni; see `mtl.read` for how Phong's become metallic-roughness ones. MTL files,
+    materials and images that are missing are named in one warning, together with what is not honored. Other files
+    have no materials: one matte gray part, named after the file.
 
     Args:
         path: The file.
@@ -38,6 +40,7 @@ def load_scene(path: str | pathlib.Path) -> Scene:
     if path.suffix.lower() in (".glb", ".gltf") and path.is_file():
         return gltf.read(path)
     geometry = mesh_file.read(path, groups=False)
-    count = int(geometry.region.max()) + 1 if geometry.region is not None else 1
-    matte = TexturedMaterial(base_color=0.5, metallic=0.0)
-    return Scene(split_parts(geometry, [path.stem] * count, [matte] * count, path))
+    names, materials = [path.stem], [mtl.matte()]
+    if path.suffix.lower() == ".obj":
+        names, materials = mtl.of_regions(path)
+    return Scene(split_parts(geometry, names, materials, path))

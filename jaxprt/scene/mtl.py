@@ -1,0 +1,194 @@
+"""Materials of OBJ files (Wavefront MTL), with the metallic-roughness statements that exporters add."""
+
+import math
+import pathlib
+import warnings
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxprt.files import images
+from jaxprt.scene.material import Texture, TexturedMaterial
+
+_COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
+_NUMBERS = {"Ns", "Ni", "Pr", "Pm", "illum"}
+# Where a map goes: field, channels, whether it holds colors in sRGB.
+_MAPS = {
+    "map_Kd": ("base_color_texture", (0, 1, 2), True),
+    "map_Ke": ("emissive_texture", (0, 1, 2), True),
+    "map_Pr": ("roughness_texture", (0,), False),
+    "map_Pm": ("metallic_texture", (0,), False),
+    "norm": ("normal_texture", (0, 1, 2), False),
+}
+_ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # Numbers that options of maps may have; all others have one word.
+_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # Ambient light is computed; the rest is of transparent things.
+_OPAQUE = {"d": 1.0, "Tr": 0.0}
+
+
+def matte() -> TexturedMaterial:
+    """What faces without material are made of: a gray that reflects alike in all directions."""
+    return TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0)
+
+
+def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
+    """Names and materials of the regions of an OBJ file, in the order of their first faces, as `mesh_file` has them.
+
+    What is missing (MTL files, materials, images) or not honored is named in one warning; a matte gray takes the
+    place of materials that are missing.
+
+    Args:
+        path: The OBJ file.
+    """
+    order: dict[str | None, None] = {}
+    name, files, found = None, [], {}
+    ignored: set[str] = set()
+    for line in path.read_bytes().decode(errors="replace").splitlines():
+        key, _, rest = line.replace("\t", " ").strip().partition(" ")
+        if key == "usemtl":
+            name = rest.strip()
+        elif key == "mtllib":
+            files.append(rest.strip())
+        elif key == "f":
+            order[name] = None
+    for file in files:
+        for each in [file] if (path.parent / file).is_file() else file.split():
+            if (path.parent / each).is_file():
+                material, more = read(path.parent / each)
+                found, ignored = material | found, ignored | more
+            else:
+                ignored.add(f"mtllib ({path.parent / each}, which does not exist)")
+    ignored |= {f"usemtl {each} (no such material)" for each in order if each is not None and each not in found}
+    if ignored:
+        warnings.warn(f"{path}: not honored are {', '.join(sorted(ignored))}", stacklevel=3)
+    return [each or "default" for each in order], [found.get(each or "", matte()) for each in order]
+
+
+def read(path: pathlib.Path) -> tuple[dict[str, TexturedMaterial], set[str]]:
+    """The materials of an MTL file.
+
+    Kd is the base color; map_Kd multiplies it. Where there is Pr or Pm (roughness and metalness), these and Ni make
+    the rest. Else the material is Phong's: a dielectric whose reflectance at normal incidence is Ks, none for illum 0
+    and 1 or without Ks, and whose roughness is that of the microfacet distribution nearest to the lobe of exponent Ns:
+    alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007, "Microfacet models for refraction through
+    rough surfaces", section 5.2).
+
+    Args:
+        path: The file.
+
+    Returns:
+        Materials by name, and what is not honored: statements by name, and images that are missing or damaged.
+
+    Raises:
+        ValueError: A number is damaged or out of its range; says where.
+    """
+    material: dict[str, TexturedMaterial] = {}
+    ignored: set[str] = set()
+    statements: dict[str, list[str]] = {}
+    name = None
+    lines = path.read_bytes().decode(errors="replace").splitlines()
+    for line in [*lines, "newmtl"]:
+        key, *rest = line.partition("#")[0].split() or [""]
+        if key == "newmtl":
+            if name is not None:
+                material[name] = _material(statements, path, name, ignored)
+            name, statements = " ".join(rest), {}
+        elif key:
+            statements[key] = rest
+    return material, ignored
+
+
+def _material(statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str]) -> TexturedMaterial:
+    """The material of the statements after one newmtl."""
+    value = {key: _number(statements, key, path, name) for key in (*_COLORS, *_NUMBERS) if key in statements}
+    for key in value.keys() & {"Kd", "Ks", "Pr", "Pm"}:
+        if np.max(value[key]) > 1:
+            ignored.add(f"{key} above 1")
+            value[key] = np.minimum(value[key], 1)
+    field: dict[str, Any] = {_COLORS[key]: value[key] for key in ("Kd", "Ke") if key in value}
+    for key, words in statements.items():
+        if key in _MAPS:
+            _add_map(field, key, words, path, ignored)
+        elif key in _OPAQUE and _number(statements, key, path, name) == _OPAQUE[key]:
+            continue
+        elif key not in value and key not in _SILENT:
+            ignored.add(key)
+    # An exponent n of Phong's lobe is about alpha = sqrt(2 / (n + 2)); roughness is the root of alpha.
+    roughness = (2 / (max(0.0, value.get("Ns", 0.0)) + 2)) ** 0.25
+    if (value.keys() | statements.keys()) & {"Pr", "Pm", "map_Pr", "map_Pm"}:
+        field["roughness"] = value.get("Pr", 1.0 if "roughness_texture" in field else roughness)
+        field["metallic"] = value.get("Pm", 1.0 if "metallic_texture" in field else 0.0)
+        field["ior"] = max(1.0, value.get("Ni", 1.5))
+    elif "Ks" not in value or value.get("illum", 2) < 2:
+        field |= {"metallic": 0.0, "roughness": roughness, "specular": 0.0}
+    else:  # At the default index of refraction 4 % times the color are reflected.
+        field |= {"metallic": 0.0, "roughness": roughness, "specular_color": value["Ks"] / 0.04}
+    try:
+        return TexturedMaterial(**field)
+    except ValueError as error:
+        raise ValueError(f"{path}, material {name!r}: {error}") from error
+
+
+def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name: str) -> Any:
+    """The number or color of a statement; one number stands for a gray."""
+    words = statements[key]
+    try:
+        if not words or words[0] in ("spectral", "xyz"):
+            raise ValueError
+        number = [float(word) for word in words[: 3 if key in _COLORS else 1]]
+        if not all(math.isfinite(each) for each in number):
+            raise ValueError
+    except ValueError:
+        got = " ".join([key, *words])
+        raise ValueError(f"{path}, material {name!r}: {key} must have finite numbers, got {got!r}") from None
+    if key not in _COLORS:
+        return number[0]
+    return np.array(number if len(number) == 3 else number[:1] * 3)
+
+
+def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Path, ignored: set[str]) -> None:
+    """Adds the texture of a statement, or what is wrong with it to what is ignored."""
+    name, channels, decoded = _MAPS[key]
+    options, words = _options(words)
+    file = path.parent / " ".join(words).replace("\\", "/")
+    try:
+        if not file.is_file():
+            raise ValueError(f"{file}, which does not exist")
+        image = images.decode_image(file.read_bytes(), name=str(file), decoded=decoded)
+    except ValueError as error:
+        ignored.add(f"{key} ({error})")
+        return
+    ignored |= {f"option {each} of maps" for each in options.keys() - {"-o", "-s", "-clamp"}}
+    if image.shape[-1] < 3:
+        channels = (0,) * len(channels)
+    scale, offset = (_pair(options.get(each, []), plain) for each, plain in (("-s", 1.0), ("-o", 0.0)))
+    wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
+    transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]], np.float32)
+    field[name] = Texture(jnp.asarray(image[..., channels]), transform, 0, (wrap, wrap))
+
+
+def _options(words: list[str]) -> tuple[dict[str, list[str]], list[str]]:
+    """Options of a map before the name of its file, and the words of the name."""
+    options: dict[str, list[str]] = {}
+    place = 0
+    while place < len(words) - 1 and words[place].startswith("-"):
+        key, end = words[place], place + 1
+        while end < len(words) - 1 and end - place <= _ARGUMENTS.get(key, 1):
+            if key in _ARGUMENTS and not _is_number(words[end]):
+                break
+            end += 1
+        options[key] = words[place + 1 : end]
+        place = end
+    return options, words[place:]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def _pair(words: list[str], plain: float) -> list[float]:
+    """Two numbers of an option of up to three."""
+    return [*(float(word) for word in words[:2]), plain, plain][:2]

@@ -1,0 +1,125 @@
+"""OBJ files with MTL materials."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.files import write_png
+from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.mesh import split
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+FACE = "f 1/1 2/2 3/3 4/4\n"
+IMAGE = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 1]]], np.float32)  # Red, green; blue, white.
+
+
+def write(folder, materials, lines="usemtl a\n" + FACE, name="scene"):
+    (folder / f"{name}.mtl").write_text(materials)
+    path = folder / f"{name}.obj"
+    path.write_text(f"mtllib {name}.mtl\n{SQUARE}{lines}")
+    return path
+
+
+def one(folder, statements):
+    (part,) = load_scene(write(folder, f"newmtl a\n{statements}")).parts
+    return part
+
+
+def test_parts_are_the_materials_in_order_of_their_first_faces(tmp_path):
+    materials = "newmtl oak wood\nKd .1 .2 .3\nd 1\nTr 0.0\nKa 1 1 1\nnewmtl unused\nnewmtl steel\nPm 1\nPr .3\n"
+    lines = FACE + "usemtl steel\n" + FACE + "usemtl oak wood\n" + FACE + "usemtl steel\n" + FACE
+    path = write(tmp_path, materials, lines)
+    scene = load_scene(path)
+    assert [part.name for part in scene.parts] == ["default", "steel", "oak wood"]
+    assert [len(part.mesh.face) for part in scene.parts] == [2, 4, 2]
+    for part, own in zip(scene.parts, split(load_mesh(path)), strict=True):
+        np.testing.assert_array_equal(part.mesh.position, own.position)
+    default, steel, wood = (part.material for part in scene.parts)
+    assert (float(steel.metallic), float(steel.roughness)) == (1, pytest.approx(0.3))
+    np.testing.assert_allclose(wood.base_color, [0.1, 0.2, 0.3], rtol=1e-6)
+    assert (float(wood.metallic), float(wood.specular)) == (0, 0)
+    np.testing.assert_array_equal(default.base_color, [0.5] * 3)
+
+
+@pytest.mark.parametrize("exponent", [0, 10, 500])
+def test_phong_becomes_the_microfacets_nearest_to_its_lobe(tmp_path, exponent):
+    material = one(tmp_path, f"Kd .5 .5 .5\nKs .2 .1 .04\nNs {exponent}\nNi 1.2\nillum 2\n").material
+    # A Beckmann distribution of width m is near a power 2 / m^2 - 2 of the cosine: Walter et al. 2007, section 5.2.
+    assert 2 / float(material.roughness) ** 4 - 2 == pytest.approx(exponent, abs=1e-2)
+    reflectance = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular_color * material.specular
+    np.testing.assert_allclose(reflectance, [0.2, 0.1, 0.04], rtol=1e-5)
+    matte = one(tmp_path, f"Kd .5 .5 .5\nKs .2 .1 .04\nNs {exponent}\nillum 1\n").material
+    assert float(matte.specular) == 0
+
+
+def test_metallic_roughness_statements_come_before_phongs(tmp_path):
+    material = one(tmp_path, "Kd 1 1 1\nKs .5 .5 .5\nNs 250\nNi 1.45\nPr .25\nPm .5\nKe 2 1 0\nillum 2\n").material
+    assert (float(material.roughness), float(material.metallic)) == (0.25, 0.5)
+    assert float(material.ior) == pytest.approx(1.45)
+    np.testing.assert_array_equal(material.specular_color, [1] * 3)
+    np.testing.assert_array_equal(material.emissive, [2, 1, 0])
+
+
+def test_maps_lie_as_the_file_has_them_and_options_move_and_clamp_them(tmp_path):
+    (tmp_path / "a folder").mkdir()
+    write_png(tmp_path / "a folder" / "four colors.png", IMAGE)
+    statements = "Kd .5 1 1\nmap_Kd a folder\\four colors.png\nmap_Pr a folder/four colors.png\n"
+    part = one(tmp_path, statements + "map_Pm -s 1 1 1 -o .5 -clamp on a folder/four colors.png\n")
+    place = np.asarray(part.mesh.texture)
+    np.testing.assert_array_equal(place, [[0, 0], [1, 0], [1, 1], [0, 1]])
+    lower_left = part.material.at(jnp.array([[0.25, 0.25]]))
+    np.testing.assert_allclose(lower_left.base_color, [[0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(lower_left.roughness, [0], atol=1e-6)  # The channel of red.
+    np.testing.assert_allclose(lower_left.metallic, [1], atol=1e-6)  # Moved by half the image: white.
+    upper_right = part.material.at(jnp.array([[0.75, 0.75]]))
+    np.testing.assert_allclose(upper_right.base_color, [[0, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(upper_right.metallic, [0], atol=1e-6)  # Beyond the edge: green.
+
+
+def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
+    statements = "Kd 2 1 1\nd 0.5\nbump a.png\nmap_Kd absent.png\nmap_Ke text.png\naniso 1\n"
+    (tmp_path / "text.png").write_text("no picture")
+    path = write(tmp_path, f"newmtl a\n{statements}", "usemtl a\n" + FACE + "usemtl b\n" + FACE)
+    path.write_text("mtllib gone.mtl\n" + path.read_text())
+    with pytest.warns(UserWarning, match="not honored") as caught:
+        scene = load_scene(path)
+    (message,) = [str(each.message) for each in caught]
+    assert message.startswith(f"{path}: not honored are ")
+    expected = ["Kd above 1", "aniso", "bump", ", d,", r"absent.png, which does not exist", "text.png must be an EXR"]
+    for each in [*expected, "gone.mtl, which does not exist", "usemtl b (no such material)"]:
+        assert message.count(each) == 1, each
+    np.testing.assert_array_equal(scene["a"].material.base_color, [1, 1, 1])
+    assert scene["a"].material.textures == ()
+    np.testing.assert_array_equal(scene["b"].material.base_color, [0.5] * 3)
+    path.write_text(SQUARE + FACE)
+    assert [part.name for part in load_scene(path).parts] == ["default"]
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("Kd 1 x 1", "material 'a': Kd must have finite numbers, got 'Kd 1 x 1'"),
+        ("Ns nan", "material 'a': Ns must have finite numbers, got 'Ns nan'"),
+        ("Kd", "material 'a': Kd must have finite numbers, got 'Kd'"),
+        ("Kd spectral a.rfl", "material 'a': Kd must have finite numbers, got 'Kd spectral a.rfl'"),
+        ("Pr -1", "material 'a': roughness of TexturedMaterial must be between 0 and 1"),
+    ],
+)
+def test_damaged_numbers_are_refused_by_name(tmp_path, statement, message):
+    with pytest.raises(ValueError, match=f"scene.mtl, {message}"):
+        one(tmp_path, statement)
+
+
+@pytest.mark.parametrize("name", ["fuze", "rabbit", "chair_model", "negative_indices"])
+def test_real_files_have_the_regions_of_their_meshes_and_say_what_is_missing(data, name):
+    path = data / f"meshes_awkward/{name}.obj"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load_scene(path)
+    assert len(caught) <= 1
+    own = split(load_mesh(path))
+    assert [len(part.mesh.face) for part in scene.parts] == [len(each.face) for each in own]
+    for part in scene.parts:
+        assert np.isfinite(part.surface().base_color).all()
