@@ -152,6 +152,8 @@ HOST = {
     "scene.gltf_material": "reads files",
     "scene.gltf": "reads files",
     "scene.mtl": "reads files",
+    "scene.mitsuba_dict": "reads files",
+    "scene.mitsuba_material": "reads files",
     "scene.file_parts": "NumPy, where data enters",
     "scene.scene.numbered": "names",
     "scene.scene_file": "reads files",

@@ -134,7 +134,7 @@ class Document:
         return value.astype(np.float64)
 
     def image(self, index: Any, owner: str) -> bytes:
-        """The bytes of an image file, and what to call it in messages."""
+        """The bytes of an image file, inside the file or beside it."""
         item = self.item("images", index, owner)
         if "bufferView" in item:
             return bytes(self.view(item["bufferView"], f"image {index}")[0])

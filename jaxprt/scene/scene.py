@@ -124,7 +124,10 @@ class Scene(eqx.Module):
 
     @property
     def mesh(self) -> Mesh:
-        """All parts as one mesh, whose regions are the numbers of the parts; `mesh.split` takes it apart."""
+        """All parts as one mesh, joined anew at each access.
+
+        Its regions are the numbers of the parts; `mesh.split` takes it apart.
+        """
         return meshes.join(
             [
                 eqx.tree_at(lambda each: each.region, part.mesh, np.zeros(len(part.mesh.position), np.int32))

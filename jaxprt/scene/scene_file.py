@@ -1,14 +1,16 @@
 """Scenes in files of all formats."""
 
 import pathlib
+from collections.abc import Mapping
+from typing import Any
 
-from jaxprt.scene import gltf, mesh_file, mtl
+from jaxprt.scene import gltf, mesh_file, mitsuba_dict, mtl
 from jaxprt.scene.file_parts import split_parts
 from jaxprt.scene.scene import Scene
 
 
-def load_scene(path: str | pathlib.Path) -> Scene:
-    """Loads a scene with its materials: a glTF, GLB, PLY, OBJ, STL or OFF file.
+def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
+    """Loads a scene with its materials: a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
     Geometry is read as by `load_mesh`. There is one part for each material that is used, named after it; equal names
     are numbered. Textures repeat what several materials share only once.
@@ -25,8 +27,12 @@ def load_scene(path: str | pathlib.Path) -> Scene:
     materials and images that are missing are named in one warning, together with what is not honored. Other files
     have no materials: one matte gray part, named after the file.
 
+    A dictionary is as for `mitsuba.load_dict`, with arrays [4 4] or objects that have a `matrix` as transforms. It has
+    the shapes obj, ply, rectangle, cube and sphere, the last three divided finely; the BSDFs that `mitsuba_material`
+    names, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective sensors.
+
     Args:
-        path: The file.
+        path: The file, or the dictionary.
 
     Returns:
         The scene.
@@ -34,8 +40,10 @@ def load_scene(path: str | pathlib.Path) -> Scene:
     Raises:
         FileNotFoundError: There is no such file, or it needs another one that does not exist.
         ValueError: The file is of no known kind, damaged, or has no triangles; an image is no picture; a factor is
-            not finite or out of its range.
+            not finite or out of its range; a BSDF of a dictionary has no equal here.
     """
+    if isinstance(path, Mapping):
+        return mitsuba_dict.read(path)
     path = pathlib.Path(path)
     if path.suffix.lower() in (".glb", ".gltf") and path.is_file():
         return gltf.read(path)

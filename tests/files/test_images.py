@@ -6,7 +6,7 @@ import OpenEXR
 import OpenImageIO
 import pytest
 
-from jaxprt.files import read_image, write_exr, write_png
+from jaxprt.files import decode_image, read_image, write_exr, write_png
 
 
 def random_image(*shape, seed=0):
@@ -196,3 +196,17 @@ def test_a_path_may_be_relative(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_exr("image.exr", random_image(2, 2, 3))
     assert read_image(pathlib.Path("image.exr"))[0].shape == (2, 2, 3)
+
+
+@pytest.mark.parametrize(("form", "error"), [("png", 1 / 255), ("jpeg", 0.02), ("tiff", 1 / 255)])
+def test_images_in_memory_are_decoded_as_files_are_or_left_as_they_are_stored(tmp_path, form, error):
+    stored = (np.full((16, 8, 3), [0.2, 0.5, 0.9]) * 255).round().astype(np.uint8)
+    write_oiio(tmp_path / f"image.{form}", stored, "uint8")
+    content = (tmp_path / f"image.{form}").read_bytes()
+    decoded = decode_image(content, name="image 3 of a.glb")
+    np.testing.assert_array_equal(decoded, read_image(tmp_path / f"image.{form}")[0])
+    np.testing.assert_allclose(encode_srgb(decoded), stored / 255, atol=error)
+    np.testing.assert_allclose(decode_image(content, name="a", decoded=False), stored / 255, atol=error)
+    for damaged in (b"", b"no picture", content[:30]):
+        with pytest.raises(ValueError, match=r"image 3 of a\.glb must be an (undamaged|EXR)"):
+            decode_image(damaged, name="image 3 of a.glb")
