@@ -16,12 +16,19 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-from jaxprt import brdf, decompose, files, image, inverse, plan, scene, sphere, visibility
+from jaxprt import brdf, decompose, files, image, inverse, plan, relit, scene, sphere, visibility
+from jaxprt.relit import RelitScene, precompute
+from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
 
 __all__ = [
     "Blend",
+    "Camera",
+    "Environment",
+    "Part",
+    "RelitScene",
+    "Scene",
     "System",
     "bounces",
     "brdf",
@@ -32,11 +39,16 @@ __all__ = [
     "harmonic",
     "image",
     "inverse",
+    "load_environment",
+    "load_mesh",
+    "load_scene",
     "lobe",
     "memory",
     "plan",
+    "precompute",
     "radiance",
     "reference",
+    "relit",
     "scene",
     "separable",
     "sphere",

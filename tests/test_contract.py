@@ -33,6 +33,7 @@ from jaxprt import bounces, brdf, dynamic, scene, visibility
 from jaxprt import harmonic as harmonic_system
 from jaxprt import lobe as lobe_system
 from jaxprt import separable as separable_system
+from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import raster
 
@@ -47,6 +48,7 @@ HOST = {
     "inverse": "takes functions, and fits on the host",
     "cli.report": "measures, and writes files",
     "cli.animation": "the same",
+    "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
     "image.raster.front": "gives truth values",
     "visibility.rays": "traces rays",
@@ -103,6 +105,8 @@ HOST = {
     "systems.separable.factorization.factor": "checks values, and chooses the number of terms by them",
     "systems.lobe.table.tabulate": "checks values, and chooses the number of lobes by them",
     "systems.lobe.table.sampled": "checks values",
+    "systems.lobe.table.diffuse": "puts arrays side by side",
+    "systems.lobe.knots": "takes indices; tested through tables over parameters",
     "systems.lobe.table.is_isotropic": "compares values",
     "systems.dynamic.brdf_set.separate": "checks values",
     "systems.dynamic.brdf_set.factor": "the same",
@@ -521,6 +525,20 @@ EXAMPLES = {
             draw.upper(5),
             draw.upper(5),
         )
+    ),
+    "brdf.varying.PerVertex": example(
+        lambda draw: call(
+            PerVertex(brdf.Phong(draw.uniform(5, 3), draw.uniform(5, 3), draw.uniform(5, 1))),
+            draw.upper(5),
+            draw.upper(5),
+        ),
+    ),
+    "brdf.varying.Channels": example(
+        lambda draw: call(
+            Channels((brdf.Phong(draw.uniform(1)), brdf.Lambert(draw.uniform(1))), draw.uniform(2)),
+            draw.upper(5),
+            draw.upper(5),
+        ),
     ),
     "brdf.microfacet.GGX": example(
         lambda draw: call(brdf.GGX(draw.uniform(3), draw.uniform(2), draw.uniform()), draw.upper(5), draw.upper(5))

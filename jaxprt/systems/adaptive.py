@@ -14,6 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
+from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import linear
 from jaxprt.sphere import cubemap, haar
 
@@ -34,7 +35,7 @@ class Integrand(NamedTuple):
     """What is integrated.
 
     Attributes:
-        brdf: A pytree and callable.
+        brdf: A pytree and callable; `PerVertex` for one of each vertex.
         frame: Rows are tangent, bitangent, normal.
         wo: Local directions to the eye.
         light: Radiance of lights l in the texels d.
@@ -200,7 +201,10 @@ def _visit(fixed: tuple, colors: int) -> Callable:
         wo = integrand.wo[vertex]
         wi, weight, texel = _nodes(cell, integrand.frame[vertex], size)
         weight *= wo[:, 2:, None] > 0
-        sent = value(integrand.brdf, jnp.stack(wi, -1), wo[:, None, None])
+        brdf = integrand.brdf
+        if isinstance(brdf, PerVertex):
+            brdf = brdf.of(jnp.broadcast_to(vertex[:, None, None], wi[0].shape).ravel())
+        sent = value(brdf, jnp.stack(wi, -1), wo[:, None, None])
         inner = _children(sent * (jnp.maximum(wi[2], 0) * weight)[..., None])
         clear = choice.seen[vertex[:, None, None], texel].astype(weight.dtype) / LEVELS
         scale = clear * brightest(mean[:, texel], choice.weight[vertex].T[:, :, None, None])

@@ -8,6 +8,7 @@ radiance = system.combine(A, V)        in the mesh's order of vertices
 
 import abc
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -154,6 +155,66 @@ class Total(System):
     def vertices(self) -> int:
         """Number of vertices."""
         return self.part[0].vertices
+
+
+class Joined(System):
+    """Systems of different vertices, those of one after those of the next, as `scene.mesh.join` puts them.
+
+    Materials are one of each system, or None.
+
+    Attributes:
+        part: The systems.
+    """
+
+    part: tuple[System, ...]
+
+    def light(self, environment: Environment) -> tuple[PyTree, ...]:
+        """The light of each system; of systems that share it made once."""
+        made: dict[tuple, PyTree] = {}
+        result = []
+        for each in self.part:
+            key = each.shared_light
+            lit = each.light(environment) if key is None or key not in made else made[key]
+            if key is not None:
+                made[key] = lit
+            result.append(lit)
+        return tuple(result)
+
+    def shade(self, light: tuple[PyTree, ...], materials: Sequence | None = None) -> tuple[PyTree, ...]:
+        """What arrives, of each system."""
+        require.kind("the light", light, tuple, source="Joined.light")
+        triples = zip(self.part, light, self._given(materials), strict=True)
+        return tuple(each.shade(lit, own) for each, lit, own in triples)
+
+    def view(self, eye: Float[Array, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
+        """The view of each system."""
+        return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
+
+    def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
+        """Radiance of all vertices; gray systems get as many colors as the others have."""
+        require.kind("the light", light, tuple, source="Joined.light")
+        require.kind("the view", view, tuple, source="Joined.view")
+        parts = [each.combine(*sides) for each, *sides in zip(self.part, light, view, strict=True)]
+        colors = max(each.shape[1] for each in parts)
+        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in parts])
+
+    def _given(self, materials: Sequence | None) -> Sequence:
+        if materials is None:
+            return [None] * len(self.part)
+        if not isinstance(materials, Sequence) or len(materials) != len(self.part):
+            raise TypeError(f"the materials must be a list, one for each of {len(self.part)} parts, got {materials}")
+        return materials
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return sum(each.vertices for each in self.part)
+
+    @property
+    def shared_light(self) -> tuple | None:
+        """Those of the systems, if all have one."""
+        keys = tuple(each.shared_light for each in self.part)
+        return None if None in keys else (Joined, *keys)
 
 
 def total(*systems: System) -> Total:

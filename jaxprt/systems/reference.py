@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
+from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
@@ -36,7 +37,8 @@ def radiance(
     Args:
         mesh: The vertices.
         brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions, of which values below
-            the horizon do not count; a new function object, as a lambda in a loop, compiles anew.
+            the horizon do not count; a new function object, as a lambda in a loop, compiles anew. `PerVertex` has one
+            for each vertex of the mesh.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
         occluder: What casts shadows; the mesh itself if None.
@@ -67,6 +69,8 @@ def radiance(
     normal = np.asarray(mesh.normal, np.float32)
     position, upright, tangent = (np.asarray(each) for each in (mesh.position, mesh.normal, mesh.tangent))
     size = light.radiance.shape[-2]
+    if isinstance(brdf, PerVertex) and brdf.vertices != len(position):
+        raise ValueError(f"the BRDF must be of the mesh's {len(position)} vertices, got {brdf.vertices}")
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []
@@ -74,7 +78,8 @@ def radiance(
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
         seen, _ = visibility.fractional(rays, start[part], normal[part], size=size)
         frame = directions.frame(upright[part], tangent[part])
-        block = integrate(seen, position[part], frame, brdf, light, eye, error=error)
+        own = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
+        block = integrate(seen, position[part], frame, own, light, eye, error=error)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
 
@@ -99,7 +104,7 @@ def integrate(
         seen: Visible share of each texel in sixteenths.
         position: Positions in world units.
         frame: Rows are tangent, bitangent, normal.
-        brdf: A BRDF that is a pytree and callable, as the models are.
+        brdf: A BRDF that is a pytree and callable, as the models are, or `PerVertex`.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer.
         error: As in `radiance`.
@@ -131,12 +136,13 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
     # Vertices come one after another, so that the arrays of each stay in the processor's cache. `brightest` and the
     # sum over texels are loops for a reason: XLA computes a value again for each of its uses, except across loops.
     def one(argument):
-        axes, wo, level = argument
-        value = adaptive.value(given.brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
+        axes, wo, level, vertex = argument
+        brdf = given.brdf.of(vertex) if isinstance(given.brdf, PerVertex) else given.brdf
+        value = adaptive.value(brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
         value = value.reshape(*level.shape, -1)
         flux = area @ axes[2]
         clear = level.astype(flux.dtype) / visibility.LEVELS
-        peak = wo[2] * jnp.mean(adaptive.value(given.brdf, (wo * _MIRROR)[None], wo))
+        peak = wo[2] * jnp.mean(adaptive.value(brdf, (wo * _MIRROR)[None], wo))
         arriving = jnp.maximum(flux, 0) * clear
         gray, lean, height, flat = jax.lax.stop_gradient((jnp.mean(value, -1), flux, peak, arriving))
         weight = 1 / jnp.maximum(jnp.einsum("let,et->l", mean, gray * flat), _DARK)
@@ -152,7 +158,7 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
         total = jax.lax.scan(add, jnp.zeros((len(mean), colors), value.dtype), (light, value, arriving))[0]
         return total, weight, height, chosen
 
-    total, weight, height, chosen = jax.lax.map(one, (given.frame, given.wo, level))
+    total, weight, height, chosen = jax.lax.map(one, (given.frame, given.wo, level, jnp.arange(len(given.wo))))
     edge = size // adaptive.root(size)
     return total, adaptive.Choice(seen, weight, height, error), chosen.reshape(-1, 6, edge, edge)
 

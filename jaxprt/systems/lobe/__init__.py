@@ -1,12 +1,12 @@
 """The lobe system: BRDFs as mixtures of von Mises-Fisher lobes, visibility in pyramids."""
 
-from jaxprt.systems.lobe import em, published, pyramid, relight, remainder, system, table
+from jaxprt.systems.lobe import em, knots, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, compress, precompute
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter, radiance
 from jaxprt.systems.lobe.remainder import Remainder
 from jaxprt.systems.lobe.system import LobeSystem
-from jaxprt.systems.lobe.table import LobeBrdf, Lobes, tabulate
+from jaxprt.systems.lobe.table import LobeBrdf, Lobes, diffuse, tabulate
 
 __all__ = [
     "LobeBrdf",
@@ -18,7 +18,9 @@ __all__ = [
     "Remainder",
     "combine",
     "compress",
+    "diffuse",
     "em",
+    "knots",
     "look",
     "mirror_lobes",
     "precompute",

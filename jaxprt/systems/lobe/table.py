@@ -8,7 +8,6 @@ fixed widths around the mirror direction, is `jaxprt.lobe.published.mirror_lobes
 """
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import ClassVar
@@ -22,7 +21,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf import grid
 from jaxprt.decompose import mixture
 from jaxprt.sphere import harmonics, hemisphere
-from jaxprt.systems.lobe import em
+from jaxprt.systems.lobe import em, knots
 
 _STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
 # How many times these, and the share that neighbors in the table have in a lobe after them.
@@ -140,7 +139,7 @@ class LobeBrdf(eqx.Module):
             for knot, each in zip(self.knot, parameter, strict=True)
         ]
         value = (
-            _between_knots(self, jnp.concatenate(rows), place, axis)
+            knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
             if place
             else grid.read(jnp.concatenate(rows), axis)
         )
@@ -159,39 +158,6 @@ class LobeBrdf(eqx.Module):
         batch = wo.shape[:-1]
         value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
         return value.T.reshape(*batch, len(self.weight))
-
-
-def _between_knots(table: LobeBrdf, row: Array, knot: list, axis: list) -> Float[Array, "r v"]:
-    """Rows of a table for views that each have parameters of their own: between knots first, then between nodes."""
-    sizes, nodes = row.shape[1 : 1 + len(knot)], row.shape[1 + len(knot) :]
-    flat = row.reshape(len(row), -1)
-
-    def read(index: Array, node: Array, left: list) -> Array:
-        """Rows at a node, between the knots of the parameters that are left."""
-        if not left:
-            return flat.at[:, index * math.prod(nodes) + node].get(mode="promise_in_bounds")
-        size, (low, upper) = left[0]
-        first, second = (read(index * size + low + up, node, left[1:]) for up in (0, 1))
-        return _merged(first, second, upper, lobes=table.lobes)
-
-    total = jnp.zeros((), row.dtype)
-    for corner in itertools.product((0, 1), repeat=len(axis)):
-        node, weight = jnp.zeros((), jnp.int32), jnp.ones((), row.dtype)
-        for up, size, (low, share) in zip(corner, nodes, axis, strict=True):
-            node, weight = node * size + low + up, weight * (share if up else 1 - share)
-        total = total + weight * read(jnp.zeros((), jnp.int32), node, list(zip(sizes, knot, strict=True)))
-    return total
-
-
-def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
-    """Rows of lobes between those of two knots, as `mean` has it."""
-    count = (3 * lobes, 4 * lobes, first.shape[0] - (first.shape[0] - 4 * lobes) // (lobes + 1))
-    parts = [jnp.split(each, count) for each in (first, second)]
-    strong = [jnp.sum(each[2].reshape(-1, lobes, each[2].shape[1]), 0) for each in parts]
-    low, high = jnp.maximum((1 - upper) * strong[0], 0) + _TINY, jnp.maximum(upper * strong[1], 0) + _TINY
-    high = high / (low + high)
-    shares = jnp.tile(high, (3, 1)), high, upper, upper
-    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, shares, strict=True)])
 
 
 @jax.jit
@@ -213,6 +179,14 @@ def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
     place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
     scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)
     return LobeBrdf(place, scale, weight, diffuse, table.knot[1:], table.error)
+
+
+def diffuse(albedo: Float[Array, " c"]) -> LobeBrdf:
+    """The table of an ideal diffuse BRDF: one lobe without weight beside the diffuse part."""
+    rows = albedo[:, None]
+    none = jnp.zeros((1, 2), rows.dtype)
+    up = jnp.stack([none, none, none + 1])
+    return LobeBrdf(up, none, 0 * rows[..., None] + none, rows + none, (), jnp.zeros((), rows.dtype))
 
 
 def tabulate(

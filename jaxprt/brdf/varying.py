@@ -1,0 +1,59 @@
+"""BRDFs that vary over a surface: one for each vertex, and several gray ones side by side."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxprt import require
+
+
+class PerVertex(eqx.Module):
+    """A BRDF for each vertex: a model whose parameters have a leading axis of vertices, every one of them.
+
+    Attributes:
+        model: The model, such as `MetallicRoughness` with textured parameters.
+    """
+
+    model: Callable
+
+    def __check_init__(self):
+        """Refuses parameters of unlike numbers of vertices."""
+        leaves = jax.tree.leaves(self.model)
+        if not leaves or any(not each.ndim for each in leaves):
+            raise ValueError("every parameter of the model must have a leading axis of vertices, got one without")
+        for each in leaves:
+            require.length("the rows of each parameter of the model", each, len(leaves[0]))
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(jax.tree.leaves(self.model)[0])
+
+    def of(self, vertex: Int[Array, "*b"]) -> Callable:
+        """The model of some vertices; of one vertex it has no leading axis."""
+        return jax.tree.map(lambda each: each[vertex], self.model)
+
+    def __call__(self, wi: Float[Array, "v *b 3"], wo: Float[Array, "v *b 3"]) -> Float[Array, "v *b c"]:
+        """Value in 1/sr, of each vertex for its own directions."""
+        return self.model(wi, wo)
+
+
+class Channels(eqx.Module):
+    """Several gray BRDFs as the channels of one, so that one table or factorization holds them all.
+
+    Attributes:
+        model: The BRDFs.
+        scale: Factor of each. What is fitted to all channels together sees their sum, so that typical weights belong
+            here; weights of a `Blend` are then relative to them.
+    """
+
+    model: tuple[Any, ...]
+    scale: Float[Array, " k"]
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b k"]:
+        """Values in 1/sr, times the scales."""
+        return jnp.concatenate([each(wi, wo) for each in self.model], -1) * self.scale

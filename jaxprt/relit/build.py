@@ -1,0 +1,80 @@
+"""Makes scenes ready."""
+
+import os
+import pathlib
+from collections.abc import Mapping
+from concurrent.futures import Executor
+
+from jaxprt import require
+from jaxprt.relit.channels import of_part
+from jaxprt.relit.recipes import SYSTEMS, Job, Recipe
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Scene
+from jaxprt.systems.protocol import Joined
+
+
+def precompute(
+    scene: Scene,
+    *,
+    system: str | Recipe | Mapping[str, str | Recipe] = "lobe",
+    size: int = 64,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> RelitScene:
+    """Makes a scene ready to be relit: traces what its vertices see, and fits the BRDFs of its parts.
+
+    All parts cast shadows on each other.
+
+    Args:
+        scene: The scene, from `jaxprt.load_scene` or made of `jaxprt.Part`.
+        system: "lobe", "harmonic" or "separable"; or sizes of one, such as `jaxprt.relit.Lobes(lobes=8)`; or one of
+            these for each part, by its name.
+        size: Edge of the light's cubemap faces in texels, a power of two.
+        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed; this machine's cores if None.
+        progress: Whether to show progress bars.
+
+    Returns:
+        The scene, ready for `radiance` and `picture`.
+
+    Raises:
+        TypeError: No scene, or a system of another kind.
+        ValueError: There is no such system or part, a part's material is not one that its system can have, or the
+            store at `path` was made from something else.
+    """
+    require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
+    folder = None if path is None else pathlib.Path(path)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    mesh = scene.mesh
+    systems, shadings = [], []
+    for number, part in enumerate(scene.parts):
+        shading = of_part(part)
+        at = folder and folder / f"{number}_{_file_name(part.name)}"
+        job = Job(mesh, size=size, path=at, executor=executor, progress=progress)
+        systems.append(recipes[part.name].make(shading, job))
+        shadings.append(shading)
+    return RelitScene(scene, Joined(tuple(systems)), tuple(shadings))
+
+
+def _recipe(system, name: str, scene: Scene) -> Recipe:
+    """The recipe of a part."""
+    if isinstance(system, Mapping):
+        names = [part.name for part in scene.parts]
+        missing, unknown = (set(a) - set(b) for a, b in ((names, system), (system, names)))
+        if missing or unknown:
+            raise ValueError(f"systems must be given for each of the parts {names}, got {list(system)}")
+        return _recipe(system[name], name, scene)
+    if isinstance(system, str):
+        if system not in SYSTEMS:
+            raise ValueError(f"the system must be one of {', '.join(SYSTEMS)}, got {system!r}")
+        return SYSTEMS[system]
+    require.kind("the system", system, Recipe, source="jaxprt.relit.Lobes, Harmonics, Terms or Clusters")
+    return system
+
+
+def _file_name(name: str) -> str:
+    """A name of a part as that of a folder."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)

@@ -1,0 +1,190 @@
+"""How to make a part of a scene ready for a system: the sizes, and the calls that they take."""
+
+import os
+import pathlib
+from collections.abc import Callable
+from concurrent.futures import Executor
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxprt import visibility
+from jaxprt.brdf import Lambert
+from jaxprt.relit.channels import Shading
+from jaxprt.scene import Mesh
+from jaxprt.systems import bright_texels, harmonic, lobe, separable
+from jaxprt.systems.protocol import System
+from jaxprt.visibility import StoredVisibility
+
+
+class Job(eqx.Module):
+    """Where and of what a part is made ready.
+
+    Attributes:
+        occluder: What casts shadows: all parts.
+        size: Edge of the light's cubemap faces in texels.
+        vertex: Numbers of the vertices to light; all if None.
+        visible: What these see, if it is known already.
+        path: What the names of folders begin with; None keeps nothing.
+        executor: Where blocks are computed; this machine's cores if None.
+        progress: Whether to show progress bars.
+    """
+
+    occluder: Mesh
+    size: int = 64
+    vertex: np.ndarray | None = None
+    visible: StoredVisibility | None = None
+    path: str | os.PathLike | None = None
+    executor: Executor | None = None
+    progress: bool = True
+
+    def options(self, name: str) -> dict:
+        """Options of every `precompute`, for a folder of a name."""
+        path = None if self.path is None else pathlib.Path(f"{self.path}_{name}.prt")
+        return {"path": path, "executor": self.executor, "progress": self.progress}
+
+    def traced(self) -> dict:
+        """Options of those that trace rays."""
+        return {"occluder": self.occluder, "vertex": self.vertex}
+
+
+@runtime_checkable
+class Recipe(Protocol):
+    """Sizes for one system, and how a part is made ready with them."""
+
+    def make(self, shading: Shading, job: Job) -> System:
+        """The system of a part."""
+        ...
+
+
+class Lobes(eqx.Module):
+    """The lobe system, with the brightest texels summed exactly.
+
+    Attributes:
+        lobes: Lobes of the BRDF.
+        texels: Brightest texels that are summed one by one; 0 for none.
+    """
+
+    lobes: int = 12
+    texels: int = 16
+
+    def make(self, shading: Shading, job: Job) -> System:
+        """The system of a part."""
+        if job.visible is None:
+            transport = lobe.precompute(shading.mesh, size=job.size, **job.traced(), **job.options("lobe"))
+        else:
+            transport = lobe.compress(job.visible)
+        if isinstance(shading.brdf, Lambert):
+            table = lobe.diffuse(shading.brdf.albedo)
+        else:
+            table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
+        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, job.size)
+
+
+class Harmonics(eqx.Module):
+    """The harmonic system: transfer vectors for what is ideally diffuse, matrices for all else.
+
+    Attributes:
+        degree: Highest degree of the harmonics.
+        laplacian: Share of the light's squared Laplacian that is kept for what is not diffuse; 1 for no window.
+    """
+
+    degree: int = 4
+    laplacian: float = 1.0
+
+    def make(self, shading: Shading, job: Job) -> System:
+        """The system of a part."""
+        options = {"degree": self.degree, **job.traced()}
+        if isinstance(shading.brdf, Lambert):
+            vectors = harmonic.precompute_diffuse(shading.mesh, **options, **job.options(f"vectors_{self.degree}"))
+            return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
+        table = harmonic.tabulate(shading.brdf, degree=self.degree, knot=shading.knot)
+        matrices = harmonic.precompute(shading.mesh, **options, **job.options(f"matrices_{self.degree}"))
+        return harmonic.HarmonicSystem(matrices, table, self.laplacian)
+
+
+class Terms(eqx.Module):
+    """The separable system with sparse transport.
+
+    Attributes:
+        terms: BRDF terms; what is ideally diffuse has one.
+        keep: Wavelet coefficients of each vertex and term.
+    """
+
+    terms: int = 4
+    keep: int = 96
+
+    def make(self, shading: Shading, job: Job) -> System:
+        """The system of a part."""
+        _refuse_knots(shading)
+        factored = separable.factor(shading.brdf, terms=1 if isinstance(shading.brdf, Lambert) else self.terms)
+        options = {"keep": self.keep, "size": job.size, **job.traced(), **job.options("separable")}
+        return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
+
+
+class Clusters(eqx.Module):
+    """The separable system compressed over clusters of vertices, with the brightest texels summed exactly.
+
+    Attributes:
+        terms: BRDF terms.
+        resolution: Edge of their maps in texels.
+        vectors: Principal components along the vertices of a cluster.
+        modes: Principal components along the light.
+        keep: Wavelet coefficients of each cluster.
+        texels: Brightest texels that are summed one by one.
+        members: Vertices of a cluster, about.
+    """
+
+    terms: int = 32
+    resolution: int = 64
+    vectors: int = 16
+    modes: int = 80
+    keep: int = 768
+    texels: int = 16
+    members: int = 225
+
+    def make(self, shading: Shading, job: Job) -> System:
+        """The system of a part."""
+        _refuse_knots(shading)
+        visible = job.visible
+        if visible is None:
+            options = {**job.traced(), **job.options("visibility")}
+            visible = visibility.precompute(shading.mesh, size=job.size, **options)
+        count = len(visible.position)
+        clusters = max(1, round(count / self.members))
+        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
+        factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
+        vectors, keep = min(self.vectors, count // clusters), min(self.keep, 6 * visible.size**2)
+        limits = {"vectors": vectors, "modes": min(self.modes, keep, vectors * terms), "keep": keep}
+        options = job.options("clusters")
+        transport = separable.clustered.precompute(visible, factored, clusters=clusters, **limits, **options)
+        system = separable.SeparableSystem(transport, factored)
+        return _bright(system, visible, shading, self.texels, visible.size)
+
+
+SYSTEMS: dict[str, Recipe] = {
+    "harmonic": Harmonics(laplacian=0.4),
+    "lobe": Lobes(),
+    "separable": Terms(),
+}
+
+
+def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:
+    """A system with single texels, if any are asked for."""
+    texels = min(texels, 6 * size * size - 1)
+    if not texels:
+        return system
+    sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
+    samples = bright_texels.samples_for(sharpest, size=size)
+    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
+
+
+def _refuse_knots(shading: Shading) -> None:
+    if shading.knot:
+        low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
+        raise ValueError(
+            f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
+            f"{high:.2f}: take the lobe or the harmonic system"
+        )

@@ -1,0 +1,49 @@
+"""Lobes between the knots of a table whose parameters differ from view to view."""
+
+import itertools
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_TINY = 1e-12
+
+
+def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> Float[Array, "r v"]:
+    """Rows of a table for views that each have parameters of their own: between knots first, then between nodes.
+
+    Args:
+        row: Means, logarithms of concentrations, weights and diffuse albedos of all lobes, on knots and nodes.
+        knot: Lower neighbor and share of the upper one, for each parameter of each view.
+        axis: The same for the nodes of the view.
+        lobes: Number of lobes.
+    """
+    sizes, nodes = row.shape[1 : 1 + len(knot)], row.shape[1 + len(knot) :]
+    flat = row.reshape(len(row), -1)
+
+    def read(index: Array, node: Array, left: list) -> Array:
+        """Rows at a node, between the knots of the parameters that are left."""
+        if not left:
+            return flat.at[:, index * math.prod(nodes) + node].get(mode="promise_in_bounds")
+        size, (low, upper) = left[0]
+        first, second = (read(index * size + low + up, node, left[1:]) for up in (0, 1))
+        return _merged(first, second, upper, lobes=lobes)
+
+    total = jnp.zeros((), row.dtype)
+    for corner in itertools.product((0, 1), repeat=len(axis)):
+        node, weight = jnp.zeros((), jnp.int32), jnp.ones((), row.dtype)
+        for up, size, (low, share) in zip(corner, nodes, axis, strict=True):
+            node, weight = node * size + low + up, weight * (share if up else 1 - share)
+        total = total + weight * read(jnp.zeros((), jnp.int32), node, list(zip(sizes, knot, strict=True)))
+    return total
+
+
+def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
+    """Rows of lobes between those of two knots, as `jaxprt.systems.lobe.table.mean` has it."""
+    count = (3 * lobes, 4 * lobes, first.shape[0] - (first.shape[0] - 4 * lobes) // (lobes + 1))
+    parts = [jnp.split(each, count) for each in (first, second)]
+    strong = [jnp.sum(each[2].reshape(-1, lobes, each[2].shape[1]), 0) for each in parts]
+    low, high = jnp.maximum((1 - upper) * strong[0], 0) + _TINY, jnp.maximum(upper * strong[1], 0) + _TINY
+    high = high / (low + high)
+    shares = jnp.tile(high, (3, 1)), high, upper, upper
+    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, shares, strict=True)])
