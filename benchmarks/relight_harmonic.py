@@ -23,9 +23,8 @@ from benchmarks import harness
 from benchmarks.precompute_separable import Recorder, embree_alone
 from jaxprt import harmonic, reference, scene, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.cli import report
 from jaxprt.scene import Mesh, builtin, load_mesh
-from jaxprt.sphere import directions, rotation
+from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems.harmonic import TransferMatrix
 
 DEGREE = 4
@@ -33,6 +32,12 @@ DEGREE = 4
 PAPER = {"buddha": (4.05, 3.22, 15.6, 127.0), "teapot": (2.0, 1.64, 9.5, 48.9)}
 MESHES = {"buddha": "happy_buddha_100k.ply", "dragon": "dragon_100k.ply", "nefertiti": "nefertiti.ply"}
 LIGHTS = {"grace": "grace_cross.hdr", "eucalyptus": "eucalyptus_rnl_cross.hdr", "sunrise": "polyhaven_sunrise_1k.exr"}
+WINDOWS = {
+    "none": lambda light: jnp.ones(harmonics.degree_of(len(light)) + 1),
+    "hann": lambda light: harmonics.hann(degree=harmonics.degree_of(len(light))),
+    "lanczos": lambda light: harmonics.lanczos(degree=harmonics.degree_of(len(light))),
+    "laplacian": lambda light: harmonics.least_laplacian(light, jnp.asarray(0.4)),
+}
 BRDFS = {
     "matte": Lambert(0.8),
     "glossy (12, 4)": AshikhminShirley(nu=12, nv=4),
@@ -141,8 +146,9 @@ def errors(quick: bool) -> list[dict]:
             for order in orders:
                 matrix = full.matrix[..., : order**2, : order**2]
                 short, few = TransferMatrix(matrix, full.position, full.frame), table.truncate(degree=order - 1)
-                for window in report.WINDOWS:
-                    coefficient = report.harmonic_light(light, order=order, window=window)
+                for window in WINDOWS:
+                    coefficient = harmonic.project(light, degree=order - 1)
+                    coefficient = harmonics.convolve(coefficient, WINDOWS[window](coefficient))
                     call = lambda s=short, f=few, c=coefficient: harmonic.radiance(s, f, c, eye=eye)  # noqa: E731
                     color = call()
                     lines.append(
@@ -200,7 +206,7 @@ def plot(lines: list[dict], path: pathlib.Path) -> None:
     figure, axes = pyplot.subplots(1, len(lights), figsize=(5 * len(lights), 4), sharey=True, squeeze=False)
     for panel, light in zip(axes[0], lights, strict=True):
         for name in BRDFS:
-            for window, style in zip(report.WINDOWS, ("-", "--", ":", "-."), strict=True):
+            for window, style in zip(WINDOWS, ("-", "--", ":", "-."), strict=True):
                 row = [x for x in lines if (x["light"], x["brdf"], x["window"]) == (light, name, window)]
                 time_each = [1e9 * x["seconds"] / x["vertices"] for x in row]
                 panel.loglog(time_each, [x["error"] for x in row], style, marker="o", label=f"{name}, {window}")

@@ -16,8 +16,8 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-from jaxprt import brdf, decompose, files, image, inverse, plan, relit, scene, sphere, visibility
-from jaxprt.relit import RelitScene, precompute
+from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, visibility
+from jaxprt.relit import RelitScene, plan, precompute
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total

@@ -19,7 +19,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "cli", "inverse", "relit", "plan", "systems", "image", "visibility", "scene", "brdf"]
+ROOMS = ["__main__", "cli", "inverse", "relit", "systems", "image", "visibility", "scene", "brdf"]
 ROOMS += ["decompose", "sphere", "files", "compile", "require"]
 
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.

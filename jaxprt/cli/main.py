@@ -12,15 +12,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
 import jaxprt as prt
 from jaxprt.cli import animation, report
-from jaxprt.cli.report import Part, Scene
-from jaxprt.scene import Environment
+from jaxprt.cli.report import Made, View
+from jaxprt.relit.recipes import Recipe
+from jaxprt.scene import Environment, Part, Scene
 
-SYSTEMS = ("separable", "harmonic", "lobe", "dynamic")
+SYSTEMS = ("planned", "separable", "harmonic", "lobe", "dynamic")
+_LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # share of the squared Laplacian that each window leaves
 # Turns that bring an axis of the file to +y.
 _UPRIGHT = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -33,6 +36,7 @@ _RANGES = (
     (("order",), "from 1 to 15", lambda x: 1 <= x <= 15),
     (("lobes",), "from 1 to 64", lambda x: 1 <= x <= 64),
     (("animate",), "at least 2", lambda x: x >= 2),
+    (("error",), "positive and less than 1", lambda x: 0 < x < 1),
     (("roughness", "f0"), "from 0 to 1", lambda x: 0 <= x <= 1),
     (("nu", "nv"), "positive and finite", lambda x: 0 < x < np.inf),
     (("diffuse", "specular"), "not negative and finite", lambda x: 0 <= x < np.inf),
@@ -58,11 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m jaxprt", description=__doc__)
-    parser.add_argument("--mesh", type=Path, help="PLY, OBJ, STL, OFF, GLB or glTF; an embedded scene if not given")
+    parser.add_argument("--mesh", type=Path, help="GLB, glTF, OBJ, PLY, STL or OFF; an embedded scene if not given")
     parser.add_argument("--up", choices=list(_UPRIGHT), default="y", help="axis of the file that points up (default y)")
     parser.add_argument("--environment", type=Path, nargs="+", metavar="FILE", help="EXR or HDR; embedded if not given")
     parser.add_argument(
-        "--brdf", choices=["ashikhmin-shirley", "cook-torrance", "lambert"], help="default ashikhmin-shirley"
+        "--brdf",
+        choices=["ashikhmin-shirley", "cook-torrance", "lambert"],
+        help="instead of the file's materials; matte gray if it has none",
     )
     parser.add_argument("--diffuse", type=float, nargs="+", default=[0.5], help="gray or three colors (default 0.5)")
     parser.add_argument("--specular", type=float, nargs="+", default=[0.75], help="gray or three colors (default 0.75)")
@@ -77,9 +83,12 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar=("REGION", "DIFFUSE", "SPECULAR", "ROUGHNESS", "F0"),
-        help="of one of the scene's regions, numbered from 0, Cook-Torrance's model; can change in the dynamic system",
+        help="of one of the scene's parts, numbered from 0, Cook-Torrance's model; can change in the dynamic system",
     )
-    parser.add_argument("--system", choices=SYSTEMS, nargs="+", help="one, or several")
+    parser.add_argument(
+        "--system", choices=SYSTEMS, nargs="+", help="one, or several; planned (default) finds one for each part"
+    )
+    parser.add_argument("--error", type=float, help="relative error that the planned system must meet (default 0.05)")
     parser.add_argument("--bounces", type=int, choices=[0, 1, 2], help="of light, in the dynamic system (default 2)")
     parser.add_argument(
         "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"
@@ -90,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         "--order", type=int, default=5, help="bands of the harmonic system (default 5: 25 coefficients)"
     )
     parser.add_argument(
-        "--window", choices=list(report.WINDOWS), default="laplacian", help="against ringing on what is glossy"
+        "--window", choices=list(_LAPLACIAN), default="laplacian", help="against ringing on what is glossy"
     )
     parser.add_argument(
         "--lobes", type=int, default=12, help="lobes of the glossy BRDF in the lobe system (default 12)"
@@ -121,6 +130,8 @@ def _check(options: argparse.Namespace) -> None:
                 "--material must be the number of a region and four numbers from 0 to 1, got "
                 f"{' '.join(f'{x:g}' for x in (region, *numbers))}"
             )
+    if options.error is not None and "planned" not in (options.system or ["planned"]):
+        raise ValueError("--error needs --system planned")
     for name in ("animate", "bounces"):
         if getattr(options, name) is not None and "dynamic" not in (options.system or ()):
             raise ValueError(f"--{name} needs --system dynamic")
@@ -128,78 +139,82 @@ def _check(options: argparse.Namespace) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     _check(options)
-    scene = _scene(options)
+    view = _view(options)
     options.output.mkdir(parents=True, exist_ok=True)
-    told = _describe(scene, options)
-    print(f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in scene.parts)} vertices")
-    _warn_of_backs(scene)
-    systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["separable"])
-    ready, changing = {}, None
+    found = _describe(view, options)
+    print(
+        f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in view.scene.parts)} vertices"
+    )
+    _warn_of_backs(view)
+    systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["planned"])
+    made, changing = {}, None
     for system in systems:
-        if system == "separable":
-            ready[system] = report.relight_separable(scene, options.output, keep=options.keep)
-        elif system == "harmonic":
-            ready[system] = report.relight_harmonic(scene, options.output, order=options.order, window=options.window)
-        elif system == "lobe":
-            ready[system] = report.relight_lobe(scene, options.output, lobes=options.lobes)
-        else:
-            changing = animation.prepare(
-                scene, options.output, bounces=2 if options.bounces is None else options.bounces
-            )
+        if system == "dynamic":
+            count = 2 if options.bounces is None else options.bounces
+            changing = animation.prepare(view, options.output, terms=options.terms, reflections=count)
             # The exact pictures have direct light alone, and so has what is compared with them.
-            ready[system] = animation.relit(changing._replace(tensor=None), scene)
-    told["precompute"] = {system: each.told for system, each in ready.items()}
-    start, seen = time.perf_counter(), report.seen(scene)
-    exact = report.exact(scene, seen)
-    told["reference_seconds"] = time.perf_counter() - start
-    told["lights"] = {
-        name: report.compare(scene, name, ready, [each[number] for each in exact], seen, options.output)
-        for number, name in enumerate(scene.lights)
+            made[system] = animation.made(changing, view, reflected=False)
+        else:
+            made[system] = _made(system, view, options)
+    found["precompute"] = {system: each.cost for system, each in made.items()}
+    start, seen = time.perf_counter(), report.seen(view)
+    exact = report.exact(view, seen)
+    found["reference_seconds"] = time.perf_counter() - start
+    found["lights"] = {
+        name: report.compare(view, name, made, [each[number] for each in exact], seen, options.output)
+        for number, name in enumerate(view.lights)
     }
     if changing is not None:
-        ready["dynamic"] = animation.relit(changing, scene)
-        for name, light in told["lights"].items() if changing.tensor is not None else ():
+        made["dynamic"] = animation.made(changing, view, reflected=True)
+        for name, light in found["lights"].items() if changing.reflected is not None else ():
             stops = light["exposure_stops"]
-            light["dynamic"]["reflected_share"] = animation.reflect(changing, scene, name, stops, options.output)
+            light["dynamic"]["reflected_share"] = animation.reflect(changing, view, name, stops, options.output)
         if options.animate:
-            animation.animate(changing, scene, options.output, frames=options.animate)
-    told["times"] = {system: report.times(scene, each) for system, each in ready.items()}
+            animation.animate(changing, view, options.output, frames=options.animate)
+    found["times"] = {system: report.times(view, each) for system, each in made.items()}
     if options.table:
-        vertex = report.sample(scene, options.table)
-        truth = report.exact(scene, [vertex])[0]
-        tables = {"separable": report.table_separable, "harmonic": report.table_harmonic, "lobe": report.table_lobe}
-        told["table"] = [row for system in systems if system in tables for row in tables[system](scene, vertex, truth)]
+        vertex = report.sample(view, options.table)
+        truth = report.exact(view, [vertex])[0]
+        chosen = [system for system in systems if system in report.TABLES]
+        found["table"] = [row for system in chosen for row in report.table(system, view, vertex, truth)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    told["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
+    found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
     path = options.output / "report.json"
-    path.write_text(json.dumps(told, indent=2) + "\n")
-    _tell(told, path)
+    path.write_text(json.dumps(found, indent=2) + "\n")
+    _tell(found, path)
 
 
-def _scene(options: argparse.Namespace) -> Scene:
-    terms = 1 if options.brdf == "lambert" else options.terms
-    if options.mesh is None:
-        pieces, light, dark = prt.scene.mesh.split(prt.scene.builtin.chess())
-        parts = [
-            Part("pieces", pieces, _brdf(options), terms),
-            Part("light squares", light, prt.brdf.Lambert([0.6, 0.55, 0.45]), 1),
-            Part("dark squares", dark, prt.brdf.Lambert([0.12, 0.08, 0.06]), 1),
-        ]
+def _made(system: str, view: View, options: argparse.Namespace) -> Made:
+    """The scene, made ready by one system."""
+    size = next(iter(view.lights.values())).radiance.shape[-2]
+    recipes: dict[str, Recipe] | Recipe
+    if system == "planned":
+        error = 0.05 if options.error is None else options.error
+        chosen = prt.plan(view.scene, environments=list(view.lights.values()), error=error)
+        print(chosen)
+        recipes = chosen.recipes
+    elif system == "separable":
+        recipes = prt.relit.Terms(options.terms, options.keep)
+    elif system == "harmonic":
+        recipes = prt.relit.Harmonics(options.order - 1, _LAPLACIAN[options.window])
     else:
-        mesh = prt.scene.mesh.turn(prt.scene.load_mesh(options.mesh), np.array(_UPRIGHT[options.up]))
-        parts = [Part("object", mesh, _brdf(options), terms)]
-        if options.material and len(np.unique(np.asarray(mesh.region))) > 1:
-            regions = enumerate(prt.scene.mesh.split(mesh))
-            parts = [Part(f"region {number}", each, _brdf(options), terms) for number, each in regions]
-        if options.ground:
-            parts.append(Part("ground", prt.scene.mesh.ground_plane(mesh), prt.brdf.Lambert(0.5), 1))
-    for region, diffuse, specular, roughness, f0 in options.material:
-        if region >= len(parts):
-            raise ValueError(f"--material must name one of regions 0 to {len(parts) - 1}, got {region:g}")
+        recipes = prt.relit.Lobes(options.lobes)
+    return report.make(view, recipes, options.output / system, size=size)
+
+
+def _view(options: argparse.Namespace) -> View:
+    """The scene, its lights, and the camera."""
+    scene = _embedded(options) if options.mesh is None else _loaded(options)
+    parts = list(scene.parts)
+    for number, diffuse, specular, roughness, f0 in options.material:
+        if number >= len(parts):
+            raise ValueError(f"--material must name one of parts 0 to {len(parts) - 1}, got {number:g}")
         brdf = prt.brdf.CookTorrance(diffuse=diffuse, specular=specular, roughness=roughness, f0=f0)
-        parts[int(region)] = parts[int(region)]._replace(brdf=brdf, terms=options.terms)
+        parts[int(number)] = _with(parts[int(number)], brdf)
     if options.environment:
         lights = _load_lights(options.environment)
+    elif scene.environments:
+        lights = {f"light_{number}": each for number, each in enumerate(scene.environments)}
     else:
         lights = {"daylight": prt.scene.builtin.daylight(), "studio": prt.scene.builtin.studio()}
     texels = 6 * next(iter(lights.values())).radiance.shape[-2] ** 2
@@ -207,7 +222,43 @@ def _scene(options: argparse.Namespace) -> Scene:
         raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
     edge = {"width": options.size, "height": options.size}
-    return Scene(parts, lights, prt.scene.camera.orbit(parts[0].mesh, azimuth=azimuth, elevation=elevation, **edge))
+    whole = Scene(parts[:-1] if options.ground else parts).mesh
+    return View(Scene(parts), lights, prt.scene.camera.orbit(whole, azimuth=azimuth, elevation=elevation, **edge))
+
+
+def _embedded(options: argparse.Namespace) -> Scene:
+    """Chess pieces on a board."""
+    if options.ground:
+        raise ValueError("--ground needs --mesh: the embedded scene has a board")
+    pieces, light, dark = prt.scene.mesh.split(prt.scene.builtin.chess())
+    brdf = _brdf(options) or prt.brdf.AshikhminShirley(
+        diffuse=options.diffuse, specular=options.specular, nu=options.nu, nv=options.nv
+    )
+    return Scene(
+        [
+            Part("pieces", pieces, brdf),
+            Part("light squares", light, prt.brdf.Lambert([0.6, 0.55, 0.45])),
+            Part("dark squares", dark, prt.brdf.Lambert([0.12, 0.08, 0.06])),
+        ]
+    )
+
+
+def _loaded(options: argparse.Namespace) -> Scene:
+    """The file's scene, upright, on its ground if one is asked for."""
+    scene, brdf = prt.load_scene(options.mesh), _brdf(options)
+    turn = np.array(_UPRIGHT[options.up])
+    parts = [eqx.tree_at(lambda each: each.mesh, part, prt.scene.mesh.turn(part.mesh, turn)) for part in scene.parts]
+    if brdf is not None:
+        parts = [_with(part, brdf) for part in parts]
+    if options.ground:
+        ground = prt.scene.mesh.ground_plane(Scene(parts).mesh)
+        parts.append(Part("ground", ground, prt.brdf.Lambert(0.5)))
+    return Scene(parts, environments=scene.environments)
+
+
+def _with(part: Part, brdf: Callable) -> Part:
+    """The part, of another BRDF."""
+    return Part(part.name, part.mesh, brdf)
 
 
 def _load_lights(paths: Sequence[Path]) -> dict[str, Environment]:
@@ -219,7 +270,10 @@ def _load_lights(paths: Sequence[Path]) -> dict[str, Environment]:
     return lights
 
 
-def _brdf(options: argparse.Namespace) -> Callable:
+def _brdf(options: argparse.Namespace) -> Callable | None:
+    """The BRDF that is asked for, if one is."""
+    if options.brdf is None:
+        return None
     if options.brdf == "lambert":
         return prt.brdf.Lambert(options.diffuse)
     if options.brdf == "cook-torrance":
@@ -228,13 +282,15 @@ def _brdf(options: argparse.Namespace) -> Callable:
     return prt.brdf.AshikhminShirley(diffuse=options.diffuse, specular=options.specular, nu=options.nu, nv=options.nv)
 
 
-def _describe(scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
+def _describe(view: View, options: argparse.Namespace) -> dict[str, Any]:
     """What is relit, where and by what: the head of the report."""
 
     def values(module):
-        return {name: np.asarray(value).tolist() for name, value in vars(module).items()}
+        leaves = {name: value for name, value in vars(module).items() if isinstance(value, jax.Array | float | int)}
+        return {name: np.asarray(value).tolist() for name, value in leaves.items()}
 
-    files = options.environment or ["embedded"] * len(scene.lights)
+    files = options.environment or ["embedded"] * len(view.lights)
+    parts = view.scene.parts
     return {
         "machine": {
             "processor": platform.processor() or platform.machine(),
@@ -246,44 +302,40 @@ def _describe(scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
         "mesh": str(options.mesh or "embedded"),
         "up": options.up,
         "ground": options.ground,
-        "environments": {name: str(file) for name, file in zip(scene.lights, files, strict=True)},
-        "vertices": {part.name: len(part.mesh.position) for part in scene.parts},
-        "brdf": {part.name: {"model": type(part.brdf).__name__, **values(part.brdf)} for part in scene.parts},
-        "camera": values(scene.camera),
+        "environments": {name: str(file) for name, file in zip(view.lights, files, strict=True)},
+        "vertices": {part.name: len(part.mesh.position) for part in parts},
+        "brdf": {part.name: {"model": type(part.material).__name__, **values(part.material)} for part in parts},
+        "camera": values(view.camera),
     }
 
 
-def _warn_of_backs(scene: Scene) -> None:
+def _warn_of_backs(view: View) -> None:
     """Tells on stderr where the normals of most triangles in the picture point away, as in an inside-out mesh."""
-    mesh, triangle = scene.parts[0].mesh, report.visible(scene)
+    mesh, triangle = view.scene.parts[0].mesh, report.visible(view)
     corner = np.asarray(mesh.face)[triangle[triangle < len(mesh.face)]]
     normal, position = (np.asarray(field)[corner].mean(1) for field in (mesh.normal, mesh.position))
-    away = np.sum(normal * (np.asarray(scene.camera.eye) - position), 1) < 0
+    away = np.sum(normal * (np.asarray(view.camera.eye) - position), 1) < 0
     if 2 * np.sum(away) > len(away):
-        told = f"{np.sum(away)} of {len(away)} triangles in the picture face away and will be black"
-        print(f"jaxprt: warning: {told}: is the mesh inside out, with clockwise faces?", file=sys.stderr)
+        message = f"{np.sum(away)} of {len(away)} triangles in the picture face away and will be black"
+        print(f"jaxprt: warning: {message}: is the mesh inside out, with clockwise faces?", file=sys.stderr)
 
 
-def _tell(told: dict[str, Any], path: Path) -> None:
-    for name, light in told["lights"].items():
-        for system in told["times"]:
+def _tell(found: dict[str, Any], path: Path) -> None:
+    for name, light in found["lights"].items():
+        for system in found["times"]:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
             error = light[system]["image_error"]
             print(f"{name}, {system}: relative L2 error of the picture {error:.1%}; of vertex radiance: {parts}")
             if "reflected_share" in light[system]:
                 share = light[system]["reflected_share"]
                 print(f"{name}, {system}: {share:.1%} of the picture's light comes from other surfaces")
-    for system, times in told["times"].items():
+    for system, times in found["times"].items():
         milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
         print(f"{system}: {milliseconds.replace('_', ' ')}")
-    for row in told.get("table", []):
+    for row in found.get("table", []):
         print(
             "  ".join(
                 f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
             )
         )
     print(f"pictures and {path.name} are in {path.parent}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

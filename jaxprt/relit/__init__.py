@@ -1,7 +1,8 @@
 """Scenes made ready to be relit, by any of the systems."""
 
-from jaxprt.relit import build, channels, recipes, scene
+from jaxprt.relit import build, channels, planning, recipes, scene
 from jaxprt.relit.build import precompute
+from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
 from jaxprt.relit.scene import RelitScene
 
@@ -9,10 +10,13 @@ __all__ = [
     "Clusters",
     "Harmonics",
     "Lobes",
+    "Plan",
     "RelitScene",
     "Terms",
     "build",
     "channels",
+    "plan",
+    "planning",
     "precompute",
     "recipes",
     "scene",

@@ -2,22 +2,29 @@
 
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 
+import tqdm
+
 from jaxprt import require
+from jaxprt.files import objects
 from jaxprt.relit.channels import of_part
+from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import SYSTEMS, Job, Recipe
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Scene
+from jaxprt.scene import Environment, Scene
 from jaxprt.systems.protocol import Joined
 
 
 def precompute(
     scene: Scene,
     *,
-    system: str | Recipe | Mapping[str, str | Recipe] = "lobe",
-    size: int = 64,
+    system: str | Recipe | Mapping[str, str | Recipe] | None = None,
+    error: float = 0.05,
+    environments: Sequence[Environment] | None = None,
+    rate: float = 30.0,
+    size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -30,7 +37,11 @@ def precompute(
         scene: The scene, from `jaxprt.load_scene` or made of `jaxprt.Part`.
         system: "lobe", "harmonic" or "separable"; or sizes of one, such as `jaxprt.relit.Lobes(lobes=8)`; or one of
             these for each part, by its name.
-        size: Edge of the light's cubemap faces in texels, a power of two.
+            If None, `jaxprt.plan` chooses for each part what meets the error with the fewest bytes.
+        error: Relative L2 error of the radiance of each part, for the plan.
+        environments: Lights that the error must hold for, for the plan; see `jaxprt.plan`.
+        rate: Frames per second with new light and new view, for the plan.
+        size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None.
         progress: Whether to show progress bars.
@@ -44,10 +55,14 @@ def precompute(
             store at `path` was made from something else.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+    if system is None:
+        wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
+        system, size = wanted.recipes, wanted.size if size is None else size
+    size = 64 if size is None else size
+    recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     mesh = scene.mesh
     systems, shadings = [], []
     for number, part in enumerate(scene.parts):
@@ -57,6 +72,25 @@ def precompute(
         systems.append(recipes[part.name].make(shading, job))
         shadings.append(shading)
     return RelitScene(scene, Joined(tuple(systems)), tuple(shadings))
+
+
+def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
+    """The plan, made once for a folder."""
+    kept = folder and folder / "plan"
+    if kept is not None and kept.exists():
+        found = objects.load(kept)
+        if found.asked == options["error"] and found.rate == options["rate"]:
+            return found
+        raise ValueError(
+            f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
+            f"got {options['error']:g} at {options['rate']:g}: name another path"
+        )
+    made = plan(scene, **options)
+    if options["progress"]:
+        tqdm.tqdm.write(str(made))
+    if kept is not None:
+        objects.save(kept, made)
+    return made
 
 
 def _recipe(system, name: str, scene: Scene) -> Recipe:

@@ -161,7 +161,7 @@ class Clusters(eqx.Module):
         options = job.options("clusters")
         transport = separable.clustered.precompute(visible, factored, clusters=clusters, **limits, **options)
         system = separable.SeparableSystem(transport, factored)
-        return _bright(system, visible, shading, self.texels, visible.size)
+        return _bright(system, lobe.bits(lobe.compress(visible)), shading, self.texels, visible.size)
 
 
 SYSTEMS: dict[str, Recipe] = {

@@ -36,18 +36,16 @@ def small(coarse):
     """Coarse maps, skies and ground: what the command does with them is the same."""
     with pytest.MonkeyPatch.context() as patch:
         for room, name, options in (
-            (prt.separable.factorization, "factor", {"resolution": 8}),
+            (prt.separable, "factor", {"resolution": 8}),
             (prt.scene, "load_environment", {"size": 8}),
-            (prt.separable.wavelets, "precompute", {"size": 8}),
-            (prt.harmonic.transfer, "precompute", {"size": 8}),
-            (prt.harmonic.transfer, "precompute_diffuse", {"size": 8}),
-            (prt.harmonic.table, "tabulate", {"resolution": 8, "error": 1.0}),
-            (prt.lobe.pyramid, "precompute", {"size": 8}),
-            (prt.lobe.table, "tabulate", {"resolution": 8}),
-            (prt.bounces.functions, "factor", {"functions": 2, "terms": 4}),
+            (prt.harmonic, "precompute", {"size": 8}),
+            (prt.harmonic, "precompute_diffuse", {"size": 8}),
+            (prt.harmonic, "tabulate", {"resolution": 8, "error": 1.0}),
+            (prt.lobe, "tabulate", {"resolution": 8}),
+            (prt.bounces, "factor", {"functions": 2, "terms": 4}),
             (prt.scene.mesh, "ground_plane", {"vertices": 49}),
-            (prt.dynamic.transport, "precompute", {"size": 8}),
-            (prt.bounces.tensor, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
+            (prt.dynamic, "precompute", {"size": 8}),
+            (prt.bounces, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
             patch.setattr(room, name, functools.partial(getattr(room, name), **options))
         for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
@@ -76,7 +74,8 @@ def run(place, *more, mesh="mesh.obj", sky=("sky.exr",), output=None):
     output = output or place / "out"
     files = ["--mesh", str(place / mesh), "--environment", *[str(place / name) for name in sky]]
     options = ["--size", "32", "--brdf", "lambert", "--keep", "8", "--output", str(output)]
-    return main([*files, *options, *more])
+    system = [] if "--system" in more else ["--system", "separable"]
+    return main([*files, *options, *system, *more])
 
 
 def numbers(tree):
@@ -111,8 +110,7 @@ def test_pictures_and_report_are_written(output):
     kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
     names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
     expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
-    stores = {f"{part}{suffix}.prt" for part in ("object", "ground") for suffix in ("", "_order_5", "_lobe")}
-    assert {path.name for path in output.iterdir()} == expected | stores | {"report.json"}
+    assert {path.name for path in output.iterdir()} == expected | set(SYSTEMS) | {"report.json"}
     for name in expected:
         assert (output / name).stat().st_size > 50
     picture, _ = prt.files.read_image(output / "sky_harmonic.exr")
@@ -128,17 +126,17 @@ def test_the_systems_stand_side_by_side_before_the_reference(output):
 
 def test_the_report_is_json_of_finite_numbers(output):
     told = report(output)
-    assert told["vertices"] == {"object": 4, "ground": 49}
+    assert told["vertices"] == {"mesh": 4, "ground": 49}
     assert set(told["lights"]) == {"sky", "dusk"}
     for light in told["lights"].values():
         for system in SYSTEMS:
             assert 0 < light[system]["image_error"] < 0.5
-            assert set(light[system]["vertex_error"]) == {"object", "ground"}
-    assert told["precompute"]["separable"]["object"]["keep"] == 8
-    assert told["precompute"]["harmonic"]["object"]["coefficients"] == 25
-    assert told["precompute"]["lobe"]["object"]["lobes"] == 0  # it is diffuse
-    assert told["precompute"]["lobe"]["object"]["exact_texels"] == 16
-    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("object", "ground")}
+            assert set(light[system]["vertex_error"]) == {"mesh", "ground"}
+    assert told["precompute"]["separable"]["mesh"]["keep"] == 8
+    assert told["precompute"]["harmonic"]["mesh"]["degree"] == 4
+    assert told["precompute"]["lobe"]["mesh"]["texels"] == 16
+    assert told["precompute"]["lobe"]["bytes"] > 0
+    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("mesh", "ground")}
     assert min(numbers(told["times"])) > 0
     assert told["peak_bytes"] > 1e7
 
@@ -164,7 +162,7 @@ def test_the_pictures_differ_by_what_the_report_says(output):
 
 def test_a_second_run_takes_the_transport_from_the_first(place, output, capsys):
     before = report(output)
-    stored = {path: path.stat().st_mtime_ns for path in output.glob("*.prt/**/*") if path.is_file()}
+    stored = {path: path.stat().st_mtime_ns for path in output.glob("*/*.prt/**/*") if path.is_file()}
     assert run(place, *WHOLE, sky=("sky.exr", "dusk.exr"), output=output) == 0
     told = capsys.readouterr()
     assert "pictures and report.json are in" in told.out
@@ -182,10 +180,10 @@ def glossy(place):
     (folder / "other").mkdir(parents=True)
     shutil.copy(place / "dusk.exr", folder / "other" / "sky.exr")
     options = ["--table", "3", "--terms", "2", "--diffuse", "0.2", "0.3", "0.4", "--specular", "0.1", "--nu", "10"]
-    options += ["--system", *SYSTEMS, "--order", "4", "--window", "hann", "--lobes", "1"]
+    options += ["--system", *SYSTEMS, "--order", "4", "--window", "none", "--lobes", "1"]
     options += ["--brdf", "ashikhmin-shirley"]
     with pytest.MonkeyPatch.context() as patch:
-        for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("ORDERS", (2, 4)), ("LOBES", (1,))):
+        for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("DEGREES", (1, 3)), ("LOBES", (1,))):
             patch.setattr(f"jaxprt.cli.report.TABLE_{name}", values)
         assert run(place, *options, sky=("sky.exr", "glossy/other/sky.exr"), output=folder) == 0
     return folder
@@ -195,17 +193,17 @@ def test_glossy_brdfs_and_the_error_table(glossy):
     table = report(glossy)["table"]
     separable, harmonic, lobe = ([row for row in table if row["system"] == system] for system in SYSTEMS)
     assert {(row["terms"], row["keep"]) for row in separable} == {(t, k) for t in (1, 4) for k in (32, 96)}
-    assert {row["coefficients"] for row in harmonic} == {4, 16}
-    assert [(row["lobes"], row["exact_texels"]) for row in lobe] == [(1, 0), (1, 16), (1, 64)]
+    assert {(row["degree"], row["laplacian"]) for row in harmonic} == {(d, w) for d in (1, 3) for w in (1.0, 0.4)}
+    assert [(row["lobes"], row["texels"]) for row in lobe] == [(1, 0), (1, 16), (1, 64)]
     assert all(0 < row[f"error {sky}"] < 2 for row in table for sky in ("sky", "sky_2"))
     made = report(glossy)["precompute"]
-    assert (made["harmonic"]["object"]["coefficients"], made["lobe"]["object"]["lobes"]) == (16, 1)
+    assert (made["harmonic"]["mesh"]["degree"], made["lobe"]["mesh"]["lobes"]) == (3, 1)
 
 
 # The command prints warnings itself; here they would be errors before they reach it.
 @pytest.mark.filterwarnings("default:.* pixels are negative:UserWarning")
 def test_negative_pixels_are_told_on_stderr(place, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    monkeypatch.setattr(prt.separable, "factor", stop)
     assert run(place, sky=("negative.exr",), output=tmp_path) == 130
     assert "jaxprt: " in (told := capsys.readouterr().err)
     assert "pixels are negative" in told
@@ -283,7 +281,7 @@ def test_an_output_that_is_a_file_is_refused(place, tmp_path, capsys):
 def test_another_meshs_store_in_the_output_is_refused(place, output, capsys):
     assert run(place, "--keep", "9", output=output) == 2
     assert_told(
-        capsys, "object.prt holds arrays made from something else .*keep: there 8, now 9.* name another --output"
+        capsys, r"separable.prt holds arrays made from something else .*keep: there 8, now 9.* name another --output"
     )
 
 
@@ -293,12 +291,12 @@ def stop(*_, **__):
 
 @pytest.mark.parametrize("options", [["--keep", "0"], ["--keep", "30000"], ["--diffuse=-1"], ["--nu", "0"]])
 def test_bad_numbers_are_refused_before_anything_is_factored(place, tmp_path, monkeypatch, options):
-    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    monkeypatch.setattr(prt.separable, "factor", stop)
     assert run(place, *options, output=tmp_path) == 2
 
 
 def test_an_interrupt_ends_in_one_line_and_status_130(place, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    monkeypatch.setattr(prt.separable, "factor", stop)
     assert run(place, output=tmp_path) == 130
     assert capsys.readouterr().err == "jaxprt: stopped; the same command goes on from here\n"
 
@@ -314,7 +312,7 @@ def test_two_skies_of_one_name_are_both_relit(place, glossy):
 def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
     swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
     (place / "inside_out.obj").write_text(swapped)
-    monkeypatch.setattr(prt.separable.factorization, "factor", stop)
+    monkeypatch.setattr(prt.separable, "factor", stop)
     assert run(place, mesh=mesh, output=tmp_path) == 130
     warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jaxprt: warning: ")]
     assert len(warned) == count
@@ -349,7 +347,7 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
         (["--bounces", "1"], "--bounces needs --system dynamic"),
         (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
         (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
-        (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of regions 0 to 0, got 7"),
+        (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of parts 0 to 0, got 7"),
         (["--material", "0", "0.1", "0.1", "2", "0.1"], "four numbers from 0 to 1, got 0 0.1 0.1 2 0.1"),
         (["--roughness", "-1"], "--roughness must be from 0 to 1, got -1"),
     ],

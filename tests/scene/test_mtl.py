@@ -94,7 +94,7 @@ def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
     assert scene["a"].material.textures == ()
     np.testing.assert_array_equal(scene["b"].material.base_color, [0.5] * 3)
     path.write_text(SQUARE + FACE)
-    assert [part.name for part in load_scene(path).parts] == ["default"]
+    assert [part.name for part in load_scene(path).parts] == [path.stem]
 
 
 @pytest.mark.parametrize(

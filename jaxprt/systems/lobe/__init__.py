@@ -2,7 +2,7 @@
 
 from jaxprt.systems.lobe import em, knots, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes
-from jaxprt.systems.lobe.pyramid import LobeTransport, compress, precompute
+from jaxprt.systems.lobe.pyramid import LobeTransport, bits, compress, precompute
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter, radiance
 from jaxprt.systems.lobe.remainder import Remainder
 from jaxprt.systems.lobe.system import LobeSystem
@@ -16,6 +16,7 @@ __all__ = [
     "LobeView",
     "Lobes",
     "Remainder",
+    "bits",
     "combine",
     "compress",
     "diffuse",

@@ -237,6 +237,12 @@ def compress(direct: StoredVisibility) -> LobeTransport:
     return LobeTransport(level, vector, direct.position, direct.frame, direct.size)
 
 
+def bits(transport: LobeTransport) -> LobeTransport:
+    """The same without means and vectors: half the bytes, for single texels alone."""
+    level = transport.level[:, : 6 * transport.size**2 // 8]
+    return LobeTransport(level, transport.vector[:0], transport.position, transport.frame, transport.size)
+
+
 @jax.jit
 def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     """Bits and means of visibility, as `LobeTransport` has them.

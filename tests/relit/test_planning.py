@@ -1,0 +1,165 @@
+"""Plans against the error that carrying them out has, under lights and from views that they did not see."""
+
+import functools
+import importlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import lobe, reference
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.relit import Clusters, Harmonics, Lobes
+from jaxprt.scene import Environment, TexturedMaterial, builtin
+from jaxprt.scene.mesh import ground_plane
+
+planning = importlib.import_module("jaxprt.relit.planning")
+ASKED = 0.3
+VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse):
+    """Few steps and small maps."""
+    with pytest.MonkeyPatch.context() as patch:
+        terms = tuple(Clusters(step.terms, 12, *list(vars(step).values())[2:]) for step in planning._TERMS[:3])
+        patch.setattr(planning, "_TERMS", terms)
+        patch.setattr(planning, "_LOBES", planning._LOBES[:2])
+        patch.setattr(planning, "_HARMONIC", (Harmonics(degree=2),))
+        patch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)  # No plan reads it.
+        patch.setattr(lobe, "tabulate", functools.partial(lobe.tabulate, resolution=8))
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene():
+    ball = builtin.sphere(rings=6, sectors=8)
+    ground = ground_plane(ball, vertices=49)
+    paint = TexturedMaterial(base_color=np.array([0.6, 0.4, 0.2]), metallic=0.3, roughness=0.5)
+    parts = [prt.Part("ball", ball, AshikhminShirley(nu=8, nv=20)), prt.Part("ground", ground, Lambert(0.5))]
+    return prt.Scene([*parts, prt.Part("paint", builtin.plane(cells=3), paint)])
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return builtin.daylight(size=8)
+
+
+@pytest.fixture(scope="module")
+def planned(scene, sky):
+    return prt.plan(scene, environments=[sky], error=ASKED, rate=1e-3, progress=False)
+
+
+@pytest.fixture(scope="module")
+def ready(scene, planned):
+    return prt.precompute(scene, system=planned.recipes, size=8, progress=False)
+
+
+def test_the_error_asked_for_holds_from_other_views_and_under_another_light(scene, sky, planned, ready):
+    assert planned.error * planning.MARGIN <= ASKED
+    other = Environment(sky.radiance[:, ::-1] ** 0.8)
+    for light in (sky, other):
+        now, exact = [], []
+        for eye in VIEWS:
+            now.append(np.asarray(ready.radiance(light, eye=eye)))
+            parts = zip(scene.parts, ready.shading, strict=True)
+            options = {"eye": eye, "occluder": scene.mesh}
+            exact.append(np.concatenate([reference.radiance(s.mesh, s.exact, light, **options) for _, s in parts]))
+        assert np.linalg.norm(np.subtract(now, exact)) < 1.25 * ASKED * np.linalg.norm(exact)
+
+
+def test_bytes_are_those_of_what_is_made(planned, ready):
+    assert planned.nbytes == pytest.approx(prt.memory(ready.system), rel=0.2)
+    assert planned.seconds > 0
+
+
+def test_of_what_meets_the_error_at_the_rate_the_smallest_is_chosen(planned):
+    for part in planned.part:
+        good = [each for each in part.considered if each.error * planning.MARGIN <= ASKED]
+        assert part.chosen.nbytes == min(each.nbytes for each in good)
+
+
+def test_what_is_matte_is_lit_by_transfer_vectors(planned, ready):
+    assert isinstance(planned.recipes["ground"], Harmonics)
+    assert isinstance(ready.system.part[1], prt.harmonic.DiffuseSystem)
+
+
+def test_the_table_names_every_part_and_marks_one_choice_of_each(planned):
+    table = str(planned)
+    assert table.count("*") == 3
+    assert all(f"{name}: " in table for name in ("ball", "ground", "paint"))
+    assert f"in all: {100 * planned.error:.1f} %" in table
+    assert "slower" not in table
+
+
+def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
+    part = prt.Scene([scene["ground"]])
+    found = prt.plan(part, environments=[sky], error=ASKED, rate=1e9, progress=False)
+    good = [each for each in found.part[0].considered if each.error * planning.MARGIN <= ASKED]
+    assert found.part[0].chosen.seconds == min(each.seconds for each in good)
+    assert "slower than the 1e+09 frames per second asked for" in str(found)
+
+
+def test_an_error_that_nothing_reaches_is_refused_with_the_best(scene, sky):
+    with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for part 'ball', which .* reaches; got 1e-05"):
+        prt.plan(prt.Scene([scene["ball"]]), environments=[sky], error=1e-5, progress=False)
+
+
+def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monkeypatch):
+    part = prt.Scene([scene["ground"]])
+    options = {"environments": [sky], "path": tmp_path / "kept", "progress": False}
+    first = prt.precompute(part, error=ASKED, **options)
+    monkeypatch.setattr(planning, "_considered", None)  # Nothing is measured again.
+    again = prt.precompute(part, error=ASKED, **options)
+    np.testing.assert_array_equal(first.radiance(sky, eye=VIEWS[0]), again.radiance(sky, eye=VIEWS[0]))
+    with pytest.raises(ValueError, match=r"was made for an error of 0\.3 .*, got 0\.2 .*: name another path"):
+        prt.precompute(part, error=0.2, **options)
+
+
+def test_a_scenes_own_lights_are_planned_for(scene, sky):
+    assert planning.lights_of(prt.Scene(scene.parts, environments=[sky])) == (sky,)
+    assert len(planning.lights_of(scene)) == 2
+
+
+@pytest.mark.parametrize(
+    ("lights", "options", "message"),
+    [
+        ([], {}, "environments must be at least one, got none"),
+        ([4, 8], {}, "must be of one size"),
+        ([8], {"error": 0.0}, "error must be positive and finite, got 0"),
+        ([8], {"error": np.nan}, "error must be positive and finite, got nan"),
+        ([8], {"rate": np.inf}, "rate must be positive and finite, got inf"),
+    ],
+)
+def test_impossible_plans_are_refused(scene, lights, options, message):
+    lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
+    with pytest.raises(ValueError, match=message):
+        prt.plan(scene, environments=lights, progress=False, **options)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_plans_are_for_scenes_and_lights(scene, sky):
+    with pytest.raises(TypeError, match="scene must be of class Scene, which jaxprt"):
+        prt.plan(scene.mesh, environments=[sky])
+    with pytest.raises(TypeError, match="environment 1 must be of class Environment"):
+        prt.plan(scene, environments=[sky, 3])
+
+
+def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(scene):
+    whole = Environment(jnp.ones((6, 8, 8, 3)))
+    damaged = jax.tree.map(lambda each: each.at[2, 3, 4, 1].set(jnp.nan), whole)  # as a wrong computation makes it
+    with pytest.raises(ValueError, match=r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)"):
+        prt.plan(scene, environments=[whole, damaged], progress=False)
+
+
+def test_a_brdf_that_is_not_finite_has_no_plan(scene, sky):
+    broken = prt.Scene([prt.Part("broken", scene["ball"].mesh, lambda wi, wo: jnp.nan * wi[..., :1])])
+    with pytest.raises(ValueError, match=r"what the BRDF makes of the lights, .* must be finite, got"):
+        prt.plan(broken, environments=[sky], progress=False)
+
+
+def test_lobes_are_left_out_where_less_than_they_need_is_enough(planned):
+    considered = next(part.considered for part in planned.part if part.name == "ground")
+    assert not any(isinstance(each.recipe, Lobes) for each in considered)
