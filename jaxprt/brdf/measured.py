@@ -13,8 +13,8 @@ import pathlib
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Float64
-from scipy import ndimage
 
 from jaxprt.brdf import models
 
@@ -201,7 +201,7 @@ def tabulate(
         raise ValueError(f"there must be a valid cell, got none of {valid.size}")
     half = value.shape[2] // 2
     around = np.pad(valid, ((0, 0), (0, 0), (half, half)), mode="wrap")  # Half a turn on, the table repeats.
-    nearest = np.asarray(ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True))
+    nearest = np.asarray(scipy.ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True))
     row, column, turn = nearest[..., half : half + value.shape[2]]
     value = value[row, column, (turn - half) % value.shape[2]]
     value[0] = value[0].mean(1, keepdims=True)

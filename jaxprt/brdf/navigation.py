@@ -16,9 +16,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
-from scipy import spatial
 
 from jaxprt.brdf import models
 
@@ -216,15 +216,15 @@ def triangulate(
     # As the plane itself computes them, in its precision.
     scaled = np.asarray(_scaled(chart, point, point), np.float64)
     rounding = _ROUNDING * np.finfo(point.dtype).eps
-    distance, pair = spatial.KDTree(scaled).query(scaled, k=2)
+    distance, pair = scipy.spatial.KDTree(scaled).query(scaled, k=2)
     i, j = sorted(np.asarray(pair)[np.argmin(distance[:, 1])])
     if distance[:, 1].min() <= rounding:
         raise ValueError(
             f"points must not coincide, got {name[i]} at {_text(point[i])} and {name[j]} at {_text(point[j])}"
         )
     try:
-        triangle = spatial.Delaunay(scaled).simplices  # Counter-clockwise.
-    except spatial.QhullError:
+        triangle = scipy.spatial.Delaunay(scaled).simplices  # Counter-clockwise.
+    except scipy.spatial.QhullError:
         triangle = np.zeros((0, 3), int)
     # Slivers occur along the hull alone.
     area, size = _area(scaled[triangle])

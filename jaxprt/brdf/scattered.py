@@ -7,8 +7,8 @@ import pathlib
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float64
-from scipy import interpolate
 
 from jaxprt.brdf import measured
 from jaxprt.brdf.measured import HalfDifferenceTable
@@ -171,7 +171,7 @@ def interpolate_scattered(
     height = np.log1p(mean / scale)
     stiffness: Any = np.where(place[:, 0] < _HIGHLIGHT, smoothing / 1000, smoothing)  # One per sample; typed float.
     try:
-        spline = interpolate.RBFInterpolator(place, height, smoothing=stiffness, kernel="thin_plate_spline")
+        spline = scipy.interpolate.RBFInterpolator(place, height, smoothing=stiffness, kernel="thin_plate_spline")
     except np.linalg.LinAlgError as error:
         raise ValueError("samples must not all lie on one plane of half-vector angles") from error
     theta_h, theta_d, phi_d = measured.cell_angles(resolution)

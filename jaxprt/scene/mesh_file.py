@@ -7,7 +7,6 @@ import warnings
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from jaxprt.scene import gltf_file, gltf_geometry
 from jaxprt.scene.geometry import Geometry, joined
@@ -28,8 +27,10 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     return _concatenate(_load(path, suffix, groups), suffix, str(path))
 
 
-def _load(path: pathlib.Path, suffix: str, groups: bool) -> trimesh.Scene:
+def _load(path: pathlib.Path, suffix: str, groups: bool) -> Any:
     """The file as trimesh has it, or an error that names it."""
+    import trimesh  # Here, since it takes a second, with most of SciPy.
+
     options: dict[str, Any] = {}
     source = path
     if suffix == ".obj":
@@ -131,8 +132,10 @@ def _absolute(index: str, count: int) -> str:
     return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
 
 
-def _concatenate(scene: trimesh.Scene, suffix: str, name: str) -> Geometry:
+def _concatenate(scene: Any, suffix: str, name: str) -> Geometry:
     """All geometries of a scene, one region each."""
+    import trimesh
+
     parts = []
     nodes = list(scene.graph.nodes_geometry)
     for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.

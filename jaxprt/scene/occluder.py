@@ -2,7 +2,7 @@
 
 import fast_simplification
 import numpy as np
-from scipy import sparse, spatial
+import scipy
 
 from jaxprt.scene.mesh import Mesh, bounds, join, make_mesh
 
@@ -75,9 +75,11 @@ def _collapse(mesh: Mesh, chosen: np.ndarray, faces: int) -> Mesh:
     )
     position, face = result[0], result[1]
     # Each piece has the region that most of its vertices are nearest to: at seams two are equally near.
-    graph = sparse.coo_array((np.ones(face.size), (face.ravel(), np.roll(face, 1, 1).ravel())), (len(position),) * 2)
-    _, piece = sparse.csgraph.connected_components(graph, directed=False)
-    nearest = place[spatial.KDTree(place[:, :3]).query(position)[1], 3].astype(np.int32)
+    graph = scipy.sparse.coo_array(
+        (np.ones(face.size), (face.ravel(), np.roll(face, 1, 1).ravel())), (len(position),) * 2
+    )
+    _, piece = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    nearest = place[scipy.spatial.KDTree(place[:, :3]).query(position)[1], 3].astype(np.int32)
     votes = np.zeros((piece.max() + 1, nearest.max() + 1), np.int32)
     np.add.at(votes, (piece, nearest), 1)
     return make_mesh(position / unit + low, face, region=votes.argmax(1)[piece], name="simplified mesh")

@@ -16,8 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.spatial import KDTree
 
 from jaxprt import require
 from jaxprt.compile import apart
@@ -273,7 +273,7 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
         place = np.asarray(cubemap.direction(size=edge), np.float64)[0]
         place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
         reach = 2 * np.sin(min(np.pi, _REACH * np.sqrt(own)) / 2)
-        near = [np.unique(np.concatenate(each)) for each in KDTree(center).query_ball_point(place, reach)]
+        near = [np.unique(np.concatenate(each)) for each in scipy.spatial.KDTree(center).query_ball_point(place, reach)]
         index = np.zeros((len(place), max(map(len, near))), np.int32)
         known = np.zeros(index.shape)
         for row, each in enumerate(near):
