@@ -39,7 +39,7 @@ class PerVertex(eqx.Module):
 
     def __call__(self, wi: Float[Array, "v *b 3"], wo: Float[Array, "v *b 3"]) -> Float[Array, "v *b c"]:
         """Value in 1/sr, of each vertex for its own directions."""
-        return self.model(wi, wo)
+        return jax.vmap(lambda model, wi, wo: model(wi, wo))(self.model, wi, wo)
 
 
 class Channels(eqx.Module):

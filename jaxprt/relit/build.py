@@ -9,11 +9,11 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
-from jaxprt.relit.channels import of_part
+from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.planning import Plan, plan
-from jaxprt.relit.recipes import SYSTEMS, Job, Recipe
+from jaxprt.relit.recipes import SYSTEMS, Job, Recipe, check
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Scene
+from jaxprt.scene import Environment, Part, Scene
 from jaxprt.systems.protocol import Joined
 
 
@@ -50,11 +50,13 @@ def precompute(
         The scene, ready for `radiance` and `picture`.
 
     Raises:
-        TypeError: No scene, or a system of another kind.
-        ValueError: There is no such system or part, a part's material is not one that its system can have, or the
-            store at `path` was made from something else.
+        TypeError: No scene, a system of another kind, or a material that no system can have.
+        ValueError: There is no such system or part, the size is no power of two, a part's material is not one that
+            its system can have, or the store at `path` was made from something else.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    if size is not None and (size < 1 or size & (size - 1)):
+        raise ValueError(f"size must be a power of two, got {size}")
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -63,15 +65,24 @@ def precompute(
         system, size = wanted.recipes, wanted.size if size is None else size
     size = 64 if size is None else size
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
+    shadings = [_checked(part, recipes[part.name]) for part in scene.parts]
     mesh = scene.mesh
-    systems, shadings = [], []
-    for number, part in enumerate(scene.parts):
-        shading = of_part(part)
+    systems = []
+    for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         at = folder and folder / f"{number}_{_file_name(part.name)}"
         job = Job(mesh, size=size, path=at, executor=executor, progress=progress)
         systems.append(recipes[part.name].make(shading, job))
-        shadings.append(shading)
-    return RelitScene(scene, Joined(tuple(systems)), tuple(shadings))
+    return RelitScene(scene, Joined(tuple(systems)), shadings)
+
+
+def _checked(part: Part, recipe: Recipe) -> Shading:
+    """The part as systems take it, refused before any rays are traced if its system cannot have it."""
+    shading = of_part(part)
+    try:
+        check(recipe, shading)
+    except ValueError as error:
+        raise ValueError(f"part {part.name!r}: {error}") from None
+    return shading
 
 
 def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
@@ -110,5 +121,5 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
 
 
 def _file_name(name: str) -> str:
-    """A name of a part as that of a folder."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)
+    """The name of a part in those of files: letters and digits, not too many."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)[:40]

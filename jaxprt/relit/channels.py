@@ -2,12 +2,13 @@
 
 A metallic-roughness material is a sum of fixed gray BRDFs with textures as weights, see
 `jaxprt.brdf.MetallicRoughness.terms`. The fixed ones are the channels of one BRDF, which a system tabulates or factors
-once. Where roughness varies, too, they are tabulated over its logarithm.
+once. Where roughness varies, they are tabulated over its logarithm.
 """
 
+import dataclasses
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,107 +17,204 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import MetallicRoughness
+from jaxprt.brdf import Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.scene import Mesh, Part
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
 
-_SMOOTHEST = 0.0317  # roughness below which GGX stays as it is
+_SMOOTHEST = 1e-3**0.5  # roughness below which GGX stays as it is
 _STEP = 1.5  # from one tabulated roughness to the next, at most
-_EQUAL = 1e-3  # roughness and anisotropy that vary less are one number
+_EQUAL = 1e-3  # roughness, anisotropy and normals that vary less are equal
 _RARE = 0.02  # least typical weight of a channel, relative to the largest
+_NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # of the terms of MetallicRoughness
+_BARE = (3,)  # the term of a material that is ideally diffuse
 
 
-class Shading(NamedTuple):
+class RoughnessFamily(eqx.Module):
+    """Terms of `MetallicRoughness` as channels, for any roughness: a function that makes a BRDF.
+
+    Attributes:
+        term: Which of the terms.
+        scale: Factor of each.
+        anisotropy: Strength of the anisotropy, along the tangent.
+    """
+
+    term: tuple[int, ...] = eqx.field(static=True)
+    scale: Float[Array, " k"]
+    anisotropy: Float[Array, ""]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF of a roughness, given its natural logarithm."""
+        each = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
+        return Channels(tuple(each[k] for k in self.term), self.scale)
+
+
+class Shading(eqx.Module):
     """A part of a scene, as systems take it.
 
     Attributes:
-        mesh: Its mesh, with normals of the normal map and tangents along the anisotropy.
-        brdf: The BRDF, with as many channels as `blend` has weights; with knots a function of the parameter.
-        knot: Values of the logarithm of roughness at which to tabulate; none where it does not vary.
-        blend: Weights and parameters of each vertex; None for a BRDF that is given whole.
+        mesh: The part's mesh, with normals of the normal map and tangents along the anisotropy.
+        brdf: The BRDF, with as many channels as `blend` has weights. With `knot` it is a function that makes one: a
+            `RoughnessFamily`.
         exact: The BRDF of every vertex, for the exact sum.
+        knot: Logarithms of roughness at which to tabulate; empty where roughness does not vary.
+        blend: Weights of each vertex, and logarithms of its roughness; None for a part whose material is a BRDF.
         emitted: Radiance that the surface emits; None for none.
-        term: Which of the material's terms the channels are.
-        scale: What the weights are relative to.
+        term: Which of the terms of `MetallicRoughness` the channels are.
+        scale: Factor of each channel, by which the weights are divided.
     """
 
     mesh: Mesh
     brdf: Callable
-    knot: tuple[np.ndarray, ...]
-    blend: Blend | None
     exact: Callable
-    emitted: Float[Array, "v 3"] | None
-    term: tuple[int, ...] = ()
+    knot: tuple[np.ndarray, ...] = ()
+    blend: Blend | None = None
+    emitted: Float[Array, "v 3"] | None = None
+    term: tuple[int, ...] = eqx.field(static=True, default=())
     scale: Float[Array, " k"] | None = None
 
 
+class Appearance(eqx.Module):
+    """A material at the vertices of a part, for the system that the part was precomputed with.
+
+    Attributes:
+        blend: What the system takes; None for a part whose material is a BRDF.
+        emitted: Radiance that the surface emits; None for none.
+    """
+
+    blend: Blend | None
+    emitted: Float[Array, "v 3"] | None = None
+
+
 def of_part(part: Part) -> Shading:
-    """A part as systems take it."""
-    if not isinstance(part.material, TexturedMaterial):
-        return Shading(part.mesh, part.material, (), None, part.material, None)
-    surface = part.surface()
-    material = _material(surface, part.name)
-    knot = _knots(material.roughness)
-    term = material.needed()
-    scale = jnp.mean(material.coefficient()[:, np.asarray(term)], (0, 2))
-    scale = jnp.maximum(scale, _RARE * jnp.max(scale))
-    strength, smooth = float(jnp.mean(material.anisotropy)), float(jnp.mean(material.roughness))
+    """A part of a scene, as systems take it.
 
-    def at(roughness: Array | float) -> Channels:
-        each = MetallicRoughness(roughness=roughness, anisotropy=strength).terms()
-        return Channels(tuple(each[k] for k in term), scale)
-
-    brdf = (lambda logarithm: at(jnp.exp(logarithm))) if knot else at(smooth)
-    emitted = surface.emissive if np.any(np.asarray(surface.emissive)) else None
-    mesh = _turned(part.mesh, surface)
-    return Shading(mesh, brdf, knot, _blend(material, knot, term, scale), PerVertex(material), emitted, term, scale)
-
-
-def blended(part: Part, shading: Shading, material: TexturedMaterial) -> Blend:
-    """The weights of another material on a part that was made ready.
+    A texture of anisotropy is replaced by its mean, with a warning.
 
     Raises:
-        ValueError: The material has a reflection, or a roughness, that was not made ready.
+        TypeError: The material is a BRDF of another form: a table that holds the cosine, or one BRDF for each vertex.
     """
-    new = _material(eqx.tree_at(lambda each: each.material, part, material).surface(), part.name)
-    missing = sorted(set(new.needed()) - set(shading.term))
-    if missing:
-        names = [("diffuse", "mirror", "rim", "bare diffuse")[k] for k in missing]
+    if not isinstance(part.material, TexturedMaterial):
+        if isinstance(part.material, PerVertex):
+            raise TypeError(
+                f"the material of part {part.name!r} must be one BRDF for all vertices or a TexturedMaterial, "
+                "got a BRDF for each vertex"
+            )
+        brdf = grid.as_argument(part.material)
+        return Shading(part.mesh, brdf, brdf)
+    surface = part.surface()
+    _warn_of_varying_anisotropy(part.name, surface)
+    material = _material(surface)
+    term = material.needed() or _BARE
+    if term == _BARE:
+        brdf, knot, scale = Lambert(1.0), (), jnp.ones(1)
+    else:
+        knot = _knots(material.roughness)
+        scale = jnp.mean(jnp.abs(material.coefficient()[:, np.asarray(term)]), (0, 2))
+        scale = jnp.maximum(scale, _RARE * jnp.max(scale))
+        brdf = RoughnessFamily(term, scale, material.anisotropy[0])
+        if not knot:
+            brdf = brdf(jnp.log(jnp.maximum(jnp.mean(material.roughness), _SMOOTHEST)))
+    blend = _blend(material, term, scale, varies=bool(knot))
+    mesh = _turned(part.mesh, surface)
+    return Shading(mesh, brdf, PerVertex(material), knot, blend, _emitted(surface), term, scale)
+
+
+def appearance(part: Part, shading: Shading, material: TexturedMaterial) -> Appearance:
+    """Another material on a part that was precomputed.
+
+    Textures of color, metallic, specular and emission, and within the range that was precomputed of roughness, may be
+    anything. Inside `jax.jit`, where values are not known, vertices that need what was not precomputed get NaN.
+    Derivatives leave out terms that were not precomputed.
+
+    Args:
+        part: The part.
+        shading: From `of_part`.
+        material: The material.
+
+    Raises:
+        ValueError: The material takes texture coordinates that the mesh does not have, or has a term, a roughness, an
+            anisotropy or a normal map that were not precomputed.
+    """
+    surface = dataclasses.replace(part, material=material).surface()
+    new = _material(surface)
+    _check_shape(part, shading, surface, new)
+    assert shading.scale is not None
+    blend = _blend(new, shading.term, shading.scale, varies=bool(shading.knot))
+    fits = _fits(part.name, shading, new)
+    weight = jnp.where(fits[:, None, None], blend.weight, jnp.nan) if isinstance(fits, Tracer) else blend.weight
+    return Appearance(Blend(weight, blend.parameter), _emitted(surface))
+
+
+def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
+    """Whether the terms and the roughness of each vertex were precomputed; refuses those that were not, if known."""
+    missing = np.setdiff1d(np.arange(len(_NAMES)), shading.term)
+    needed = jnp.any(new.coefficient()[:, missing] != 0, (0, 2))
+    if _known(needed) and np.any(np.asarray(needed)):
+        names = [_NAMES[k] for k in missing[np.asarray(needed)]]
         raise ValueError(
-            f"part {part.name!r} was precomputed without the {' and '.join(names)} term, which the new material needs: "
+            f"part {name!r} was precomputed without the terms that the new material needs ({', '.join(names)}): "
             "precompute it with a material that has them"
         )
-    old = np.asarray(shading.exact.model.roughness)  # pyright: ignore[reportFunctionMemberAccess]
-    low, high = float(old.min()), float(old.max())
-    if not isinstance(new.roughness, Tracer):
-        least, most = float(jnp.min(new.roughness)), float(jnp.max(new.roughness))
-        if least < low - _EQUAL or most > high + _EQUAL:
-            raise ValueError(
-                f"part {part.name!r} was precomputed for roughness from {low:.3f} to {high:.3f}, "
-                f"got a material from {least:.3f} to {most:.3f}"
-            )
-    assert shading.scale is not None
-    return _blend(new, shading.knot, shading.term, shading.scale)
-
-
-def _blend(material: MetallicRoughness, knot: tuple, term: tuple[int, ...], scale: Array) -> Blend:
-    weight = material.coefficient()[:, np.asarray(term)] / scale[:, None]
-    parameter = (jnp.log(jnp.maximum(material.roughness, _SMOOTHEST)),) if knot else ()
-    return Blend(weight, parameter)
-
-
-def _material(surface: Surface, name: str) -> MetallicRoughness:
-    """The material of every vertex, its anisotropy along the tangent."""
-    strength = np.asarray(jax.lax.stop_gradient(surface.anisotropy))
-    if np.ptp(strength) > _EQUAL:
-        warnings.warn(
-            f"part {name!r} has a texture of anisotropy, from {strength.min():.2f} to {strength.max():.2f}; "
-            f"its mean {strength.mean():.2f} stands for it",
-            stacklevel=3,
+    fits = ~jnp.any(new.coefficient()[:, missing] != 0, (1, 2))
+    if shading.term == _BARE:
+        return fits
+    old = _old(shading).roughness
+    low, high = jnp.min(old), jnp.max(old)
+    inside = (new.roughness >= low - _EQUAL) & (new.roughness <= high + _EQUAL)
+    if _known(inside) and not np.all(np.asarray(inside)):
+        raise ValueError(
+            f"part {name!r} was precomputed for roughness from {low:.3f} to {high:.3f}, got a material from "
+            f"{jnp.min(new.roughness):.3f} to {jnp.max(new.roughness):.3f}: precompute it with a material of both"
         )
+    return fits & inside
+
+
+def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRoughness) -> None:
+    """Refuses another anisotropy and other normals than the precomputed frames and tables have, where known."""
+    if not _known(surface, shading):
+        return
+    before, now = (float(each.anisotropy[0]) for each in (_old(shading), new))
+    anisotropic = before > _EQUAL and shading.term != _BARE
+    if abs(before - now) > _EQUAL and shading.term != _BARE:
+        raise ValueError(
+            f"part {part.name!r} was precomputed for an anisotropy of {before:.3f}, got a material of {now:.3f}"
+        )
+    mesh = _turned(part.mesh, surface)
+    for field, matters in (("normal", True), ("tangent", anisotropic)):
+        first, second = (np.asarray(getattr(each, field)) for each in (shading.mesh, mesh))
+        if matters and np.abs(first - second).max() > _EQUAL:
+            what = {"normal": "normal map", "tangent": "direction of anisotropy"}[field]
+            raise ValueError(
+                f"part {part.name!r} was precomputed with another {what}, or with none: precompute it with the new one"
+            )
+
+
+def _old(shading: Shading) -> MetallicRoughness:
+    """The material that a part was precomputed with."""
+    assert isinstance(shading.exact, PerVertex)
+    assert isinstance(shading.exact.model, MetallicRoughness)
+    return shading.exact.model
+
+
+def _known(*value: Any) -> bool:
+    """Whether JAX traces none of the arrays."""
+    return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
+
+
+def _blend(material: MetallicRoughness, term: tuple[int, ...], scale: Array, *, varies: bool) -> Blend:
+    weight = material.coefficient()[:, np.asarray(term)] / scale[:, None]
+    return Blend(weight, (jnp.log(jnp.maximum(material.roughness, _SMOOTHEST)),) if varies else ())
+
+
+def _emitted(surface: Surface) -> Float[Array, "v 3"] | None:
+    return None if _known(surface.emissive) and not np.any(np.asarray(surface.emissive)) else surface.emissive
+
+
+def _material(surface: Surface) -> MetallicRoughness:
+    """The material of every vertex, its anisotropy one number along the tangent."""
     ones = jnp.ones_like(surface.roughness)
     return MetallicRoughness(
         base_color=surface.base_color,
@@ -125,13 +223,23 @@ def _material(surface: Surface, name: str) -> MetallicRoughness:
         ior=surface.ior,
         specular=surface.specular,
         specular_color=surface.specular_color,
-        anisotropy=float(strength.mean()) * ones,
+        anisotropy=jnp.mean(surface.anisotropy) * ones,
         rotation=0 * ones,
     )
 
 
+def _warn_of_varying_anisotropy(name: str, surface: Surface) -> None:
+    strength = np.asarray(surface.anisotropy)
+    if np.ptp(strength) > _EQUAL:
+        warnings.warn(
+            f"part {name!r} has a texture of anisotropy, from {strength.min():.2f} to {strength.max():.2f}; "
+            f"its mean {strength.mean():.2f} stands for it",
+            stacklevel=3,
+        )
+
+
 def _knots(roughness: Float[Array, " v"]) -> tuple[np.ndarray, ...]:
-    """Logarithms of roughness between the least and the largest; none where these are alike."""
+    """Logarithms of roughness between the least and the largest; none where these are equal."""
     low, high = (max(float(each), _SMOOTHEST) for each in (jnp.min(roughness), jnp.max(roughness)))
     if high - low <= _EQUAL:
         return ()
@@ -152,6 +260,6 @@ def _turned(mesh: Mesh, surface: Surface) -> Mesh:
 @jax.jit
 def _frames(normal: Array, tangent: Array, surface: Surface) -> tuple[Array, Array]:
     frame = directions.frame(normal, tangent)
-    turned = jnp.einsum("vi,vij->vj", surface.normal, frame)
-    along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2])
+    turned = jnp.einsum("vi,vij->vj", surface.normal, frame, precision="highest")
+    along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return turned, directions.frame(turned, along)[:, 0]

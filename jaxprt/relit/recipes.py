@@ -18,15 +18,17 @@ from jaxprt.systems import bright_texels, harmonic, lobe, separable
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import StoredVisibility
 
+_HARMONIC_SIZE = 32  # texels along an edge of the visibility: as many as low degrees need
+
 
 class Job(eqx.Module):
-    """Where and of what a part is made ready.
+    """What a part is made ready for, and where that is done.
 
     Attributes:
         occluder: What casts shadows: all parts.
         size: Edge of the light's cubemap faces in texels.
         vertex: Numbers of the vertices to light; all if None.
-        visible: What these see, if it is known already.
+        visible: What these see, if it is known already. `Lobes` and `Clusters` then trace no rays; others do.
         path: What the names of folders begin with; None keeps nothing.
         executor: Where blocks are computed; this machine's cores if None.
         progress: Whether to show progress bars.
@@ -80,11 +82,13 @@ class Lobes(eqx.Module):
             table = lobe.diffuse(shading.brdf.albedo)
         else:
             table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
-        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, job.size)
+        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
 
 class Harmonics(eqx.Module):
     """The harmonic system: transfer vectors for what is ideally diffuse, matrices for all else.
+
+    The name "harmonic" stands for `laplacian=0.4`. Visibility is traced at 6 x 32 x 32 texels at most.
 
     Attributes:
         degree: Highest degree of the harmonics.
@@ -96,7 +100,7 @@ class Harmonics(eqx.Module):
 
     def make(self, shading: Shading, job: Job) -> System:
         """The system of a part."""
-        options = {"degree": self.degree, **job.traced()}
+        options = {"degree": self.degree, "size": min(job.size, _HARMONIC_SIZE), **job.traced()}
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.precompute_diffuse(shading.mesh, **options, **job.options(f"vectors_{self.degree}"))
             return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
@@ -111,16 +115,20 @@ class Terms(eqx.Module):
     Attributes:
         terms: BRDF terms; what is ideally diffuse has one.
         keep: Wavelet coefficients of each vertex and term.
+        resolution: Edge of the terms' maps in texels.
     """
 
     terms: int = 4
     keep: int = 96
+    resolution: int = 48
 
     def make(self, shading: Shading, job: Job) -> System:
         """The system of a part."""
-        _refuse_knots(shading)
-        factored = separable.factor(shading.brdf, terms=1 if isinstance(shading.brdf, Lambert) else self.terms)
-        options = {"keep": self.keep, "size": job.size, **job.traced(), **job.options("separable")}
+        check(self, shading)
+        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
+        factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
+        keep = min(self.keep, 6 * job.size**2)
+        options = {"keep": keep, "size": job.size, **job.traced(), **job.options("separable")}
         return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
 
 
@@ -147,7 +155,7 @@ class Clusters(eqx.Module):
 
     def make(self, shading: Shading, job: Job) -> System:
         """The system of a part."""
-        _refuse_knots(shading)
+        check(self, shading)
         visible = job.visible
         if visible is None:
             options = {**job.traced(), **job.options("visibility")}
@@ -181,8 +189,13 @@ def _bright(system: System, visible, shading: Shading, texels: int, size: int) -
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
 
 
-def _refuse_knots(shading: Shading) -> None:
-    if shading.knot:
+def check(recipe: Recipe, shading: Shading) -> None:
+    """Refuses a part that a recipe cannot make.
+
+    Raises:
+        ValueError: The roughness of the part varies, and the recipe factors one BRDF.
+    """
+    if shading.knot and isinstance(recipe, Terms | Clusters):
         low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
         raise ValueError(
             f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "

@@ -1,36 +1,75 @@
 """Scenes made ready: every part by a system, and the four verbs, radiance and pictures of the whole."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
+from jaxprt.brdf import grid
 from jaxprt.image import raster
-from jaxprt.relit.channels import Shading, blended
-from jaxprt.scene import Camera, Environment, Scene, TexturedMaterial
+from jaxprt.relit.channels import Appearance, Shading, appearance
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import background
 from jaxprt.systems import protocol
 from jaxprt.systems.protocol import Blend, Joined, System
 
 
-class RelitScene(System):
-    """A scene that is ready to be relit. It is a system itself: its vertices are those of `scene.mesh`.
+class SceneView(eqx.Module):
+    """A view of a scene.
 
-    Materials are a dictionary from names of parts to other materials: `TexturedMaterial`, or `Blend` for its weights.
-    Parts that are not named keep the material that they were made ready with.
+    Attributes:
+        part: The views of its parts, as their systems have them.
+        emitted: Radiance that each vertex emits; None where none does.
+    """
+
+    part: tuple[PyTree, ...]
+    emitted: Float[Array, "v 3"] | None
+
+
+class RelitScene(System):
+    """A scene that is ready to be relit. It is a system itself: its vertices are those of `scene.mesh`, in that order.
+
+    Materials are a dictionary from names of parts to other materials: `TexturedMaterial`, `Appearance` for one that is
+    evaluated at the vertices already, or `Blend` for its weights alone. Parts that are not named keep the material that
+    they were precomputed with. A part whose material is a BRDF keeps that.
 
     Attributes:
         scene: The scene.
         system: The systems of its parts.
         shading: What its parts are to the systems.
+        mesh: The mesh of all parts, with the scene's own normals.
+        camera: The scene's first camera; one around it, a little from above, where it has none.
     """
 
     scene: Scene
     system: Joined
     shading: tuple[Shading, ...]
+    mesh: Mesh
+    camera: Camera
+
+    def __init__(self, scene: Scene, system: Joined, shading: Sequence[Shading]):
+        """Joins the parts' meshes.
+
+        Args:
+            scene: The scene.
+            system: The systems of its parts, in order.
+            shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
+        """
+        # What is no array cannot be an argument of a jitted function.
+        parts = [
+            part
+            if isinstance(part.material, TexturedMaterial)
+            else dataclasses.replace(part, material=grid.as_argument(part.material))
+            for part in scene.parts
+        ]
+        self.scene = dataclasses.replace(scene, parts=parts)
+        self.system, self.shading, self.mesh = system, tuple(shading), scene.mesh
+        self.camera = scene.cameras[0] if scene.cameras else orbit(self.mesh, azimuth=0.5, elevation=0.3)
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """What a light is to all parts."""
@@ -38,29 +77,38 @@ class RelitScene(System):
 
     def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
         """What arrives at all parts."""
-        return self.system.shade(light, self._blends(materials))
+        return self.system.shade(light, [each.blend for each in self._all(materials)])
 
-    def view(self, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None) -> tuple[PyTree, ...]:
-        """What a view and the materials are to all parts."""
-        return self.system.view(eye, self._blends(materials))
+    def view(self, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
+        """What a view and the materials are to all parts.
 
-    def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
-        """Radiance of all vertices, with what they emit."""
-        color = self.system.combine(light, view)
-        if all(each.emitted is None for each in self.shading):
-            return color
-        zero = jnp.zeros((1, 3), color.dtype)
+        Raises:
+            TypeError: The materials are no dictionary, one of them is of another kind, or one is of a part whose
+                material is a BRDF.
+            ValueError: There is no such part, or a material has what was not precomputed; see
+                `jaxprt.relit.channels.appearance`.
+        """
+        every = self._all(materials)
+        view = self.system.view(eye, [each.blend for each in every])
+        if all(each.emitted is None for each in every):
+            return SceneView(view, None)
         emitted = [
-            jnp.broadcast_to(zero if each.emitted is None else each.emitted, (len(each.mesh.position), 3))
-            for each in self.shading
+            jnp.zeros((len(part.mesh.position), 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
+            for part, each in zip(self.scene.parts, every, strict=True)
         ]
-        return color + jnp.concatenate(emitted)
+        return SceneView(view, jnp.concatenate(emitted))
+
+    def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
+        """Radiance of all vertices, with what they emit."""
+        require.kind("the view", view, SceneView, source="RelitScene.view")
+        color = self.system.combine(light, view.part)
+        return color if view.emitted is None else color + view.emitted
 
     def radiance(
         self, environment: Environment, *, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye: `jaxprt.radiance` of this scene."""
-        return protocol.radiance(self, environment, eye=eye, materials=materials)
+        return protocol.radiance(self, environment, eye=eye, materials=self.appearances(materials))
 
     def picture(
         self,
@@ -69,31 +117,66 @@ class RelitScene(System):
         *,
         materials: Mapping[str, Any] | None = None,
     ) -> Float[Array, "h w c"]:
-        """The picture of the scene before its light, in linear radiance.
+        """The picture of the scene in a light, in linear radiance.
 
         Args:
-            environment: The light, which is seen behind the scene too.
-            camera: From where; the scene's first camera, or else one that sees all of it.
+            environment: One light, which is seen behind the scene too.
+            camera: From where; `self.camera` if None.
             materials: Other materials of some parts.
 
         Returns:
             The picture. `jaxprt.image.display` makes it fit for the screen.
+
+        Raises:
+            TypeError: The light is no Environment, or the camera no Camera.
+            ValueError: The light is a batch, or as in `view`.
         """
+        require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
+        if environment.radiance.ndim != 4:
+            raise ValueError(f"a picture has one light [6, n, n, c], got {list(environment.radiance.shape)}")
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         color = self.radiance(environment, eye=camera.eye, materials=materials)
         sky = background(environment, raster.ray_direction(camera))
         return raster.render(self.mesh, color, camera, background=sky)
 
-    @property
-    def camera(self) -> Camera:
-        """The scene's first camera; one around it, a little from above, where it has none."""
-        return self.scene.cameras[0] if self.scene.cameras else orbit(self.scene.mesh, azimuth=0.5, elevation=0.3)
+    def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
+        """Materials evaluated at the vertices: once for all views.
 
-    @property
-    def mesh(self):
-        """The mesh of all parts, with the scene's own normals."""
-        return self.scene.mesh
+        Args:
+            materials: A dictionary from names of parts to materials; None for none.
+
+        Returns:
+            The same dictionary with an `Appearance` for each material, which all verbs take.
+
+        Raises:
+            TypeError: As in `view`.
+            ValueError: As in `view`.
+        """
+        if materials is None:
+            return {}
+        if not isinstance(materials, Mapping):
+            raise TypeError(
+                f"the materials must be a dictionary from names of parts to materials, got {type(materials).__name__}"
+            )
+        known = {part.name: (part, each) for part, each in zip(self.scene.parts, self.shading, strict=True)}
+        unknown = [name for name in materials if name not in known]
+        if unknown:
+            raise ValueError(f"materials must be of the parts {list(known)}, got one of {unknown[0]!r}")
+        result = {}
+        for name, given in materials.items():
+            part, shading = known[name]
+            if shading.blend is None:
+                raise TypeError(
+                    f"the material of part {name!r} is a BRDF, which cannot be replaced: precompute the scene with "
+                    "another one, or with a TexturedMaterial"
+                )
+            kinds, source = (TexturedMaterial, Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
+            require.kind(f"the material of part {name!r}", given, *kinds, source=source)
+            if isinstance(given, TexturedMaterial):
+                given = appearance(part, shading, given)
+            result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
+        return result
 
     @property
     def vertices(self) -> int:
@@ -102,30 +185,11 @@ class RelitScene(System):
 
     @property
     def shared_light(self) -> tuple | None:
-        """That of its systems."""
+        """What the light of all parts depends on besides the environment."""
         return self.system.shared_light
 
-    def _blends(self, materials: Mapping[str, Any] | None) -> Sequence[Blend | None]:
-        """What the systems of the parts take."""
-        if materials is None:
-            return [each.blend for each in self.shading]
-        if not isinstance(materials, Mapping):
-            raise TypeError(
-                f"the materials must be a dictionary from names of parts to materials, got {type(materials).__name__}"
-            )
-        names = [part.name for part in self.scene.parts]
-        unknown = [name for name in materials if name not in names]
-        if unknown:
-            raise ValueError(f"materials must be of the parts {names}, got one of {unknown[0]!r}")
-        result = []
-        for part, shading in zip(self.scene.parts, self.shading, strict=True):
-            given = materials.get(part.name)
-            if given is None:
-                result.append(shading.blend)
-                continue
-            if shading.blend is None:
-                raise TypeError(f"the material of part {part.name!r} is a BRDF, which was precomputed for good")
-            name = f"the material of part {part.name!r}"
-            require.kind(name, given, TexturedMaterial, Blend, source="jaxprt.scene.TexturedMaterial")
-            result.append(given if isinstance(given, Blend) else blended(part, shading, given))
-        return result
+    def _all(self, materials: Mapping[str, Any] | None) -> list[Appearance]:
+        """The appearance of each part: the given one, or that which it was precomputed with."""
+        given = self.appearances(materials)
+        pairs = zip(self.scene.parts, self.shading, strict=True)
+        return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]

@@ -1,0 +1,291 @@
+"""Parts of scenes as systems take them: channels, weights, knots and frames, without any system.
+
+Vertices lie at the centers of the textures' texels, one vertex to a texel, so that expected values are the images'.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf.varying import Channels, PerVertex
+from jaxprt.relit.channels import Appearance, RoughnessFamily, appearance, of_part
+from jaxprt.scene import Part, TexturedMaterial
+from jaxprt.scene.material import Texture
+from jaxprt.scene.mesh import make_mesh
+
+ROWS, COLUMNS = 3, 4
+COUNT = ROWS * COLUMNS
+RANDOM = np.random.default_rng(0)
+TANGENT, BITANGENT, NORMAL = np.array([0.6, 0, 0.8]), np.array([0.8, 0, -0.6]), np.array([0, 1.0, 0])
+
+
+def image(low: float = 0.05, high: float = 1.0, channels: int = 1) -> jax.Array:
+    return jnp.asarray(RANDOM.uniform(low, high, (ROWS, COLUMNS, channels)), jnp.float32)
+
+
+def patch(material, **more) -> Part:
+    """A flat grid in the plane y = 0, vertices in the order of texels."""
+    row, column = np.divmod(np.arange(COUNT), COLUMNS)
+    position = np.stack([column, 0 * row, row], -1).astype(float)
+    corner = (np.arange(ROWS - 1)[:, None] * COLUMNS + np.arange(COLUMNS - 1)).reshape(-1, 1)
+    face = (corner + np.array([0, COLUMNS, 1, 1, COLUMNS, COLUMNS + 1])).reshape(-1, 3)
+    texture = np.stack([(column + 0.5) / COLUMNS, 1 - (row + 0.5) / ROWS], -1)
+    tangent = np.broadcast_to(TANGENT, (COUNT, 3))
+    return Part("patch", make_mesh(position, face, tangent=tangent, texture=texture), material, **more)
+
+
+def pairs(count: int = 3) -> jax.Array:
+    """Pairs of directions above the horizon for every vertex, [2 count v 3]."""
+    direction = RANDOM.normal(size=(2, count, COUNT, 3)).astype(np.float32)
+    direction[..., 2] = np.abs(direction[..., 2]) + 0.05
+    return jnp.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+@jax.jit
+def evaluated(model, wi, wo):
+    """Values of a BRDF, [count v c]."""
+    return model(wi, wo)
+
+
+@jax.jit
+def blended(shading, blend, wi, wo):
+    """Weights times channels of each vertex, [count v c]."""
+    if not shading.knot:
+        return jnp.einsum("nvk,vkc->nvc", shading.brdf(wi, wo), blend.weight)
+    assert isinstance(shading.brdf, RoughnessFamily)
+    value = jax.vmap(lambda each, wi, wo: shading.brdf(each)(wi, wo), (0, 1, 1), 1)(*blend.parameter, wi, wo)
+    return jnp.einsum("nvk,vkc->nvc", value, blend.weight)
+
+
+COLOR, METALLIC, ROUGHNESS, SPECULAR, TINT = image(channels=3), image(), image(0.2), image(0.1), image(channels=3)
+MATERIALS = {
+    "color": ({"roughness": 0.4, "metallic": 0.0}, {"base_color": COLOR}),
+    "metallic": ({"base_color": (0.9, 0.5, 0.2), "roughness": 0.3}, {"metallic": METALLIC}),
+    "ior": ({"roughness": 0.5, "metallic": 0.2, "ior": 1.9}, {"base_color": COLOR}),
+    "specular": ({"roughness": 0.5, "metallic": 0.0}, {"base_color": COLOR, "specular": SPECULAR}),
+    "tint": ({"roughness": 0.6, "metallic": 0.3, "specular": 0.7}, {"specular_color": TINT, "base_color": COLOR}),
+    "roughness": ({"metallic": 0.5, "anisotropy": 0.3}, {"roughness": ROUGHNESS, "base_color": COLOR}),
+    "diffuse": ({"metallic": 0.0, "specular": 0.0}, {"base_color": COLOR, "roughness": ROUGHNESS}),
+    "smooth": ({"roughness": 0.0, "metallic": 1.0}, {"base_color": COLOR}),
+}
+
+
+def textured(factor: dict, images: dict) -> TexturedMaterial:
+    return TexturedMaterial(**factor, **{f"{name}_texture": Texture(each) for name, each in images.items()})
+
+
+def at_vertices(factor: dict, images: dict) -> MetallicRoughness:
+    """The material of each vertex, by NumPy."""
+    value = {}
+    for name in ("base_color", "metallic", "roughness", "ior", "specular", "specular_color", "anisotropy"):
+        start = np.asarray(factor.get(name, {"ior": 1.5, "anisotropy": 0.0}.get(name, 1.0)), np.float32)
+        colored = name.endswith("color")
+        every = np.broadcast_to(start, (COUNT, 3) if colored else (COUNT,))
+        value[name] = jnp.asarray(every * np.asarray(images[name]).reshape(every.shape) if name in images else every)
+    return MetallicRoughness(**value, rotation=jnp.zeros(COUNT))
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_weights_times_channels_are_the_material_of_each_vertex(name, close):
+    shading = of_part(patch(textured(*MATERIALS[name])))
+    wi, wo = pairs()
+    expected = evaluated(at_vertices(*MATERIALS[name]), wi, wo)
+    close(blended(shading, shading.blend, wi, wo), expected, tolerance=2e-5)
+    assert isinstance(shading.exact, PerVertex)
+    close(evaluated(shading.exact, *jnp.swapaxes(jnp.stack([wi, wo]), 1, 2)), np.swapaxes(expected, 0, 1))
+
+
+def test_vertex_colors_multiply_the_base_color(close):
+    factor, images = MATERIALS["color"]
+    tint = image(channels=3).reshape(COUNT, 3)
+    shading = of_part(patch(textured(factor, images), color=tint))
+    wi, wo = pairs()
+    expected = at_vertices(factor, {"base_color": images["base_color"].reshape(-1, 3) * tint})
+    close(blended(shading, shading.blend, wi, wo), evaluated(expected, wi, wo))
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_another_material_has_its_own_weights_whatever_the_scale(name, close):
+    """The part is made for one material and shown with another; scales are those of the first."""
+    factor, images = MATERIALS[name]
+    first = patch(textured(factor, images))
+    shading = of_part(first)
+    other = {each: value if each == "roughness" else value[::-1, ::-1] * 0.5 for each, value in images.items()}
+    shown = appearance(first, shading, textured(factor, other))
+    wi, wo = pairs()
+    expected = evaluated(at_vertices(factor, other), wi, wo)
+    close(blended(shading, shown.blend, wi, wo), expected, tolerance=2e-5)
+
+
+def test_channels_that_no_vertex_needs_are_left_out():
+    terms = {name: of_part(patch(textured(*each))).term for name, each in MATERIALS.items()}
+    assert terms["smooth"] == (1, 2)
+    assert terms["color"] == terms["metallic"] == terms["ior"] == (0, 1, 2)
+    assert terms["specular"] == terms["tint"] == (0, 1, 2, 3)
+    assert terms["diffuse"] == (3,)
+
+
+def test_what_is_ideally_diffuse_is_a_white_lambert_brdf_without_knots():
+    shading = of_part(patch(textured(*MATERIALS["diffuse"])))
+    assert isinstance(shading.brdf, Lambert)
+    assert shading.knot == shading.blend.parameter == ()
+    np.testing.assert_allclose(shading.blend.weight[:, 0], COLOR.reshape(-1, 3), rtol=1e-6)
+
+
+def test_a_black_material_reflects_nothing_and_emits_what_it_emits():
+    glow = image(channels=3)
+    black = {"base_color": 0.0, "specular": 0.0, "metallic": 0.0, "emissive": (2.0, 3.0, 4.0)}
+    shading = of_part(patch(textured(black, {"emissive": glow})))
+    assert not np.any(shading.blend.weight)
+    np.testing.assert_allclose(shading.emitted, np.asarray(glow).reshape(-1, 3) * [2, 3, 4], rtol=1e-6)
+
+
+def test_what_emits_nothing_has_none():
+    assert of_part(patch(TexturedMaterial())).emitted is None
+
+
+def test_weights_of_channels_are_about_one_except_for_rare_ones():
+    """A fit of all channels together is then about what is seen."""
+    shading = of_part(patch(textured(*MATERIALS["metallic"])))
+    mean = np.mean(np.asarray(shading.blend.weight), (0, 2))
+    assert np.all((mean > 1e-3) & (mean < 1.001))
+    assert np.any(mean > 0.99)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.2, 1.0), (0.0, 0.5), (0.4, 0.41)])
+def test_knots_cover_the_roughness_in_steps_of_less_than_one_and_a_half(low, high):
+    rough = jnp.linspace(low, high, COUNT).reshape(ROWS, COLUMNS, 1)
+    shading = of_part(patch(textured({}, {"roughness": rough})))
+    (knot,) = shading.knot
+    (parameter,) = shading.blend.parameter
+    np.testing.assert_allclose(np.exp(knot[[0, -1]]), [max(low, 1e-3**0.5), high], rtol=1e-6)
+    np.testing.assert_allclose(np.exp(parameter), np.maximum(rough.ravel(), 1e-3**0.5), rtol=1e-5)
+    assert np.all(np.diff(knot) > 0)
+    assert np.diff(knot).max() <= np.log(1.5) + 1e-6
+
+
+def test_roughness_of_one_value_needs_no_knots():
+    shading = of_part(patch(textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})))
+    assert shading.knot == shading.blend.parameter == ()
+    assert isinstance(shading.brdf, Channels)
+    np.testing.assert_allclose(shading.brdf.model[0].roughness, 0.4, rtol=1e-6)
+
+
+@pytest.mark.parametrize("hand", [1.0, -1.0])
+def test_normal_maps_tilt_normals(hand, close):
+    slope = RANDOM.uniform(-0.5, 0.5, (COUNT, 2))
+    normal = np.concatenate([slope, np.ones((COUNT, 1))], 1)
+    texel = ((normal / 1.5 + 1) / 2).reshape(ROWS, COLUMNS, 3).astype(np.float32)
+    part = patch(
+        TexturedMaterial(normal_scale=0.5, normal_texture=Texture(jnp.asarray(texel))), handedness=jnp.full(COUNT, hand)
+    )
+    x, y = 0.5 * slope.T[..., None]
+    expected = x * TANGENT + hand * y * BITANGENT + NORMAL
+    mesh = of_part(part).mesh
+    close(mesh.normal, expected / np.linalg.norm(expected, axis=1, keepdims=True))
+    close(np.sum(np.asarray(mesh.normal * mesh.tangent), 1), np.zeros(COUNT), tolerance=1e-6)
+    np.testing.assert_array_equal(mesh.position, part.mesh.position)
+
+
+@pytest.mark.parametrize("hand", [1.0, -1.0])
+def test_tangents_lie_along_the_anisotropy_as_if_the_material_turned(hand, close):
+    part = patch(TexturedMaterial(roughness=0.4, anisotropy=0.6, rotation=0.7), handedness=jnp.full(COUNT, hand))
+    shading = of_part(part)
+    expected = np.cos(0.7) * TANGENT + hand * np.sin(0.7) * BITANGENT
+    close(shading.mesh.tangent, np.broadcast_to(expected, (COUNT, 3)))
+    wi, wo = pairs()
+    frame = np.stack([TANGENT, BITANGENT, NORMAL]).astype(np.float32)
+    along = np.asarray(shading.mesh.tangent)[0]
+    turned = np.stack([along, np.cross(NORMAL, along), NORMAL]).astype(np.float32)
+    value = evaluated(MetallicRoughness(roughness=0.4, anisotropy=0.6, rotation=hand * 0.7), wi, wo)
+    new = [each @ frame @ turned.T for each in (wi, wo)]
+    close(blended(shading, shading.blend, *new), np.broadcast_to(value, (*value.shape[:2], 3)), tolerance=1e-4)
+
+
+def test_rotation_without_anisotropy_and_flat_maps_leave_the_mesh_alone():
+    flat = np.broadcast_to(np.float32([0.5, 0.5, 1.0]), (ROWS, COLUMNS, 3))
+    part = patch(TexturedMaterial(rotation=0.7, normal_texture=Texture(flat)))
+    assert of_part(part).mesh is part.mesh
+
+
+def test_a_texture_of_anisotropy_counts_as_its_mean_and_says_so():
+    texel = np.full((ROWS, COLUMNS, 3), 0.5, np.float32)
+    texel[..., 0], texel[..., 2] = 1.0, np.linspace(0, 1, COUNT).reshape(ROWS, COLUMNS)
+    part = patch(TexturedMaterial(anisotropy=0.8, anisotropy_texture=Texture(jnp.asarray(texel))))
+    with pytest.warns(
+        UserWarning, match=r"part 'patch' has a texture of anisotropy, from 0\.00 to 0\.80; its mean 0\.40"
+    ):
+        shading = of_part(part)
+    np.testing.assert_allclose(shading.exact.model.anisotropy, 0.4, rtol=1e-6)
+
+
+def test_a_plain_brdf_stays_as_it_is():
+    model = CookTorrance()
+    shading = of_part(patch(model))
+    assert shading.brdf is shading.exact is model
+    assert shading.blend is None
+
+
+def test_a_function_becomes_what_jitted_functions_take():
+    shading = of_part(patch(lambda wi, wo: wi[..., :1] * 0 + 0.25))
+    wi, wo = pairs()
+    assert np.all(jax.jit(lambda each: each.brdf(wi, wo))(shading) == 0.25)
+
+
+def test_brdfs_of_another_form_are_refused():
+    each = PerVertex(Lambert(jnp.ones((COUNT, 1))))
+    with pytest.raises(TypeError, match="part 'patch' must be one BRDF for all vertices or a TexturedMaterial, got a"):
+        of_part(patch(each))
+
+
+NEW = {
+    "color": ({"base_color": 0.5}, r"'patch' was precomputed without the terms that the new material needs \(rim\)"),
+    "dielectric": ({"metallic": 0.0, "specular": 0.5}, r"\(diffuse, rim, bare diffuse\)"),
+    "rough": (
+        {"roughness": 0.6},
+        r"for roughness from 0\.400 to 0\.500, got a material from 0\.480 to 0\.600: precomp",
+    ),
+    "smooth": ({"roughness": 0.4}, r"for roughness from 0\.400 to 0\.500, got a material from 0\.320 to 0\.400"),
+    "anisotropy": (
+        {"anisotropy": 0.3},
+        r"'patch' was precomputed for an anisotropy of 0\.500, got a material of 0\.300",
+    ),
+    "direction": ({"rotation": 1.0}, r"'patch' was precomputed with another direction of anisotropy"),
+    "normal": ({"normal_texture": Texture(image(channels=3))}, r"'patch' was precomputed with another normal map"),
+}
+
+
+def metal(**change) -> TexturedMaterial:
+    rough = jnp.linspace(0.8, 1.0, COUNT).reshape(ROWS, COLUMNS, 1)
+    return TexturedMaterial(**({"roughness": 0.5, "anisotropy": 0.5} | change), roughness_texture=Texture(rough))
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_materials_that_need_what_was_not_precomputed_are_refused(name):
+    change, message = NEW[name]
+    part = patch(metal())
+    with pytest.raises(ValueError, match=message):
+        appearance(part, of_part(part), metal(**change))
+
+
+def test_a_material_with_textures_needs_texture_coordinates():
+    bare = patch(metal())
+    part = Part("patch", make_mesh(bare.mesh.position, bare.mesh.face), TexturedMaterial())
+    with pytest.raises(ValueError, match=r"part 'patch' must have mesh\.texture for the textures of its"):
+        appearance(part, of_part(part), metal())
+
+
+def test_inside_a_program_vertices_that_need_what_was_not_precomputed_are_nan():
+    part = patch(metal())
+    shading = of_part(part)
+
+    @jax.jit
+    def weight(material) -> Appearance:
+        return appearance(part, shading, material).blend.weight
+
+    np.testing.assert_allclose(weight(metal()), shading.blend.weight, rtol=1e-5)
+    assert np.isnan(weight(metal(metallic=0.5))).all()
+    high = np.asarray(metal().roughness_texture.image).ravel() * 0.55 > 0.501
+    np.testing.assert_array_equal(np.isnan(weight(metal(roughness=0.55))).all((1, 2)), high)
