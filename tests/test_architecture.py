@@ -38,6 +38,7 @@ ONLY_IN = {
 }
 
 MOST_LINES = 400
+MOST_LINES_OF_A_FUNCTION = 60  # its docstring apart
 VAGUE = {"utils", "util", "common", "helpers", "misc", "_src", "core"}
 
 
@@ -137,6 +138,15 @@ def test_module_has_a_subject_and_fits_on_a_few_screens(module):
     assert not VAGUE & set(module.split("."))
     lines = len(PATHS[module].read_text().splitlines())
     assert lines <= MOST_LINES, f"{lines} lines: {module} has two subjects"
+
+
+@each_module
+def test_functions_have_one_idea(module):
+    functions = (node for node in ast.walk(TREES[module]) if isinstance(node, ast.FunctionDef))
+    for each in functions:
+        documented = len((ast.get_docstring(each) or "").splitlines())
+        lines = (each.end_lineno or 0) - each.lineno + 1 - documented
+        assert lines <= MOST_LINES_OF_A_FUNCTION, f"{each.name} has {lines} lines without its docstring"
 
 
 @each_module

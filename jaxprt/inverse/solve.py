@@ -1,7 +1,7 @@
 """Least squares by jaxopt, which no other module knows."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -215,6 +215,35 @@ def marquardt(
     return Fit(unravel(value), np.array(history), unravel(jnp.asarray(deviation, free.dtype)), told.T)
 
 
+def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:
+    """What each number changes, squared, estimated by random signs; and its unit, the reciprocal of the root."""
+    probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), dtype)
+    square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
+    whole = jnp.max(square)
+    return square, 1 / jnp.sqrt(square + _LEAST * jnp.where(whole > 0, whole, 1))
+
+
+def _step_length(curved: Callable, x: Array) -> Array:
+    """A safe step for an objective, by the largest eigenvalue of its curvature: power iteration."""
+    tiny = jnp.finfo(x.dtype).tiny
+
+    def step(_, towards):
+        return curved(towards / jnp.maximum(jnp.linalg.norm(towards), tiny))
+
+    towards = jax.random.normal(jax.random.key(1), x.shape, x.dtype)
+    largest = jnp.linalg.norm(jax.lax.fori_loop(0, _POWER, step, towards))
+    return 1 / (_SAFETY * jnp.maximum(largest, tiny))
+
+
+def _first_order(value: Callable, bounded: bool, length, steps: int) -> Any:
+    """Of jaxopt, for an objective: with a fixed step where there are bounds, else by line searches."""
+    options = {"maxiter": steps, "implicit_diff": False}
+    if not bounded:
+        return jaxopt.LBFGS(value, **options)
+    box = jaxopt.projection.projection_box
+    return jaxopt.ProjectedGradient(value, box, stepsize=lambda _: length, **options)
+
+
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
     """By first derivatives, each number in units of what it changes.
 
@@ -233,38 +262,21 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         return jnp.linalg.norm(left), jnp.sum(left**2) / 2 + extra(x)
 
     def solver(size, length) -> Any:
-        """For numbers in units of their sizes."""
-
-        def value(y):
-            return both(function(size * y), size * y)[1]
-
-        options = {"maxiter": steps, "implicit_diff": False}
-        if not bounded:
-            return jaxopt.LBFGS(value, **options)
-        box = jaxopt.projection.projection_box
-        return jaxopt.ProjectedGradient(value, box, stepsize=lambda _: length, **options)
+        return _first_order(lambda y: both(function(size * y), size * y)[1], bounded, length, steps)
 
     @jax.jit
     def begin(x, bound):
         left, along = jax.linearize(function, x)
         back = jax.linear_transpose(along, x)
-        probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), x.dtype)
-        square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
-        whole = jnp.max(square)
-        size = 1 / jnp.sqrt(square + _LEAST * jnp.where(whole > 0, whole, 1))
+        square, size = _units(back, count, x.dtype)
         limit = [tuple(each / size for each in bound)] if bounded else []
 
-        def curved(_, towards):
-            towards = towards / jnp.maximum(jnp.linalg.norm(towards), tiny)
+        def curved(towards):
             bent = size * back(along(size * towards))[0]
             slope = jax.grad(lambda y: extra(size * y))
             return bent + jax.jvp(slope, (x / size,), (towards,))[1]
 
-        length, tiny = 0.0, jnp.finfo(x.dtype).tiny
-        if bounded:
-            towards = jax.random.normal(jax.random.key(1), x.shape, x.dtype)
-            largest = jnp.linalg.norm(jax.lax.fori_loop(0, _POWER, curved, towards))
-            length = 1 / (_SAFETY * jnp.maximum(largest, tiny))
+        length = _step_length(curved, x) if bounded else 0.0
         state = solver(size, length).init_state(x / size, *limit)
         return square, (size, length), limit, x / size, state, both(left, x)
 
@@ -293,9 +305,13 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         if still == _PATIENT:
             break
     noise = history[-1] ** 2 / max(1, count)
-    square, place = np.asarray(square), np.asarray(y)
+    deviation = _deviations(np.asarray(square), np.asarray(y), limit, noise)
+    return Fit(unravel(scales[0] * y), np.array(history), unravel(jnp.asarray(deviation, first.dtype)), None)
+
+
+def _deviations(square: np.ndarray, place: np.ndarray, limit: Sequence, noise: float) -> np.ndarray:
+    """Deviation of each number; infinite where residuals hardly depend on it, and at its bounds."""
     known = square > _KNOWN**2 * square.max()
     for low, high in limit:
         known &= (np.asarray(low) < place) & (place < np.asarray(high))
-    deviation = np.where(known, np.sqrt(noise / np.where(square > 0, square, 1)), np.inf)
-    return Fit(unravel(scales[0] * y), np.array(history), unravel(jnp.asarray(deviation, first.dtype)), None)
+    return np.where(known, np.sqrt(noise / np.where(square > 0, square, 1)), np.inf)

@@ -1,6 +1,6 @@
 """Scenes made ready to be relit, by any of the systems."""
 
-from jaxprt.relit import build, channels, planning, recipes, scene
+from jaxprt.relit import build, channels, measuring, planning, recipes, scene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
@@ -15,6 +15,7 @@ __all__ = [
     "Terms",
     "build",
     "channels",
+    "measuring",
     "plan",
     "planning",
     "precompute",

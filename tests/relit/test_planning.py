@@ -15,6 +15,7 @@ from jaxprt.relit import Clusters, Harmonics, Lobes
 from jaxprt.scene import Environment, TexturedMaterial, builtin
 from jaxprt.scene.mesh import ground_plane
 
+measuring = importlib.import_module("jaxprt.relit.measuring")
 planning = importlib.import_module("jaxprt.relit.planning")
 ASKED = 0.3
 VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
@@ -70,6 +71,16 @@ def test_the_error_asked_for_holds_from_other_views_and_under_another_light(scen
         assert np.linalg.norm(np.subtract(now, exact)) < 1.25 * ASKED * np.linalg.norm(exact)
 
 
+def test_the_report_has_the_error_of_every_part(scene, sky, planned, ready):
+    found = ready.report([sky, Environment(jnp.ones((6, 8, 8, 3)))])
+    assert [(each.name, each.vertices) for each in found.part] == [(each.name, each.vertices) for each in planned.part]
+    for each, part in zip(found.part, planned.part, strict=True):
+        assert len(each.errors) == 2
+        assert 0 < each.errors[0] < 2 * part.chosen.error + 0.01
+    assert found.nbytes == prt.memory(ready.system)
+    assert str(found).count("off by") == 3
+
+
 def test_bytes_are_those_of_what_is_made(planned, ready):
     assert planned.nbytes == pytest.approx(prt.memory(ready.system), rel=0.2)
     assert planned.seconds > 0
@@ -119,8 +130,8 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
 
 
 def test_a_scenes_own_lights_are_planned_for(scene, sky):
-    assert planning.lights_of(prt.Scene(scene.parts, environments=[sky])) == (sky,)
-    assert len(planning.lights_of(scene)) == 2
+    assert measuring.lights_of(prt.Scene(scene.parts, environments=[sky])) == (sky,)
+    assert len(measuring.lights_of(scene)) == 2
 
 
 @pytest.mark.parametrize(

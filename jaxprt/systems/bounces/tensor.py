@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -195,38 +196,14 @@ def precompute(
 
     Reference: Sun et al. 2007, sections 3.1 and 4.3.
     """
-    if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
-        raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
-    for number, each in enumerate(brdfs):
-        if not isinstance(each, DynamicBrdf | SeparableBrdf):
-            raise TypeError(
-                f"the BRDF of region {number} must be from jaxprt.bounces.factor or separable.factor, got "
-                f"{type(each).__name__}"
-            )
-    region = np.asarray(mesh.region)
-    numbers = np.unique(region)
-    if len(brdfs) != len(numbers):
-        raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
-    if bounces not in (1, 2):
-        raise ValueError(f"bounces must be 1 or 2, got {bounces}")
-    if not 0 <= least < 1:
-        raise ValueError(f"least must be at least 0 and less than 1, got {least}")
-    if min(components, modes, edge, size) < 1 or edge & (edge - 1):
-        raise ValueError(
-            f"components, modes, edge and size must be at least 1, and edge a power of two, got {components}, {modes}, "
-            f"{edge} and {size}"
-        )
+    numbers = _regions(mesh, brdfs)
+    _check_sizes(bounces, least, components, modes, edge, size)
     bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
     factor = tuple(each.factor if isinstance(each, DynamicBrdf) else functions.fixed_weights(each) for each in brdfs)
     if path is not None:
         os.makedirs(path, exist_ok=True)
-    options = {"executor": executor, "progress": progress}
-    response = []
-    for number, basis in zip(numbers.tolist(), bases, strict=True):
-        vertex = np.flatnonzero(region == number)
-        own = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
-        store = None if path is None else os.path.join(path, f"response_{number}")
-        response.append(visibility.blocks.compute(own, path=store, label=f"region {number}", **options)["response"])
+    run = _Run(path, executor, progress)
+    region = np.asarray(mesh.region)
     member = separable.clustered.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
     job = jobs.TransferJob.make(
         mesh,
@@ -234,7 +211,7 @@ def precompute(
         None,
         size,
         bases=bases,
-        response=tuple(response),
+        response=_responses(mesh, bases, numbers, edge, run),
         white=np.concatenate([_white(each) for each in factor]),
         scale=np.asarray(scales(factor)),
         region=np.searchsorted(numbers, region),
@@ -242,9 +219,7 @@ def precompute(
         components=min(components, member.shape[1]),
         modes=min(modes, 6 * edge * edge),
     )
-    del response
-    store = None if path is None else os.path.join(path, "clusters")
-    found = visibility.blocks.compute(job, path=store, label="bounce", **options)
+    found = run.compute(job, "clusters", "bounce")
     share = _shares(found["energy"], job.scale)
     function = np.flatnonzero(share >= least)
     worth = [_rms(found["white"])]
@@ -254,22 +229,80 @@ def precompute(
     if bounces == 2 and function.size:
         count = min(_twice(components), member.shape[1])
         again = job.again(weight, core, found["mode"], function, components=count)
-        sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
-        white = job.white[function]
-        brought = [again.brought(again.tensor(member[each]), member[each], white) for each in sample]
-        worth.append(_rms(np.concatenate(brought)))
-        if worth[1] >= least:
-            store = None if path is None else os.path.join(path, "clusters_2")
-            twice = visibility.blocks.compute(again, path=store, label="bounce 2", **options)
-            worth[1] = _rms(twice["white"])
-            parts = (twice["weight"].reshape(*member.shape, -1), twice["core"], twice["error"])
-            second = SecondBounce(*map(jax.device_put, parts))
+        second, brought = _second(again, member, job.white[function], least, run)
+        worth.append(brought)
     if progress:
         _tell(share, function, worth, second, bounces)
     rows = (separable.clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
-    told = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
-    return TransferTensor(*arrays, factor=factor, second=second, **told, mesh=visibility.blocks.scene_key(mesh))
+    judged = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
+    return TransferTensor(*arrays, factor=factor, second=second, **judged, mesh=visibility.blocks.scene_key(mesh))
+
+
+class _Run(NamedTuple):
+    """Where blocks are computed and kept."""
+
+    path: str | os.PathLike | None
+    executor: Executor | None
+    progress: bool
+
+    def compute(self, job: visibility.blocks.Job, name: str, label: str) -> dict[str, np.ndarray]:
+        """The results of a job, kept in a folder of a name."""
+        store = None if self.path is None else os.path.join(self.path, name)
+        options = {"executor": self.executor, "progress": self.progress}
+        return visibility.blocks.compute(job, path=store, label=label, **options)
+
+
+def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
+    """Numbers of the regions, if there is a BRDF for each."""
+    if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
+        raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
+    for number, each in enumerate(brdfs):
+        if not isinstance(each, DynamicBrdf | SeparableBrdf):
+            raise TypeError(
+                f"the BRDF of region {number} must be from jaxprt.bounces.factor or separable.factor, got "
+                f"{type(each).__name__}"
+            )
+    numbers = np.unique(np.asarray(mesh.region))
+    if len(brdfs) != len(numbers):
+        raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
+    return numbers
+
+
+def _check_sizes(bounces: int, least: float, components: int, modes: int, edge: int, size: int) -> None:
+    """Refuses numbers that are out of range."""
+    if bounces not in (1, 2):
+        raise ValueError(f"bounces must be 1 or 2, got {bounces}")
+    if not 0 <= least < 1:
+        raise ValueError(f"least must be at least 0 and less than 1, got {least}")
+    if min(components, modes, edge, size) < 1 or edge & (edge - 1):
+        raise ValueError(
+            f"components, modes, edge and size must be at least 1, and edge a power of two, got {components}, {modes}, "
+            f"{edge} and {size}"
+        )
+
+
+def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run: _Run) -> tuple[np.ndarray, ...]:
+    """What the light factors of each region make of direct light."""
+    result = []
+    for number, basis in zip(numbers.tolist(), bases, strict=True):
+        vertex = np.flatnonzero(np.asarray(mesh.region) == number)
+        job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
+        result.append(run.compute(job, f"response_{number}", f"region {number}")["response"])
+    return tuple(result)
+
+
+def _second(
+    job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: _Run
+) -> tuple[SecondBounce | None, float]:
+    """The second bounce, or None if some clusters show that it brings too little; and what it brings."""
+    sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
+    worth = _rms(np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample]))
+    if worth < least:
+        return None, worth
+    found = run.compute(job, "clusters_2", "bounce 2")
+    parts = (found["weight"].reshape(*member.shape, -1), found["core"], found["error"])
+    return SecondBounce(*map(jax.device_put, parts)), _rms(found["white"])
 
 
 def _areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
