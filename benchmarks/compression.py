@@ -103,8 +103,8 @@ def measure(quick: bool, store: pathlib.Path | None):
     published_line, peer = measure_published(glossy, whole, exact, lights, views, quick)
     yield from published_line
     for terms, vectors, modes, keep, sun in front[:1] if quick else front:
-        cut = parts[0].transport.keep(keep, modes=modes, vectors=vectors, terms=terms)
-        case = [Part(seen[0], BRDF, factored.keep(terms), cut), Part(seen[1], GROUND, plain, parts[1].transport)]
+        cut = parts[0].transport.truncate(keep, modes=modes, vectors=vectors, terms=terms)
+        case = [Part(seen[0], BRDF, factored.truncate(terms), cut), Part(seen[1], GROUND, plain, parts[1].transport)]
         name = f"{terms} terms, {vectors} vectors, {modes} modes, {keep} coefficients, {sun} texels"
         stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in seen)
         yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
@@ -249,7 +249,7 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
             def turn(eye=views[0], blurred=blurred, texel=texel, excess=excess, parts=parts):
                 eye = jnp.asarray(eye)
                 return [
-                    lobe.combine(blurred, lobe.look(each, table, eye=eye))
+                    lobe.combine(blurred, lobe.view_lobes(each, table, eye=eye))
                     + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
                     for each, table, brdf in parts
                 ]
@@ -259,7 +259,7 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
                 for at, now in enumerate(turn(eye=each)):
                     square += exact[at].squares(number, place, now)
             eye = jnp.asarray(views[0])
-            view = [lobe.look(each, table, eye=eye) for each, table, _ in parts]
+            view = [lobe.view_lobes(each, table, eye=eye) for each, table, _ in parts]
 
             def lighten(light=light, view=view, eye=eye, parts=parts, sun=sun):
                 texel, excess, rest = bright_texels.split(light, count=sun)

@@ -113,7 +113,7 @@ def figure() -> None:
             for resolution in RESOLUTIONS
         ]
         for terms in FIGURE_TERMS:
-            errors = [float(sample_error(brdf, each.keep(terms))[1]) for each in factored]
+            errors = [float(sample_error(brdf, each.truncate(terms))[1]) for each in factored]
             print(f"{terms:>5}" + "".join(f"{error:8.3f}" for error in errors), flush=True)
 
 

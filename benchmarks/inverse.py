@@ -183,7 +183,7 @@ class Coated:
         table, s = self.lobes.at(jnp.log(material["nu"]), jnp.log(material["nv"])), material["specular"]
         weight, diffuse = (s * each[:1] + (1 - s) * each[1:] for each in (table.weight, table.diffuse))
         table = eqx.tree_at(lambda each: (each.weight, each.diffuse), table, (weight, diffuse))
-        glossy = lobe.combine(light, lobe.look(self.seen, table, eye=eye))
+        glossy = lobe.combine(light, lobe.view_lobes(self.seen, table, eye=eye))
         under = harmonic.radiance(self.shadows, self.base, coefficient, eye=eye)
         return glossy + material["diffuse"] * (1 - s) * under
 

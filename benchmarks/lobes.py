@@ -69,7 +69,9 @@ def measure(quick: bool):
                 rest = Environment(jnp.stack([bright_texels.split(light, count=SUN)[2].radiance for light in lights]))
                 left = lobe.Remainder(brdf, table)
                 most = separable.factor(left, terms=max(terms), resolution=12 if quick else 64)
-                more = [radiance(most.keep(number), seen, visible, rest, views, error=TERMS_ERROR) for number in terms]
+                more = [
+                    radiance(most.truncate(number), seen, visible, rest, views, error=TERMS_ERROR) for number in terms
+                ]
             for number, (name, light) in enumerate(zip(names, lights, strict=True)):
 
                 def frame(eye=views[0], table=table, light=light, brdf=brdf, samples=samples):

@@ -2,7 +2,7 @@
 
 XLA's CPU code repeats a step for each of its uses where it fuses the two; gathers, and loops over vertices, are then
 done many times over. JAX makes gradients of linear maps by transposing what it was given, step by step; that of a
-gather is a scatter, which is five times as slow. `apart` and `linear` are the cures, under all transformations.
+gather is a scatter, which is five times as slow. `isolated` and `linear` are the cures, under all transformations.
 """
 
 import functools
@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 Fixed = TypeVar("Fixed", bound=PyTree)
 
 
-def apart(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
+def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
     """Decorates a step that is compiled by itself: like `jax.jit`, and also where another program holds it.
 
     Args:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.compile import apart, linear
+from jaxprt.compile import isolated, linear
 
 
 def product(fixed, x):
@@ -107,7 +107,7 @@ def test_the_gradient_has_the_type_of_its_argument(matrix):
     assert jax.grad(ours)(single, matrix).dtype == jnp.float32
 
 
-@partial(apart, static=("power",))
+@partial(isolated, static=("power",))
 def step(x, y, *, power):
     return x**power * y["y"], x - y["y"]
 
@@ -133,17 +133,17 @@ def test_a_step_apart_is_the_step(change, x64):
 
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf])
 def test_a_step_apart_is_taken_whatever_comes_first(value):
-    doubled = jax.jit(apart(lambda x: 2 * jnp.where(jnp.isfinite(x), x, 1)))
+    doubled = jax.jit(isolated(lambda x: 2 * jnp.where(jnp.isfinite(x), x, 1)))
     np.testing.assert_array_equal(doubled(jnp.array([value, 3.0])), [2, 6])
 
 
 def test_steps_take_whole_numbers_and_nothing():
-    assert jax.jit(apart(lambda x: x + 1))(jnp.array([-1, 4])).tolist() == [0, 5]
-    assert jax.jit(apart(lambda x: x + 1))(jnp.zeros((0, 3))).shape == (0, 3)
+    assert jax.jit(isolated(lambda x: x + 1))(jnp.array([-1, 4])).tolist() == [0, 5]
+    assert jax.jit(isolated(lambda x: x + 1))(jnp.zeros((0, 3))).shape == (0, 3)
 
 
 def test_on_cpus_a_step_inside_a_program_is_a_branch_of_its_own():
-    text = jax.jit(apart(lambda x: jnp.sin(x) + 1)).lower(jnp.ones(3)).as_text()
+    text = jax.jit(isolated(lambda x: jnp.sin(x) + 1)).lower(jnp.ones(3)).as_text()
     assert ("case" in text) == (jax.default_backend() == "cpu")
 
 
@@ -154,7 +154,7 @@ def test_a_gradient_outside_any_program_is_compiled_once():
         traces.append(x)
         return jnp.sin(x) ** 2
 
-    step = apart(counted)
+    step = isolated(counted)
     slope = jax.grad(lambda x: jnp.sum(step(x)))
     first = slope(jnp.ones(3))
     before = len(traces)

@@ -63,7 +63,7 @@ HOST = {
     "systems.lobe.pyramid.between": "indices, of a NumPy table",
     "systems.lobe.pyramid.corners": "indices beside the weights",
     "systems.lobe.relight.scales": "NumPy tables",
-    "systems.lobe.relight.look": "gives indices beside shares, compiled in steps; lobe.radiance has them all",
+    "systems.lobe.relight.view_lobes": "gives indices beside shares, compiled in steps; lobe.radiance has them all",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
     "require.length": "checks a shape",

@@ -186,20 +186,17 @@ def _run(options: argparse.Namespace) -> None:
 
 def _made(system: str, view: View, options: argparse.Namespace) -> Made:
     """The scene, made ready by one system."""
-    size = next(iter(view.lights.values())).radiance.shape[-2]
-    recipes: dict[str, Recipe] | Recipe
+    output = options.output / system
     if system == "planned":
-        error = 0.05 if options.error is None else options.error
-        chosen = prt.plan(view.scene, environments=list(view.lights.values()), error=error)
-        print(chosen)
-        recipes = chosen.recipes
-    elif system == "separable":
-        recipes = prt.relit.Terms(options.terms, options.keep)
+        return report.plan(view, output, error=0.05 if options.error is None else options.error)
+    recipe: Recipe
+    if system == "separable":
+        recipe = prt.relit.Terms(options.terms, options.keep)
     elif system == "harmonic":
-        recipes = prt.relit.Harmonics(options.order - 1, _LAPLACIAN[options.window])
+        recipe = prt.relit.Harmonics(options.order - 1, _LAPLACIAN[options.window])
     else:
-        recipes = prt.relit.Lobes(options.lobes)
-    return report.make(view, recipes, options.output / system, size=size)
+        recipe = prt.relit.Lobes(options.lobes)
+    return report.make(view, recipe, output)
 
 
 def _view(options: argparse.Namespace) -> View:
@@ -247,7 +244,7 @@ def _loaded(options: argparse.Namespace) -> Scene:
     """The file's scene, upright, on its ground if one is asked for."""
     scene, brdf = prt.load_scene(options.mesh), _brdf(options)
     turn = np.array(_UPRIGHT[options.up])
-    parts = [eqx.tree_at(lambda each: each.mesh, part, prt.scene.mesh.turn(part.mesh, turn)) for part in scene.parts]
+    parts = [eqx.tree_at(lambda each: each.mesh, part, prt.scene.mesh.rotate(part.mesh, turn)) for part in scene.parts]
     if brdf is not None:
         parts = [_with(part, brdf) for part in parts]
     if options.ground:

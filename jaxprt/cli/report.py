@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxprt import files, image, relit, visibility
+from jaxprt.files import objects
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.recipes import Job, Recipe
 from jaxprt.scene import Camera, Environment, Scene
@@ -63,22 +64,39 @@ class Made(NamedTuple):
         return protocol.radiance(self.system, light, eye=eye, materials=self.materials)
 
 
-def make(view: View, recipes: dict[str, Recipe] | Recipe, output: Path, *, size: int) -> Made:
-    """Makes a scene ready by recipes; what is finished is kept in a folder.
+def plan(view: View, output: Path, *, error: float) -> Made:
+    """Makes a scene ready by a plan, which is kept with all else: the same command goes on with the same one.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
     """
+    lights = list(view.lights.values())
+    made = _made(view, output, error=error, environments=lights)
+    for part in objects.load(output / "plan").part:
+        made.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
+    return made
+
+
+def make(view: View, recipe: Recipe, output: Path) -> Made:
+    """Makes a scene ready by one recipe; what is finished is kept in a folder.
+
+    Raises:
+        ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
+    """
+    size = next(iter(view.lights.values())).radiance.shape[-2]
+    made = _made(view, output, system=recipe, size=size)
+    for part in view.scene.parts:
+        made.cost[part.name] = {"recipe": type(recipe).__name__, **vars(recipe)}
+    return made
+
+
+def _made(view: View, output: Path, **options: Any) -> Made:
     start, found = timeit.default_timer(), output.exists()
     try:
-        ready = relit.precompute(view.scene, system=recipes, size=size, path=output)
+        ready = relit.precompute(view.scene, path=output, **options)
     except ValueError as error:
         raise ValueError(f"{error}; here: name another --output" if found else str(error)) from error
-    cost: dict[str, Any] = {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)}
-    for part in view.scene.parts:
-        each = recipes[part.name] if isinstance(recipes, dict) else recipes
-        cost[part.name] = {"recipe": type(each).__name__, **vars(each)}
-    return Made(ready, None, cost)
+    return Made(ready, None, {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)})
 
 
 def exact(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
@@ -225,8 +243,8 @@ def _separable(shading: Shading, job: Job):
     full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, job)
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
         if terms <= full.brdf.terms:
-            short = full.transport.keep(keep, terms=terms)
-            yield {"terms": terms, "keep": keep}, SeparableSystem(short, full.brdf.keep(terms))
+            short = full.transport.truncate(keep, terms=terms)
+            yield {"terms": terms, "keep": keep}, SeparableSystem(short, full.brdf.truncate(terms))
 
 
 def _harmonic(shading: Shading, job: Job):

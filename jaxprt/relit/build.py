@@ -90,6 +90,9 @@ def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     kept = folder and folder / "plan"
     if kept is not None and kept.exists():
         found = objects.load(kept)
+        parts = {part.name: len(part.mesh.position) for part in scene.parts}
+        if {each.name: each.vertices for each in found.part} != parts:
+            raise ValueError(f"{kept} was made for another scene: name another path")
         if found.asked == options["error"] and found.rate == options["rate"]:
             return found
         raise ValueError(

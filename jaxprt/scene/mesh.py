@@ -177,7 +177,7 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
-def turn(mesh: Mesh, rotation: ArrayLike) -> Mesh:
+def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """The mesh turned by a rotation about the origin, frames and all.
 
     Raises:

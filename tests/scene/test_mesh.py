@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import Mesh, brush, ground_plane, join, load_mesh, make_mesh, split, turn
+from jaxprt.scene.mesh import Mesh, brush, ground_plane, join, load_mesh, make_mesh, rotate, split
 from jaxprt.sphere import directions
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -63,7 +63,7 @@ def test_texture_coordinates_come_back_and_follow_joining_splitting_and_turning(
     first, second = split(join([mesh, plain]))
     assert_equal(first, mesh)
     np.testing.assert_array_equal(second.texture, np.zeros((len(plain.position), 2)))
-    np.testing.assert_array_equal(turn(mesh, np.eye(3)).texture, mesh.texture)
+    np.testing.assert_array_equal(rotate(mesh, np.eye(3)).texture, mesh.texture)
     assert join([plain, plain]).texture is None
 
 
@@ -283,7 +283,7 @@ def test_lists_make_a_mesh(close):
 )
 def test_only_rotations_turn_a_mesh(matrix):
     with pytest.raises(ValueError, match="rotation must be a 3 x 3 matrix that turns and nothing else, got"):
-        turn(make_mesh(SQUARE, SQUARE_FACE), matrix)
+        rotate(make_mesh(SQUARE, SQUARE_FACE), matrix)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.995])
@@ -432,7 +432,7 @@ def test_the_ground_under_a_mesh_without_extent_is_a_square_all_the_same():
 
 def test_turned_mesh_keeps_its_shape_and_frames():
     mesh = builtin.sphere(rings=4, sectors=6)
-    turned = turn(mesh, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    turned = rotate(mesh, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
     np.testing.assert_allclose(turned.position[:, 1], mesh.position[:, 2], atol=1e-6)
     assert_frames(turned)
     np.testing.assert_allclose(turned.normal, turned.position, atol=1e-6)

@@ -38,7 +38,7 @@ WANTED = {
     ],
     "jaxprt.lobe.tabulate": [
         lambda: lobe.radiance(None, MODEL, LIGHT, eye=EYE),
-        lambda: lobe.look(None, TABLE, eye=EYE),
+        lambda: lobe.view_lobes(None, TABLE, eye=EYE),
     ],
     "jaxprt.scene.load_environment": [
         lambda: harmonic.project(COEFFICIENT, degree=2),

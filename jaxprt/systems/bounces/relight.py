@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.compile import apart
+from jaxprt.compile import isolated
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
@@ -166,7 +166,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
 
 
-@apart
+@isolated
 def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"]) -> Float[Array, "s c v"]:
     """SH coefficients, in world directions, of the radiance that arrives at each vertex.
 
@@ -215,7 +215,7 @@ def view_side(
     return tuple(result)
 
 
-@apart
+@isolated
 def combine(
     transport: DynamicTransport, arriving: tuple[Arriving, ...], view: tuple[ReflectedView, ...]
 ) -> Float[Array, "v c"]:
@@ -255,7 +255,7 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
 
 
-@apart
+@isolated
 def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
     light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
     first = _met(jnp.einsum("gle,lc->gce", tensor.mode, light), tensor.core)
@@ -276,7 +276,7 @@ def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Ar
     return jax.lax.map(one, (light, core)).reshape(clusters, light.shape[1], *shape)
 
 
-@apart
+@isolated
 def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arriving:
     local = rotation.rotate_each(whole[..., vertex], frame)
     cosine = harmonics.cosine(degree=DEGREE) / np.pi
@@ -285,7 +285,7 @@ def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arrivi
     return Arriving(local, reduce(jnp.add, parts))
 
 
-@apart
+@isolated
 def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, Array]:
     """Coefficients of the lobes of each row, and albedo of their diffuse part."""
     if lobe is None:
@@ -300,7 +300,7 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
     return jnp.stack(rows), each.diffuse
 
 
-@apart
+@isolated
 def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
     """Coefficients of a factored BRDF at each row."""
     view = brdf.view(directions.view(frame, position, eye))

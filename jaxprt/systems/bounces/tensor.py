@@ -53,7 +53,7 @@ class SecondBounce(eqx.Module):
     core: Float16[Array, "g l o s q q"]
     error: Float[Array, " g"]
 
-    def keep(self, components: int, *, scale: Float[Array, " q"]) -> "SecondBounce":
+    def truncate(self, components: int, *, scale: Float[Array, " q"]) -> "SecondBounce":
         """The first components; functions count by some scale."""
         core = self.core * (scale[:, None] * scale)
         energy = jnp.sum(core**2, (1, 3, 4, 5)) * jnp.sum(self.weight**2, 1)
@@ -101,7 +101,7 @@ class TransferTensor(eqx.Module):
         """Bytes of the tensors."""
         return sum(each.nbytes for each in jax.tree.leaves((self.weight, self.core, self.mode, self.second)))
 
-    def keep(self, components: int, *, modes: int) -> "TransferTensor":
+    def truncate(self, components: int, *, modes: int) -> "TransferTensor":
         """The first components and modes of one bounce, and half as many components of two.
 
         Their errors are then larger.
@@ -116,7 +116,7 @@ class TransferTensor(eqx.Module):
         energy, whole = _energy(self)
         kept = jnp.sum(energy[:, :modes, :components], (1, 2))
         error = jnp.sqrt(jnp.maximum(1 - kept / jnp.where(whole > 0, whole, 1), 0))
-        second = self.second and self.second.keep(_twice(components), scale=scales(self.factor)[self.function])
+        second = self.second and self.second.truncate(_twice(components), scale=scales(self.factor)[self.function])
         same = (self.place, self.region, self.area, self.function, self.factor, second)
         error = jnp.where(whole > 0, error, 0)
         return TransferTensor(weight, core, self.mode[..., :modes], *same, error, self.worth, self.mesh)
@@ -151,7 +151,7 @@ class TransferTensor(eqx.Module):
             raise ValueError(f"{reached}, got {error if nbytes is None else nbytes}")
         cost = np.where(fits, size if nbytes is None else wrong, np.inf)
         mode, component = np.unravel_index(np.argmin(cost), cost.shape)
-        return self.keep(int(component) + 1, modes=int(mode) + 1)
+        return self.truncate(int(component) + 1, modes=int(mode) + 1)
 
 
 def precompute(

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import apart
+from jaxprt.compile import isolated
 from jaxprt.scene.environment import Environment
 from jaxprt.systems import bright_texels, lobe, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
@@ -187,7 +187,7 @@ def view_side(
         if isinstance(brdf, SeparableBrdf):
             region.append(RegionView(surface, separable.view_tuple(own.terms, brdf, eye), None))
             continue
-        looked = None if brdf.lobe is None else lobe.look(own.seen, brdf.lobe, eye=eye)
+        looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye)
         factor = separable.view_tuple(own.terms, brdf.terms, eye) if brdf.terms.terms else None
         region.append(RegionView(surface, factor, looked))
     return DynamicView(eye, tuple(region))
@@ -245,7 +245,7 @@ def combine(
     return _gathered(tuple(result), transport.place)
 
 
-@apart
+@isolated
 def _mixed(brdf: DynamicBrdf, share: Array) -> Mixed:
     return brdf.at(share)
 
@@ -255,7 +255,7 @@ def _glossy(view: LobeView) -> LobeView:
     return LobeView(view.place, view.share, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
 
 
-@apart
+@isolated
 def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
     irradiance, result = met[:, -1], single
     if factor is not None:

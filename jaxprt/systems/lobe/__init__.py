@@ -3,7 +3,7 @@
 from jaxprt.systems.lobe import em, knots, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, bits, compress, precompute
-from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter, radiance
+from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, radiance, view_lobes
 from jaxprt.systems.lobe.remainder import Remainder
 from jaxprt.systems.lobe.system import LobeSystem
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes, diffuse, tabulate
@@ -22,7 +22,6 @@ __all__ = [
     "diffuse",
     "em",
     "knots",
-    "look",
     "mirror_lobes",
     "precompute",
     "prefilter",
@@ -34,4 +33,5 @@ __all__ = [
     "system",
     "table",
     "tabulate",
+    "view_lobes",
 ]

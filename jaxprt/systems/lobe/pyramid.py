@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import visibility
-from jaxprt.compile import apart
+from jaxprt.compile import isolated
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar
@@ -83,7 +83,7 @@ class LobeTransport(eqx.Module):
         return _decoded(read, bit, s, t, spread, size=self.size)
 
 
-@partial(apart, static=("size",))
+@partial(isolated, static=("size",))
 def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
     """Bytes of the eight texels that a lobe is read from, and for the scales in bits the place in the byte."""
     scale = scales(size)
@@ -102,23 +102,23 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
     return tuple(address), tuple(bit)
 
 
-@apart
+@isolated
 def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
     """All that a vertex reads side by side: what lies in memory together is then read together."""
     return jnp.stack(address).reshape(-1, address[0].shape[1]).T
 
 
-@apart
+@isolated
 def _bytes(level: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
     return jnp.take_along_axis(level, address, 1, mode="promise_in_bounds")
 
 
-@apart
+@isolated
 def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
     return tuple(read.T.reshape(8, -1, len(read)))
 
 
-@partial(apart, static=("size",))
+@partial(isolated, static=("size",))
 def _decoded(read: tuple, bit: tuple, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, Array]:
     """Value and slopes, from the eight bytes."""
     scale = scales(size)

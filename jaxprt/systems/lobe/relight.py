@@ -1,7 +1,8 @@
 """Relighting by lobes: light, view and BRDF are all free, and each change redoes only its part.
 
-`prefilter` blurs the light to a scale of widths, once per change of light. `look` turns a view and a table of lobes
-into places in the blurred light and what is seen there, once per change of view or BRDF. `combine` reads the light.
+`prefilter` blurs the light to a scale of widths, once per change of light. `view_lobes` turns a view and a table of
+lobes into places in the blurred light and what is seen there, once per change of view or BRDF. `combine` reads the
+light.
 
 Light and visibility vary together over a lobe. For a normal distribution of variance k about a direction,
 E[L V] = E[L] E[V] + k grad E[L] . grad E[V] + ..., and both slopes come with the bilinear lookups, so the second term
@@ -20,7 +21,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import apart
+from jaxprt.compile import isolated
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions, harmonics
@@ -103,7 +104,7 @@ def radiance(
 
     Reference: Sun et al. 2007, section 4.1, with free lobes and the second term.
     """
-    return combine(prefilter(light), look(transport, brdf, eye=eye))
+    return combine(prefilter(light), view_lobes(transport, brdf, eye=eye))
 
 
 @require.arguments(light=_environment)
@@ -125,7 +126,9 @@ def prefilter(light: Environment) -> LobeLight:
 
 
 @require.arguments(brdf=_brdf)
-def look(transport: LobeTransport, brdf: LobeBrdf, *parameter: Float[Array, " v"], eye: Float[Array, "3"]) -> LobeView:
+def view_lobes(
+    transport: LobeTransport, brdf: LobeBrdf, *parameter: Float[Array, " v"], eye: Float[Array, "3"]
+) -> LobeView:
     """Where each vertex reads the light for a view, and what it sees there.
 
     Args:
@@ -146,7 +149,7 @@ def look(transport: LobeTransport, brdf: LobeBrdf, *parameter: Float[Array, " v"
     return LobeView(place, share, lobe.weight, lobe.diffuse, transport.vector, transport.size)
 
 
-@apart
+@isolated
 def _places(
     position: Array, frame: Array, brdf: LobeBrdf, eye: Array, *parameter: Array
 ) -> tuple[Lobes, tuple[Array, ...]]:
@@ -156,7 +159,7 @@ def _places(
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 
 
-@partial(apart, static=("size",))
+@partial(isolated, static=("size",))
 def _taps(face, s, t, spread, concentration, share, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Texels of the blurred light, and what each counts."""
     seen, by_s, by_t = share
@@ -176,7 +179,7 @@ def _taps(face, s, t, spread, concentration, share, *, size: int) -> tuple[tuple
     return tuple(place), tuple(result)
 
 
-@apart
+@isolated
 def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     """Radiance of a view under a light.
 

@@ -8,7 +8,7 @@ from jaxprt import require
 from jaxprt.scene.environment import Environment
 from jaxprt.systems import protocol
 from jaxprt.systems.lobe.pyramid import LobeTransport
-from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, look, prefilter
+from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, view_lobes
 from jaxprt.systems.lobe.table import LobeBrdf
 from jaxprt.systems.protocol import Blend
 
@@ -41,12 +41,12 @@ class LobeSystem(protocol.System):
         return lit
 
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> LobeView:
-        """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.look`."""
+        """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.view_lobes`."""
         protocol.check_blend(materials)
         if materials is None:
-            return look(self.transport, self.brdf, eye=eye)
+            return view_lobes(self.transport, self.brdf, eye=eye)
         materials.check(self.vertices, len(self.brdf.weight))
-        seen = look(self.transport, self.brdf, *materials.parameter, eye=eye)
+        seen = view_lobes(self.transport, self.brdf, *materials.parameter, eye=eye)
         weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight)
         diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight)
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))

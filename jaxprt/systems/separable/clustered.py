@@ -74,7 +74,7 @@ class ClusteredTransport(eqx.Module):
         """Bytes of modes, cores and weights."""
         return self.index.nbytes + self.mode.nbytes + self.core.nbytes + self.weight.nbytes
 
-    def keep(
+    def truncate(
         self,
         count: int | None = None,
         *,

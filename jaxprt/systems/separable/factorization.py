@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.compile import apart
+from jaxprt.compile import isolated
 from jaxprt.decompose import eigen
 from jaxprt.files import objects
 from jaxprt.scene.environment import Environment
@@ -57,7 +57,7 @@ class SeparableBrdf(eqx.Module):
         """Pickles the function of coordinates by its name: pickle cannot take jitted functions."""
         return objects.reduced(self)
 
-    def keep(self, terms: int) -> "SeparableBrdf":
+    def truncate(self, terms: int) -> "SeparableBrdf":
         """The first `terms` terms; their error is no longer known and reads NaN where terms were dropped."""
         if not 1 <= terms <= self.terms:
             raise ValueError(f"terms must be between 1 and {self.terms}, got {terms}")
@@ -82,7 +82,7 @@ class SeparableBrdf(eqx.Module):
         return _looked_up(jnp.moveaxis(texel, 0, 2), self.coordinates(direction), polar=polar)
 
 
-@partial(apart, static=("polar",))
+@partial(isolated, static=("polar",))
 def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
     lookup = hemisphere.polar_lookup if polar else hemisphere.lookup
     if texel.shape[-1] == 1:  # Gradients by the place would take ten times as long with a trailing axis of 1.
@@ -227,7 +227,7 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
         reached = np.max([errors.light_errors(brdf, found, each) for each in light], 0)
         good = np.flatnonzero(reached <= error)
         if good.size:
-            kept = found.keep(int(good[0]) + 1)
+            kept = found.truncate(int(good[0]) + 1)
             number = jnp.asarray(reached[good[0]], found.error.dtype)
             return SeparableBrdf(kept.light_map, kept.view_map, number, kept.coordinates)
         if count == most:

@@ -36,7 +36,7 @@ class QuantizedTransport(eqx.Module):
     rms: Float[Array, " b"]
     mark: Float[Array, "r m"] | None = None
 
-    def keep(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
+    def truncate(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
         """The first `count` coefficients, largest before rounding, of the first `terms` terms (all of them if None)."""
         require.between("count", count, 1, self.index.shape[0])
         require.between("terms", terms, 1, self.terms)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.compile import apart, linear
+from jaxprt.compile import isolated, linear
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, check_mark
@@ -277,7 +277,7 @@ def _modulated(view: Array, weight: Array, *, terms: tuple[int, ...]) -> Array:
     return view * weight[:, np.repeat(np.arange(len(terms)), terms)]
 
 
-@apart
+@isolated
 def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
     """Dot product of the two tuples: outgoing radiance per vertex and color.
 

@@ -51,7 +51,7 @@ class SparseTransport(eqx.Module):
     transpose: Transpose | None = None
     mark: Float[Array, "r m"] | None = None
 
-    def keep(self, count: int, *, terms: int | None = None) -> "SparseTransport":
+    def truncate(self, count: int, *, terms: int | None = None) -> "SparseTransport":
         """The `count` largest coefficients of the first `terms` terms (all of them if None)."""
         require.between("count", count, 1, self.index.shape[0])
         require.between("terms", terms, 1, self.terms)

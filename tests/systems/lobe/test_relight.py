@@ -150,7 +150,7 @@ def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, table
 
 
 def test_the_halves_are_the_whole(transport, tables, light, close):
-    filtered, view = lobe.prefilter(light), lobe.look(transport, tables["brushed"], eye=EYE)
+    filtered, view = lobe.prefilter(light), lobe.view_lobes(transport, tables["brushed"], eye=EYE)
     close(lobe.combine(filtered, view), lobe.radiance(transport, tables["brushed"], light, eye=EYE))
 
 

@@ -136,12 +136,12 @@ def test_all_of_it_lights_as_uncompressed_transport_does(whole, brdf, expected, 
 def test_errors_fall_with_vectors_modes_and_coefficients(whole, exact):
     size = np.linalg.norm(exact)
     for name, counts in (("vectors", (1, 4)), ("modes", (1, 8)), ("count", (6, 100))):
-        error = [np.linalg.norm(by_vertex(whole.keep(**{name: each})) - exact) / size for each in counts]
+        error = [np.linalg.norm(by_vertex(whole.truncate(**{name: each})) - exact) / size for each in counts]
         assert 1 > error[0] > error[1] > HALF
 
 
 def test_the_first_vectors_are_the_best_of_their_number(whole, exact, importance, close):
-    found = by_vertex(whole.keep(vectors=4)) * importance[:, None]
+    found = by_vertex(whole.truncate(vectors=4)) * importance[:, None]
     for vertex in np.asarray(whole.vertex).reshape(CLUSTERS, -1):
         # A repeated vertex counts twice.
         matrix = (exact[vertex] * importance[:, None]).reshape(len(vertex), -1)
@@ -149,14 +149,14 @@ def test_the_first_vectors_are_the_best_of_their_number(whole, exact, importance
 
 
 def test_the_first_modes_are_the_best_of_their_number(whole, exact, importance, close):
-    found = by_vertex(whole.keep(modes=8)) * importance[:, None]
+    found = by_vertex(whole.truncate(modes=8)) * importance[:, None]
     for vertex in np.asarray(whole.vertex).reshape(CLUSTERS, -1):
         matrix = np.moveaxis(exact[vertex] * importance[:, None], 1, 0).reshape(ALL, -1)
         close(np.moveaxis(found[vertex], 1, 0).reshape(ALL, -1), best(matrix, 8), tolerance=HALF)
 
 
 def test_the_first_coefficients_and_terms_are_the_rows_and_columns_themselves(whole, close):
-    everything, part = dense(whole), whole.keep(50, terms=2)
+    everything, part = dense(whole), whole.truncate(50, terms=2)
     expected = np.zeros((*everything.shape[:2], 2))
     for number, index in enumerate(np.asarray(whole.index)[:, :50]):
         row = slice(number * 10, (number + 1) * 10)
@@ -164,7 +164,7 @@ def test_the_first_coefficients_and_terms_are_the_rows_and_columns_themselves(wh
     close(dense(part), expected, tolerance=1e-12)
     assert (part.terms, part.index.shape) == (2, (CLUSTERS, 50))
     assert part.nbytes == CLUSTERS * (2 * 50 + 2 * 50 * 30 + 2 * 30 * 10 * 2 + 4 * 10 * 10)
-    same(whole.keep(), whole)
+    same(whole.truncate(), whole)
 
 
 def test_coefficients_are_chosen_by_energy_under_natural_light(whole, small, exact, importance):
@@ -201,7 +201,7 @@ def test_stored_numbers_use_the_range_of_half_precision(small):
 
 
 def test_rms_is_that_of_the_dense_rows(whole, small, close):
-    for transport in (whole, small, whole.keep(50, terms=2)):
+    for transport in (whole, small, whole.truncate(50, terms=2)):
         close(transport.rms, np.sqrt(np.mean(dense(transport) ** 2, (0, 2))), tolerance=1e-5)
 
 
@@ -371,7 +371,7 @@ def test_impossible_numbers_are_refused(seen, brdf, options, message):
 def test_keeping_more_than_there_are_is_refused(small, name, limit):
     for value in (0, -1, limit + 1):
         with pytest.raises(ValueError, match=f"{name} must be between 1 and {limit}, got {value}"):
-            small.keep(**{name: value})
+            small.truncate(**{name: value})
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -436,8 +436,8 @@ def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_ref
 def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
     light = builtin.daylight(size=SIZE)
     other = factor(Lambert(0.5), terms=TERMS, resolution=12)
-    fewer = small.keep(terms=2)
-    assert np.isfinite(separable.radiance(fewer, brdf.keep(2), light, eye=EYE)).all()
-    for transport, wrong in ((small, other), (fewer, other.keep(2))):
+    fewer = small.truncate(terms=2)
+    assert np.isfinite(separable.radiance(fewer, brdf.truncate(2), light, eye=EYE)).all()
+    for transport, wrong in ((small, other), (fewer, other.truncate(2))):
         with pytest.raises(ValueError, match="must be the one that the transport was made for, got another"):
             separable.radiance(transport, wrong, light, eye=EYE)

@@ -70,11 +70,11 @@ def test_error_falls_with_the_terms_and_names_them():
 
 def test_kept_terms_are_the_leading_ones():
     factored = separable.factor(WANG, terms=8, resolution=16)
-    fewer = factored.keep(3)
+    fewer = factored.truncate(3)
     np.testing.assert_array_equal(fewer.light_map, factored.light_map[:3])
     assert jnp.isnan(fewer.error)
     with pytest.raises(ValueError, match="terms must be between 1 and 8, got 9"):
-        factored.keep(9)
+        factored.truncate(9)
 
 
 def test_maps_are_finite_and_continue_beyond_the_rim():

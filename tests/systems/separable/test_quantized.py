@@ -145,14 +145,14 @@ def test_bytes_are_those_of_the_bit_fields_the_indices_and_the_quanta(random, co
 @COLORS
 def test_kept_prefixes_are_prefixes_of_the_same_levels(random, colors, close):
     quantized = quantize(make(some(random, colors)))
-    fewer = quantized.keep(5, terms=2)
+    fewer = quantized.truncate(5, terms=2)
     np.testing.assert_array_equal(fewer.index, np.asarray(quantized.index)[:5, :, :2])
     np.testing.assert_array_equal(fewer.level, np.asarray(quantized.level)[:5, :, :2])
     total = np.zeros(SIZE)
     np.add.at(total, np.asarray(fewer.index).ravel(), (values(fewer) ** 2).mean(-1).ravel())
     close(fewer.rms, np.sqrt(total / (2 * VERTICES)))
     with pytest.raises(ValueError, match="count must be between 1 and 9, got 10"):
-        quantized.keep(10)
+        quantized.truncate(10)
 
 
 def test_vertices_keep_their_places_and_the_light_its_gradient(random, close):

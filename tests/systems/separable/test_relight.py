@@ -269,7 +269,7 @@ def test_transport_in_whole_numbers_relights_like_transport_in_floating_point(tr
         tolerance=1e-4,
     )
     with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
-        relight(whole, factored.keep(2), light)
+        relight(whole, factored.truncate(2), light)
 
 
 @pytest.fixture(scope="module")
@@ -368,7 +368,7 @@ def test_weights_that_do_not_fit_the_terms_are_refused(terms):
 
 def test_brdfs_with_another_number_of_terms_are_refused(transport, factored):
     with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
-        relight(transport, factored.keep(2), Environment(jnp.ones((6, SIZE, SIZE, 3))))
+        relight(transport, factored.truncate(2), Environment(jnp.ones((6, SIZE, SIZE, 3))))
 
 
 @pytest.mark.parametrize("brdf", [Lambert([0.2, 0.5, 0.9]), COLORED], ids=["lambert", "glossy"])
@@ -403,8 +403,8 @@ def test_transport_refuses_factors_that_it_was_not_made_of_wherever_values_are_k
     expected = relight(transport, factored, light)
     rounded = eqx.tree_at(lambda b: b.light_map, factored, jnp.nextafter(factored.light_map, jnp.inf))
     turned = eqx.tree_at(lambda b: b.light_map, factored, factored.light_map.at[1].multiply(-1))
-    wrong = [turned, factor(Lambert(0.5), terms=3, resolution=12), join([factored.keep(1), factored.keep(2)])]
-    for each in (known, dequantize(quantize(known)), quantize(known), known.with_transpose(), known.keep(40)):
+    wrong = [turned, factor(Lambert(0.5), terms=3, resolution=12), join([factored.truncate(1), factored.truncate(2)])]
+    for each in (known, dequantize(quantize(known)), quantize(known), known.with_transpose(), known.truncate(40)):
         assert each.mark is not None
         for right in (factored, rounded):
             np.testing.assert_allclose(relight(each, right, light), expected, rtol=0.1, atol=0.1)
@@ -413,7 +413,9 @@ def test_transport_refuses_factors_that_it_was_not_made_of_wherever_values_are_k
                 relight(each, other, light)
             with pytest.raises(ValueError, match="the BRDF must be the one that"):
                 separable.view_tuple(each, other, EYE)
-    np.testing.assert_array_equal(relight(known.keep(40, terms=2), factored.keep(2), light).shape, expected.shape)
+    np.testing.assert_array_equal(
+        relight(known.truncate(40, terms=2), factored.truncate(2), light).shape, expected.shape
+    )
     traced = jax.jit(lambda brdf: relight(known, brdf, light))(turned)
     np.testing.assert_array_equal(traced.shape, expected.shape)
     slope = jax.grad(lambda value: jnp.sum(relight(eqx.tree_at(lambda t: t.value, known, value), factored, light)))

@@ -93,7 +93,7 @@ def test_apply_is_the_dense_product(random, close, colors, light_colors):
 
 def test_kept_prefixes_are_what_the_smaller_number_would_have_kept(random):
     coefficient = random.normal(size=(5, 24, 4, 1))
-    fewer, expected = make(coefficient, 20).keep(6, terms=3), make(coefficient[:, :, :3], 6)
+    fewer, expected = make(coefficient, 20).truncate(6, terms=3), make(coefficient[:, :, :3], 6)
     for field in ("index", "value", "rms", "position", "frame"):
         np.testing.assert_array_equal(getattr(fewer, field), getattr(expected, field))
     assert fewer.nbytes == 5 * 6 * 3 * (2 + 4)
@@ -102,7 +102,7 @@ def test_kept_prefixes_are_what_the_smaller_number_would_have_kept(random):
 @pytest.mark.parametrize("count", [0, 21])
 def test_keeping_more_than_there_are_is_refused(random, count):
     with pytest.raises(ValueError, match=f"count must be between 1 and 20, got {count}"):
-        make(random.normal(size=(2, 24, 1, 1)), 20).keep(count)
+        make(random.normal(size=(2, 24, 1, 1)), 20).truncate(count)
 
 
 @pytest.mark.parametrize("terms", [-1, 0, 5])
@@ -111,7 +111,7 @@ def test_keeping_an_impossible_number_of_terms_is_refused(random, terms):
     transport = make(random.normal(size=(2, 24, 4, 3)), 20)
     for each in (transport, quantize(transport)):
         with pytest.raises(ValueError, match=f"terms must be between 1 and 4, got {terms}"):
-            each.keep(6, terms=terms)
+            each.truncate(6, terms=terms)
 
 
 def test_lights_of_another_number_of_coefficients_are_refused(random):
@@ -196,6 +196,6 @@ def test_an_empty_transport_has_a_transpose():
 
 def test_a_shorter_transport_has_no_transpose(prepared):
     _, with_transpose, light = prepared
-    shorter = with_transpose.keep(3)
+    shorter = with_transpose.truncate(3)
     assert shorter.transpose is None
     assert np.all(np.isfinite(jax.grad(squared)(light, shorter)))
