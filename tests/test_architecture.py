@@ -2,10 +2,13 @@
 
 Rooms are folders; imports point down ``ROOMS``, never up. In ``systems`` each system is a folder or file of its own,
 and imports point down ``LADDER``. Inside a folder modules may import each other. No imports form a circle.
+docs/architecture.md says the same to readers, and names only what exists.
 """
 
 import ast
+import functools
 import graphlib
+import importlib
 import itertools
 import pathlib
 import re
@@ -17,6 +20,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxprt"
+PAGE = (ROOT / "docs" / "architecture.md").read_text()
 
 # From the top. A module may import from rooms further down.
 ROOMS = ["__main__", "cli", "inverse", "relit", "systems", "image", "visibility", "scene", "brdf"]
@@ -166,6 +170,53 @@ def test_third_party_imports_are_declared(module):
 def test_rooms_hold_what_the_table_names():
     rooms = {name.split(".")[1] for name in PATHS if "." in name}
     assert rooms <= set(ROOMS), f"{rooms - set(ROOMS)} must be given a place in ROOMS"
+
+
+def rows(page: str, heading: str) -> list[list[str]]:
+    """Cells of the first table under a heading, without its head."""
+    section = re.split(r"^## ", page.partition(f"## {heading}\n")[2], flags=re.MULTILINE)[0]
+    table = re.findall(r"^\| .* \|$", section, re.MULTILINE)
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[1:]]
+
+
+def named(text: str) -> list[str]:
+    """What stands between backticks."""
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+def exists(name: str) -> bool:
+    """Whether there is such a file, folder or command of the project, or such an attribute or module of jaxprt."""
+    if "/" in name:
+        return (ROOT / name).exists()
+    whole, *parts = name.split(".")
+    try:
+        functools.reduce(getattr, parts, importlib.import_module(whole))
+    except AttributeError:
+        return False
+    return True
+
+
+def test_the_page_lists_the_rooms_from_the_top():
+    assert [named(first) for first, *_ in rows(PAGE, "Folders")] == [[room] for room in ROOMS]
+    assert {name.split(".")[1] for name in PATHS if "." in name} == set(ROOMS)
+
+
+def test_the_page_lists_the_rungs_of_the_ladder_from_the_top():
+    table = rows(PAGE, "Systems")
+    assert [set(named(systems)) for _, systems, *_ in table] == LADDER
+    assert [int(number) for number, *_ in table] == list(range(len(LADDER), 0, -1))
+    assert {name.split(".")[2] for name in PATHS if re.match(r"jaxprt\.systems\.", name)} == set(RUNG)
+
+
+@pytest.mark.parametrize("name", [name for name in sorted(set(named(PAGE))) if re.fullmatch(r"\w+[./][\w./]+", name)])
+def test_what_the_page_names_exists(name):
+    # A bare name of a file, such as `system.py`, is one that every system has.
+    assert list(PACKAGE.glob(f"systems/*/{name}")) if re.fullmatch(r"\w+\.py", name) else exists(name)
+
+
+@pytest.mark.parametrize("name", ["jaxprt/extra", "jaxprt/lobe.py", "jaxprt.extra", "jaxprt.lobe.extra"])
+def test_what_does_not_exist_is_found_out(name):
+    assert not exists(name)
 
 
 def test_no_imports_form_a_circle():
