@@ -723,7 +723,7 @@ EXAMPLES = {
     "systems.lobe.relight.combine": example(
         lambda draw: call(
             lobe_system.prefilter(draw.light(8)),
-            lobe_system.look(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
+            lobe_system.view_lobes(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
         )
     ),
     "systems.lobe.relight.radiance": example(

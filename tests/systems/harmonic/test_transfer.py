@@ -7,7 +7,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import join, make_mesh, turn
+from jaxprt.scene.mesh import join, make_mesh, rotate
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.systems.harmonic import precompute, precompute_diffuse
 from jaxprt.systems.harmonic.transfer import transfer, transfer_diffuse
@@ -169,7 +169,7 @@ def test_precomputed_open_vertices_have_the_rotation_to_their_frame(close):
 def test_a_turned_mesh_has_its_transfer_turned(close):
     quarter = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     mesh = scene()
-    here, there = (precompute(each, degree=2, size=SIZE, progress=False) for each in (mesh, turn(mesh, quarter)))
+    here, there = (precompute(each, degree=2, size=SIZE, progress=False) for each in (mesh, rotate(mesh, quarter)))
     turned = rotation.matrix(jnp.asarray(quarter, jnp.float32), degree=2)
     close(there.matrix, here.matrix @ turned.T, tolerance=HORIZON)
 
