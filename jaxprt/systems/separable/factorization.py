@@ -277,10 +277,8 @@ def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c 
         ValueError: The BRDF has no channel axis, or values that are not finite.
     """
     shape = eqx.filter_eval_shape(_row, brdf, direction, direction[0]).shape
-    if len(shape) != 2 or shape[0] != direction.shape[0] or shape[1] not in (1, 3):
-        raise ValueError(
-            f"a BRDF must map directions [b 3] to values [b 1] or [b 3], got {shape} for {direction.shape}"
-        )
+    if len(shape) != 2 or shape[0] != direction.shape[0] or not shape[1]:
+        raise ValueError(f"a BRDF must map directions [b 3] to values [b c], got {shape} for {direction.shape}")
     table, broken = _rows(brdf, direction)
     if broken:
         raise ValueError(f"a BRDF must be finite above the horizon, got {broken} of {table.size} values that are not")

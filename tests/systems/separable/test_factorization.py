@@ -5,6 +5,7 @@ import pytest
 
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment
 from jaxprt.sphere import hemisphere
 from jaxprt.systems.separable import light_errors, sample_error
@@ -36,6 +37,15 @@ def test_light_maps_are_gray_and_color_is_in_the_view_maps():
     factored = separable.factor(AshikhminShirley(diffuse=[0.9, 0.2, 0.1], specular=0.3), terms=3, resolution=16)
     assert factored.light_map.shape == (3, 16, 16, 1)
     assert factored.view_map.shape == (3, 16, 16, 3)
+
+
+def test_gray_brdfs_of_any_number_are_factored_together():
+    both = Channels((Lambert(0.4), CookTorrance(roughness=0.5)), jnp.ones(2))
+    factored = separable.factor(both, terms=52, resolution=8)
+    wi, wo = _parabolic_texels(8)
+    expected = np.asarray(evaluate(both, wi, wo))
+    assert expected.shape[1] == 2
+    assert np.linalg.norm(evaluate(factored, wi, wo) - expected) < 1e-2 * np.linalg.norm(expected)
 
 
 def _parabolic_texels(resolution):
@@ -115,7 +125,7 @@ def test_bad_options_are_refused(options, message):
 def test_bad_brdfs_are_refused():
     with pytest.raises(ValueError, match="must be finite above the horizon"):
         separable.factor(lambda wi, wo: jnp.full((*wi.shape[:-1], 1), jnp.nan), terms=1, resolution=8)
-    with pytest.raises(ValueError, match=r"\[b 1\] or \[b 3\]"):
+    with pytest.raises(ValueError, match=r"values \[b c\], got \(64,\) for \(64, 3\)"):
         separable.factor(lambda wi, wo: wi[..., 0], terms=1, resolution=8)
 
 
