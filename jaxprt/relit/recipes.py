@@ -19,6 +19,8 @@ from jaxprt.systems.protocol import System
 from jaxprt.visibility import StoredVisibility
 
 _HARMONIC_SIZE = 32  # texels along an edge of the visibility: as many as low degrees need
+_STEPS = 4  # of harmonics for one of lobes, from knot to knot
+_VARYING = 0.02  # error of tables of harmonics of which roughness varies
 
 
 class Job(eqx.Module):
@@ -104,7 +106,9 @@ class Harmonics(eqx.Module):
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.precompute_diffuse(shading.mesh, **options, **job.options(f"vectors_{self.degree}"))
             return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
-        table = harmonic.tabulate(shading.brdf, degree=self.degree, knot=shading.knot)
+        # Lobes between knots move and widen; harmonics are interpolated linearly, and need more knots.
+        finer = {"knot": tuple(map(_finer, shading.knot)), "error": _VARYING} if shading.knot else {}
+        table = harmonic.tabulate(shading.brdf, degree=self.degree, **finer)
         matrices = harmonic.precompute(shading.mesh, **options, **job.options(f"matrices_{self.degree}"))
         return harmonic.HarmonicSystem(matrices, table, self.laplacian)
 
@@ -187,6 +191,11 @@ def _bright(system: System, visible, shading: Shading, texels: int, size: int) -
     sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     samples = bright_texels.samples_for(sharpest, size=size)
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
+
+
+def _finer(knot: np.ndarray) -> np.ndarray:
+    """Evenly spaced knots, with as many steps in place of one as harmonics need."""
+    return np.linspace(knot[0], knot[-1], _STEPS * (len(knot) - 1) + 1)
 
 
 def check(recipe: Recipe, shading: Shading) -> None:
