@@ -96,7 +96,7 @@ def precompute(
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
-    job = _MatrixJob.make(mesh, occluder, vertex, size, degree=degree)
+    job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)
     return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
@@ -115,7 +115,7 @@ def precompute_diffuse(
 ) -> TransferVector:
     """Precomputes transfer vectors with self-shadowing, for ideal diffuse surfaces; options as of `precompute`."""
     check(degree, size)
-    job = _VectorJob.make(mesh, occluder, vertex, size, degree=degree)
+    job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=True)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     return TransferVector(jax.device_put(result["vector"]), visibility.rays.place(mesh, vertex))
 
@@ -200,44 +200,28 @@ def _rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class _MatrixJob(visibility.rays.VisibilityJob):
-    """Blocks of shadowed transfer matrices; see `blocks.Job`."""
+class _Job(visibility.rays.VisibilityJob):
+    """Blocks of shadowed transfer matrices, or of the vectors of ideal diffuse surfaces; see `blocks.Job`."""
 
     degree: int
+    diffuse: bool
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return self.made_by("harmonic", ALGORITHM, degree=self.degree)
+        return self.made_by("harmonic diffuse" if self.diffuse else "harmonic", ALGORITHM, degree=self.degree)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
-        terms = (self.degree + 1) ** 2
-        return {"matrix": Layout((visibility.rays.BLOCK, 1, terms, terms), 0, "float32")}
+        terms, step = (self.degree + 1) ** 2, visibility.rays.BLOCK
+        if self.diffuse:
+            return {"vector": Layout((terms, 1, step), 2, "float32")}
+        return {"matrix": Layout((step, 1, terms, terms), 0, "float32")}
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
-        matrix = transfer(seen, self.frame[self.part(block)], degree=self.degree)
-        return {"matrix": np.asarray(matrix)[:, None]}, count.rays
-
-
-@dataclass(frozen=True)
-class _VectorJob(visibility.rays.VisibilityJob):
-    """Blocks of shadowed transfer vectors; see `blocks.Job`."""
-
-    degree: int
-
-    @property
-    def header(self) -> Mapping[str, Any]:
-        return self.made_by("harmonic diffuse", ALGORITHM, degree=self.degree)
-
-    @property
-    def layout(self) -> Mapping[str, Layout]:
-        return {"vector": Layout(((self.degree + 1) ** 2, 1, visibility.rays.BLOCK), 2, "float32")}
-
-    def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
-        seen, count = self.seen(block)
-        vector = transfer_diffuse(seen, self.frame[self.part(block)], degree=self.degree)
-        return {"vector": np.asarray(vector)[:, None]}, count.rays
+        name, function = ("vector", transfer_diffuse) if self.diffuse else ("matrix", transfer)
+        made = function(seen, self.frame[self.part(block)], degree=self.degree)
+        return {name: np.asarray(made)[:, None]}, count.rays
 
 
 def check(degree: int, size: int) -> None:
