@@ -5,13 +5,14 @@ object is half diffuse, half a rough conductor as wide as Ashikhmin-Shirley (10,
 A picture's error is its noise, which a picture of another seed does not share: their difference is sqrt(2) of it, so
 no converged one is needed.
 
-`picture` traces paths through a scene with jaxprt's own materials, for judging interreflection. It compiles for the
-processor with LLVM, which must be installed; `available` tells.
+`picture` and `trace` follow paths through scenes with jaxprt's own materials. They compile for the processor with
+LLVM, which must be installed; `available` tells. `trace` does without, slowly.
 """
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -117,19 +118,47 @@ def picture(
         raise ValueError(f"depth must be at least 2 and samples at least 1, got {depth} and {samples}")
     if not available():
         raise RuntimeError(f"picture needs LLVM {_LLVM} or newer; DRJIT_LIBLLVM_PATH may name its shared library")
+    parts = [(_part(mesh, region == number), materials[number]) for number in used]
+    return trace(parts, light, camera, depth=depth, samples=samples, seed=seed)
+
+
+def trace(
+    parts: Sequence[tuple[Mesh, Any]],
+    light: Environment,
+    camera: Camera,
+    *,
+    depth: int = 2,
+    samples: int,
+    seed: int = 0,
+    sky: bool = False,
+) -> np.ndarray:
+    """Radiance of meshes with their materials, as `picture`; without LLVM slowly, in the variant scalar_rgb.
+
+    Args:
+        parts: Meshes, each with its material: one that `plugins.bsdf` has. A material of each vertex is interpolated.
+        light: One environment.
+        camera: From where.
+        depth: As in `picture`.
+        samples: As in `picture`.
+        seed: As in `picture`.
+        sky: Whether the light is seen behind the meshes.
+
+    Returns:
+        Linear radiance [h, w, 3].
+    """
     import mitsuba
 
-    mitsuba.set_variant("llvm_ad_rgb")
+    mitsuba.set_variant("llvm_ad_rgb" if available() else "scalar_rgb")
     scene = mitsuba.load_dict(
         {
             "type": "scene",
             # Russian roulette would only add noise at depths that are looked at.
-            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 100, "hide_emitters": True},
+            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 100, "hide_emitters": not sky},
             "sensor": sensor(mitsuba, camera),
             "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(latlong(light))},
             **{
-                f"region{number}": shape(mitsuba, _part(mesh, region == number), plugins.bsdf(materials[number]))
-                for number in used
+                f"part{number}": shape(mitsuba, mesh, plugins.bsdf(material), plugins.attributes(material))
+                for number, (mesh, material) in enumerate(parts)
             },
         }
     )
@@ -172,8 +201,8 @@ def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
     return Mesh(position, jnp.asarray(face.reshape(-1, 3), jnp.int32), normal, tangent, region)
 
 
-def shape(mitsuba, mesh: Mesh, bsdf):
-    """Mitsuba's mesh of a material, with tangents."""
+def shape(mitsuba, mesh: Mesh, bsdf, attributes: Mapping[str, np.ndarray] | None = None):
+    """Mitsuba's mesh of a material, with tangents and other attributes [v c] of its vertices."""
     props = mitsuba.Properties()
     props["bsdf"] = mitsuba.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     result = mitsuba.Mesh("mesh", len(mesh.position), len(mesh.face), has_vertex_normals=True, props=props)
@@ -182,7 +211,8 @@ def shape(mitsuba, mesh: Mesh, bsdf):
     parameters["vertex_normals"] = np.asarray(mesh.normal).ravel()
     parameters["faces"] = np.asarray(mesh.face).ravel()
     parameters.update()
-    result.add_attribute(plugins.TANGENT, 3, np.asarray(mesh.tangent).ravel())
+    for name, value in {plugins.TANGENT: mesh.tangent, **(attributes or {})}.items():
+        result.add_attribute(name, value.shape[1], np.asarray(value, np.float32).ravel())
     return result
 
 

@@ -1,7 +1,8 @@
 """Materials of jaxprt as plugins of Mitsuba 3: the formulas in the docstrings of `jaxprt.brdf`, with none of its code.
 
 Directions are drawn half by the cosine, half as mirrored at a half vector of the model's own distribution. Parameters
-are Mitsuba's, so that `mitsuba.traverse` finds them and its gradients reach them.
+are Mitsuba's, so that `mitsuba.traverse` finds them and its gradients reach them. Those of metallic-roughness materials
+are Mitsuba's textures: constants, or attributes of the vertices.
 """
 
 import functools
@@ -9,18 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf.varying import PerVertex
 
-_SMOOTHEST = 1e-3  # least roughness, as jaxprt.brdf has it
+_SMOOTHEST = 1e-3  # least roughness, and least alpha of GGX, as jaxprt.brdf has it
 TANGENT = "vertex_tangent"  # attribute of shapes
 
 
-def bsdf(material: CookTorrance | AshikhminShirley | Lambert) -> Any:
+def bsdf(material: CookTorrance | AshikhminShirley | Lambert | MetallicRoughness | PerVertex) -> Any:
     """Mitsuba's material, or what loads as one; a variant must be set.
+
+    A material of each vertex takes its parameters from the attributes of its shape, see `attributes`.
 
     Raises:
         ValueError: A material of another kind.
     """
+    if isinstance(material, PerVertex):
+        parameters = _parameters(material.model)
+        return _metallic_roughness()(
+            {name: {"type": "mesh_attribute", "name": f"vertex_{name}"} for name in parameters}
+        )
+    if isinstance(material, MetallicRoughness):
+        return _metallic_roughness()({name: _constant(value) for name, value in _parameters(material).items()})
     if isinstance(material, Lambert):
         albedo = np.broadcast_to(material.albedo, 3).tolist()
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
@@ -28,7 +39,38 @@ def bsdf(material: CookTorrance | AshikhminShirley | Lambert) -> Any:
         return _cook_torrance()(material)
     if isinstance(material, AshikhminShirley):
         return _ashikhmin_shirley()(material)
-    raise ValueError(f"materials must be CookTorrance, AshikhminShirley or Lambert, got {type(material).__name__}")
+    kinds = "CookTorrance, AshikhminShirley, Lambert, MetallicRoughness or PerVertex"
+    raise ValueError(f"materials must be {kinds}, got {type(material).__name__}")
+
+
+def attributes(material: Any) -> dict[str, np.ndarray]:
+    """Attributes [v c] that a shape needs for its material: the parameters of its vertices, if they have their own."""
+    if not isinstance(material, PerVertex):
+        return {}
+    return {f"vertex_{name}": value for name, value in _parameters(material.model).items()}
+
+
+def _parameters(model: Any) -> dict[str, np.ndarray]:
+    """Parameters [*b c] of a metallic-roughness material as Mitsuba interpolates them.
+
+    Raises:
+        ValueError: A material of another kind.
+    """
+    if not isinstance(model, MetallicRoughness):
+        raise ValueError(f"materials of vertices must be MetallicRoughness, got {type(model).__name__}")
+    ior = np.asarray(model.ior, np.float32)[..., None]
+    f0 = np.minimum(((1 - ior) / (1 + ior)) ** 2 * np.asarray(model.specular_color), 1)
+    colors = {"base_color": np.asarray(model.base_color), "f0": f0}
+    wide = {name: np.broadcast_to(value, (*value.shape[:-1], 3)) for name, value in colors.items()}
+    scalars = ("metallic", "roughness", "specular", "anisotropy", "rotation")
+    return wide | {name: np.asarray(getattr(model, name))[..., None] for name in scalars}
+
+
+def _constant(value: np.ndarray) -> dict[str, Any]:
+    """Mitsuba's texture of one value."""
+    if len(value) == 1:
+        return {"type": "uniform", "value": float(value[0])}
+    return {"type": "srgb", "color": [float(each) for each in value]}
 
 
 def _modules() -> tuple[Any, Any]:
@@ -61,6 +103,10 @@ def _glossy() -> Any:
             ]
             self.m_flags = self.m_components[0]
 
+        def at(self, si) -> Any:
+            """The material at a point: an object with `half`, `density` and `value`."""
+            return self
+
         def half(self, u):
             """A half vector of its distribution."""
             raise NotImplementedError
@@ -79,7 +125,7 @@ def _glossy() -> Any:
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             to, back = self.frame(si)
-            wi, half = to(si.wi), self.half(sample2)
+            wi, half = to(si.wi), self.at(si).half(sample2)
             matte = mitsuba.warp.square_to_cosine_hemisphere(sample2)
             result = drjit.zeros(mitsuba.BSDFSample3f)
             result.wo = back(drjit.select(sample1 < 0.5, matte, 2 * drjit.dot(half, wi) * half - wi))
@@ -90,13 +136,13 @@ def _glossy() -> Any:
             return result, drjit.select(result.pdf > 0, value / drjit.select(result.pdf > 0, result.pdf, 1), 0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            to, _ = self.frame(si)
+            (to, _), here = self.frame(si), self.at(si)
             wi, wo = to(si.wi), to(wo)
             lit = active & (wi.z > 0) & (wo.z > 0)
             half = drjit.normalize(wi + wo)
             cos_d = drjit.dot(half, wo)
-            value = self.value(wi, wo, half, cos_d) * wo.z
-            pdf = (wo.z / drjit.pi + self.density(half) / (4 * cos_d)) / 2
+            value = here.value(wi, wo, half, cos_d) * wo.z
+            pdf = (wo.z / drjit.pi + here.density(half) / (4 * cos_d)) / 2
             return drjit.select(lit, value, 0), drjit.select(lit, pdf, 0)
 
         def eval(self, ctx, si, wo, active=True):
@@ -113,6 +159,24 @@ def _glossy() -> Any:
             return type(self).__name__
 
     return Glossy
+
+
+def _tangent_frame(si, rotation=0.0) -> tuple[Any, Any]:
+    """Directions from the shading frame to that of the tangent, turned counterclockwise about the normal, and back."""
+    drjit, mitsuba = _modules()
+    # Interpolated as the attribute of vertices is, and square to the normal.
+    tangent = si.shape.eval_attribute_3(TANGENT, si)
+    x = si.to_local(mitsuba.Vector3f(tangent.x, tangent.y, tangent.z))
+    length = drjit.sqrt(x.x**2 + x.y**2)
+    flat = length > 1e-6  # Interpolated tangents may cancel, and a lone interaction has none.
+    length = drjit.select(flat, length, 1)
+    c, s = drjit.select(flat, x.x / length, 1), drjit.select(flat, x.y / length, 0)
+    turned_s, turned_c = drjit.sincos(rotation)
+    c, s = c * turned_c - s * turned_s, s * turned_c + c * turned_s
+    return (
+        lambda w: mitsuba.Vector3f(c * w.x + s * w.y, c * w.y - s * w.x, w.z),
+        lambda w: mitsuba.Vector3f(c * w.x - s * w.y, s * w.x + c * w.y, w.z),
+    )
 
 
 @functools.cache
@@ -156,16 +220,7 @@ def _ashikhmin_shirley() -> Any:
         colors, scalars = ("diffuse", "specular"), ("nu", "nv")
 
         def frame(self, si):
-            # Interpolated as the attribute of vertices is, and square to the normal.
-            tangent = si.shape.eval_attribute_3(TANGENT, si)
-            x = si.to_local(mitsuba.Vector3f(tangent.x, tangent.y, tangent.z))
-            length = drjit.sqrt(x.x**2 + x.y**2)
-            flat = length > 1e-6  # Interpolated tangents may cancel, and a lone interaction has none.
-            c, s = drjit.select(flat, x.x / length, 1), drjit.select(flat, x.y / length, 0)
-            return (
-                lambda w: mitsuba.Vector3f(c * w.x + s * w.y, c * w.y - s * w.x, w.z),
-                lambda w: mitsuba.Vector3f(c * w.x - s * w.y, s * w.x + c * w.y, w.z),
-            )
+            return _tangent_frame(si)
 
         def half(self, u):
             # Equations 9 and 10, over all four quadrants at once.
@@ -190,5 +245,64 @@ def _ashikhmin_shirley() -> Any:
             lobe = self.density(half) / (4 * cos_d * drjit.maximum(wi.z, wo.z)) * f
             base = (1 - (1 - wi.z / 2) ** 5) * (1 - (1 - wo.z / 2) ** 5)
             return lobe + 28 / (23 * drjit.pi) * self.diffuse * (1 - self.specular) * base
+
+    return Model
+
+
+@functools.cache
+def _metallic_roughness() -> Any:
+    drjit, mitsuba = _modules()
+
+    class Point:
+        """The material at the points of a surface interaction."""
+
+        def __init__(self, parameter, si):
+            self.base, self.f0 = (parameter[name].eval(si) for name in ("base_color", "f0"))
+            self.metallic, self.specular = (parameter[name].eval_1(si) for name in ("metallic", "specular"))
+            self.across = drjit.maximum(parameter["roughness"].eval_1(si) ** 2, _SMOOTHEST)
+            self.along = self.across + (1 - self.across) * parameter["anisotropy"].eval_1(si) ** 2
+
+        def half(self, u):
+            # Walter et al. 2007, equation 35, of the unstretched distribution.
+            slope = drjit.sqrt(u.x / drjit.maximum(1 - u.x, 1e-7))
+            sine, cosine = drjit.sincos(2 * drjit.pi * u.y)
+            return drjit.normalize(mitsuba.Vector3f(self.along * slope * cosine, self.across * slope * sine, 1))
+
+        def distribution(self, half):
+            tilt = (half.x / self.along) ** 2 + (half.y / self.across) ** 2 + half.z**2
+            return 1 / (drjit.pi * self.along * self.across * tilt**2)
+
+        def density(self, half):
+            return self.distribution(half) * half.z
+
+        def value(self, wi, wo, half, cos_d):
+            def stretched(w):
+                return drjit.sqrt((self.along * w.x) ** 2 + (self.across * w.y) ** 2 + w.z**2)
+
+            w = (1 - drjit.minimum(cos_d, 1)) ** 5
+            visible = 0.5 / (wo.z * stretched(wi) + wi.z * stretched(wo))
+            lobe = self.distribution(half) * visible
+            layer = self.f0 + (1 - self.f0) * w
+            under = 1 - self.specular * drjit.max(layer)
+            dielectric = self.specular * layer * lobe + under * self.base / drjit.pi
+            metal = (self.base + (1 - self.base) * w) * lobe
+            return (1 - self.metallic) * dielectric + self.metallic * metal
+
+    class Model(_glossy()):
+        colors, scalars = (), ()
+
+        def __init__(self, textures: dict[str, dict]):
+            super().__init__(None)
+            self.parameter = {name: mitsuba.load_dict(each) for name, each in textures.items()}
+
+        def at(self, si):
+            return Point(self.parameter, si)
+
+        def frame(self, si):
+            return _tangent_frame(si, self.parameter["rotation"].eval_1(si))
+
+        def traverse(self, callback):
+            for name, each in self.parameter.items():
+                callback.put(name, each, mitsuba.ParamFlags.Differentiable)
 
     return Model

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import path_tracing, plugins
 from jaxprt import reference
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.image import raster
 from jaxprt.scene import Camera, Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
@@ -24,6 +24,8 @@ MATERIALS = (
 SHARP = (
     *(CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], roughness, [0.1, 0.3, 0.2]) for roughness in (0.1, 0.3, 0.5)),
     *(AshikhminShirley([0.4, 0.2, 0.1], [0.1, 0.3, 0.2], nu, nv) for nu, nv in ((20.0, 150.0), (8.0, 2.0))),
+    MetallicRoughness([0.8, 0.4, 0.2], 0.5, 0.4),
+    MetallicRoughness([0.8, 0.4, 0.2], 0.2, 0.5, 1.7, 0.6, [1.0, 0.5, 0.3], anisotropy=0.6, rotation=0.4),
 )
 
 
@@ -184,7 +186,7 @@ def test_same_seed_gives_the_same_picture(scene, camera, light):
         ({"materials": MATERIALS[:1]}, "materials must have one for each region, got 1 and region 1"),
         (
             {"materials": [MATERIALS[0], None]},
-            "materials must be CookTorrance, AshikhminShirley or Lambert, got NoneType",
+            "materials must be CookTorrance, .* or PerVertex, got NoneType",
         ),
         ({"light": Environment(jnp.ones((2, 6, 4, 4, 3)))}, r"light must be one environment, got a batch \[2\]"),
         ({"depth": 1}, "depth must be at least 2 and samples at least 1, got 1 and 4"),
