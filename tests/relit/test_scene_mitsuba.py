@@ -67,7 +67,8 @@ def test_picture_is_that_of_mitsuba(relit, judge, light):
         (np.asarray(prt.image.rasterize(relit.mesh, scenes.finer(relit.camera)).triangle) < 0)[..., None]
     )
     outside = behind[..., 0] == 1
-    np.testing.assert_allclose(picture[outside], judge.mean[outside], rtol=0.1)
+    difference = np.linalg.norm(picture[outside] - judge.mean[outside])  # a silhouette may touch a pixel's corner
+    assert difference < 0.02 * np.linalg.norm(judge.mean[outside])
 
 
 @pytest.mark.parametrize("change", ["u mirrored", "v mirrored", "no metal"])
