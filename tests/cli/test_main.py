@@ -235,7 +235,7 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--keep", "0"], "--keep must be at least 1, got 0"),
         (["--keep", "30000"], "--keep must be at most 384, got 30000"),
         (["--terms", "0"], "--terms must be at least 1, got 0"),
-        (["--brdf", "ashikhmin-shirley", "--terms", "300"], "terms must be between 1 and .* got 300"),
+        (["--brdf", "ashikhmin-shirley", "--terms", "3000"], "terms must be between 1 and .* got 3000"),
         (["--diffuse", "0.1", "0.2"], "--diffuse must be one number or three, got 2"),
         (["--specular", "1", "2", "3", "4"], "--specular must be one number or three, got 4"),
         (["--diffuse", "nan"], "--diffuse must be not negative and finite, got nan"),
