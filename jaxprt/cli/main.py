@@ -219,8 +219,10 @@ def _view(options: argparse.Namespace) -> View:
         raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
     edge = {"width": options.size, "height": options.size}
-    whole = Scene(parts[:-1] if options.ground else parts).mesh
-    return View(Scene(parts), lights, prt.scene.camera.orbit(whole, azimuth=azimuth, elevation=elevation, **edge))
+    # The board of the embedded scene, and the ground, may reach beyond the picture.
+    shown = parts[:1] if options.mesh is None else parts[:-1] if options.ground else parts
+    camera = prt.scene.camera.orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge)
+    return View(Scene(parts), lights, camera)
 
 
 def _embedded(options: argparse.Namespace) -> Scene:
