@@ -236,7 +236,7 @@ def _step_length(curved: Callable, x: Array) -> Array:
 
 
 def _first_order(value: Callable, bounded: bool, length, steps: int) -> Any:
-    """Of jaxopt, for an objective: with a fixed step where there are bounds, else by line searches."""
+    """Makes a solver of jaxopt: it takes fixed steps where there are bounds, and searches along lines elsewhere."""
     options = {"maxiter": steps, "implicit_diff": False}
     if not bounded:
         return jaxopt.LBFGS(value, **options)

@@ -10,7 +10,8 @@ import tqdm
 from jaxprt import require
 from jaxprt.files import objects
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.planning import Plan, plan
+from jaxprt.relit.measuring import lights_of
+from jaxprt.relit.planning import Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Job, Recipe, check
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene
@@ -89,10 +90,9 @@ def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     """The plan, made once for a folder."""
     kept = folder and folder / "plan"
     if kept is not None and kept.exists():
-        found = objects.load(kept)
-        parts = {part.name: len(part.mesh.position) for part in scene.parts}
-        if {each.name: each.vertices for each in found.part} != parts:
-            raise ValueError(f"{kept} was made for another scene: name another path")
+        found, environments = objects.load(kept), options["environments"]
+        if found.key != key_of(scene, lights_of(scene) if environments is None else environments):
+            raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
         if found.asked == options["error"] and found.rate == options["rate"]:
             return found
         raise ValueError(

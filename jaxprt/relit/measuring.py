@@ -36,9 +36,9 @@ class Candidate(eqx.Module):
     Attributes:
         recipe: The recipe.
         error: Relative L2 error of radiance, under the worst of the lights.
-        seconds: Of a frame with new light and new view on this machine, without drawing.
-        nbytes: Of transport and BRDF.
-        precompute_seconds: On this machine.
+        seconds: Time of a frame with new light and new view on this machine, without drawing.
+        nbytes: Size of transport and BRDF in bytes.
+        precompute_seconds: Time of precomputation on this machine.
     """
 
     recipe: Any
@@ -67,10 +67,10 @@ class Report(NamedTuple):
     """How a scene that was made ready does; `print` shows it as a table.
 
     Attributes:
-        part: Of each part.
-        light_seconds: Of a new light on this machine.
-        view_seconds: Of a new view.
-        nbytes: Of all transport and BRDFs.
+        part: One entry for each part of the scene.
+        light_seconds: Time of a new light on this machine.
+        view_seconds: Time of a new view on this machine.
+        nbytes: Size of all transport and BRDFs in bytes.
     """
 
     part: tuple[PartReport, ...]
@@ -90,7 +90,7 @@ class Report(NamedTuple):
 
 
 def measure(system: Joined, scene: Scene, shadings: Sequence[Shading], environments: Sequence[Environment]) -> Report:
-    """Errors of the parts of a scene against the exact sum over a sample of vertices, from eight views."""
+    """Measures the parts of a scene against the exact sum, on a sample of their vertices, from eight views."""
     size, mesh = checked(environments, 1.0, 1.0), scene.mesh
     views, blends = views_around(mesh), [each.blend for each in shadings]
     seen = [system.view(jnp.asarray(eye), blends) for eye in views]

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import tqdm
 
 from jaxprt import require
@@ -16,6 +17,7 @@ from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import MEMBERS, Candidate, Sample, checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.scene import Environment, Scene
+from jaxprt.visibility import blocks
 
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
 _PYRAMID, _BITS = 5900, 3072  # least bytes of a vertex of lobes, and of terms with single texels
@@ -59,16 +61,18 @@ class Plan(eqx.Module):
     """The plan of a scene; `print` shows its decisions as a table.
 
     Attributes:
-        part: Of each part.
+        part: One plan for each part of the scene.
         asked: The error that was asked for.
         rate: Frames per second that were asked for.
         size: Edge of the lights' cubemap faces in texels.
+        key: Fingerprint of the scene and the lights, by which the plan of others is refused.
     """
 
     part: tuple[PartPlan, ...]
     asked: float
     rate: float
     size: int
+    key: str
 
     @property
     def error(self) -> float:
@@ -77,12 +81,12 @@ class Plan(eqx.Module):
 
     @property
     def seconds(self) -> float:
-        """Of a frame with new light and new view on this machine, without drawing."""
+        """Time of a frame with new light and new view on this machine, without drawing."""
         return sum(each.chosen.seconds for each in self.part)
 
     @property
     def nbytes(self) -> int:
-        """Of transport and BRDFs."""
+        """Size of transport and BRDFs in bytes."""
         return sum(each.chosen.nbytes for each in self.part)
 
     @property
@@ -111,9 +115,9 @@ def plan(
 ) -> Plan:
     """Chooses for each part of a scene the system that meets an error at a rate with the fewest bytes.
 
-    Of each system the cheapest sizes are taken whose error is below `error` / 1.25. On lights and views that the plan
-    did not see the error is then below `error` if they are of the same kind: a plan made under an overcast sky promises
-    nothing for a sun. If no system reaches the rate, the fastest one is taken, and the table says so.
+    The plan takes the cheapest sizes of each system whose error is below `error` / 1.25. Under lights and from views
+    that it did not see, the error is then below `error` if they are of the same kind: a plan made under an overcast sky
+    promises nothing for a sun. If no system reaches the rate, the fastest one is taken, and the table says so.
 
     Args:
         scene: The scene.
@@ -138,7 +142,7 @@ def plan(
     for part in tqdm.tqdm(scene.parts, desc="plan", unit="part", disable=not progress):
         sample = Sample.make(of_part(part), mesh, total, size, environments, views)
         count = len(part.mesh.position)
-        considered = tuple(_considered(sample, error))
+        considered = tuple(_considered(sample, error, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= error]
         if not good:
             best = min(considered, key=lambda each: each.error)
@@ -146,13 +150,18 @@ def plan(
                 f"error must be at least {best.error * MARGIN:.3g} for part {part.name!r}, which "
                 f"{best.recipe} reaches; got {error}"
             )
-        fast = [each for each in good if each.seconds * rate <= count / total]
+        fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         parts.append(PartPlan(part.name, count, chosen, considered))
-    return Plan(tuple(parts), float(error), float(rate), size)
+    return Plan(tuple(parts), float(error), float(rate), size, key_of(scene, environments))
 
 
-def _considered(sample: Sample, error: float):
+def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
+    """Fingerprint of a scene and its lights: meshes, parameters of materials, textures, radiance."""
+    return blocks.fingerprint(*jax.tree.leaves((scene, tuple(environments))))
+
+
+def _considered(sample: Sample, error: float, seconds: float):
     """Candidates of each system: by bisection, those around the first step of its ladder that meets the error."""
     if isinstance(sample.shading.brdf, Lambert):
         ladders = [(_DIFFUSE, 0)]
@@ -168,6 +177,8 @@ def _considered(sample: Sample, error: float):
             each = sample.measure(ladder[middle])
             yield each
             if each.error * MARGIN <= error:
-                high, fewest = middle, min(fewest, each.nbytes)
+                high = middle
+                if each.seconds <= seconds:
+                    fewest = min(fewest, each.nbytes)
             else:
                 low = middle + 1

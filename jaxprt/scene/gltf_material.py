@@ -122,7 +122,7 @@ class MaterialReader:
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
         """KHR_texture_transform, from texture coordinates with v up to v up.
 
-        Its matrix, for v down, is [cos sin; -sin cos] times the scale: "counter-clockwise" is meant as seen on the
+        The matrix, for v down, is [cos sin; -sin cos] times the scale: "counter-clockwise" is meant as seen on the
         image. So have three.js and Blender's importer it; GLSL in the extension's text, read by columns, turns the
         other way.
         """

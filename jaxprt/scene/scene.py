@@ -126,7 +126,7 @@ class Scene(eqx.Module):
     def mesh(self) -> Mesh:
         """All parts as one mesh, joined anew at each access.
 
-        Its regions are the numbers of the parts; `mesh.split` takes it apart.
+        Regions are the numbers of the parts; `mesh.split` takes it apart.
         """
         return meshes.join(
             [

@@ -127,6 +127,11 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
     np.testing.assert_array_equal(first.radiance(sky, eye=VIEWS[0]), again.radiance(sky, eye=VIEWS[0]))
     with pytest.raises(ValueError, match=r"was made for an error of 0\.3 .*, got 0\.2 .*: name another path"):
         prt.precompute(part, error=0.2, **options)
+    darker = Environment(0.5 * sky.radiance)
+    painted = prt.Scene([prt.Part("ground", part.parts[0].mesh, Lambert(0.4))])
+    for other, lights in ((part, [darker]), (painted, [sky])):
+        with pytest.raises(ValueError, match="made for another scene, other materials or other lights"):
+            prt.precompute(other, error=ASKED, **options | {"environments": lights})
 
 
 def test_a_scenes_own_lights_are_planned_for(scene, sky):

@@ -44,8 +44,8 @@ class SecondBounce(eqx.Module):
     """Two bounces, by clusters of vertices; `weight` holds the sizes.
 
     Attributes:
-        weight: Of the components of its cluster, for each row.
-        core: Of each cluster: texels of the light, components, harmonics, functions of the first and the second bounce.
+        weight: Weights of the components of its cluster, for each row.
+        core: For each cluster: texels of the light, components, harmonics, functions of the first and the second bounce.
         error: Relative L2 error of each cluster's tensor that the components make, as that of one bounce.
     """
 
@@ -67,8 +67,8 @@ class TransferTensor(eqx.Module):
     """One bounce and two, by clusters of vertices; `weight` holds the sizes, so that half precision holds the rest.
 
     Attributes:
-        weight: Of the components of its cluster, for each row.
-        core: Of each cluster: modes of the light, components, harmonics and functions.
+        weight: Weights of the components of its cluster, for each row.
+        core: For each cluster: modes of the light, components, harmonics and functions.
         mode: Modes of the light of each cluster, on its texels.
         place: Row of each vertex.
         region: Number of the region of each vertex.
@@ -172,7 +172,7 @@ def precompute(
 
     Args:
         mesh: The whole scene, which lights itself.
-        brdfs: Of each region, in the order of their numbers, what light meets on its way: a set from
+        brdfs: What light meets on its way, for each region in the order of their numbers: a set from
             `jaxprt.bounces.factor`, or the one BRDF that it has for good, factored.
         bounces: 1 or 2.
         least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring

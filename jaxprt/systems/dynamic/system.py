@@ -21,7 +21,7 @@ class DynamicSystem(protocol.System):
 
     Attributes:
         transport: From `jaxprt.dynamic.precompute`.
-        brdf: Of each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
+        brdf: One for each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
         texels: How many of the brightest texels light the vertices one by one.
         samples: Points along the edge of each at which the BRDF is taken, see `jaxprt.bright_texels.samples_for`.
     """
