@@ -9,6 +9,7 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
+from jaxprt.relit import reflection
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.planning import Plan, key_of, plan
@@ -25,6 +26,7 @@ def precompute(
     error: float = 0.05,
     environments: Sequence[Environment] | None = None,
     rate: float = 30.0,
+    bounces: int | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -42,6 +44,8 @@ def precompute(
         error: Relative L2 error of the radiance of each part, for the plan.
         environments: Lights that the error must hold for, for the plan; see `jaxprt.plan`.
         rate: Frames per second with new light and new view, for the plan.
+        bounces: How many times parts reflect light onto each other and themselves, 0 to 2; if None as many as the plan
+            finds worth it, and none with `system`.
         size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None.
@@ -52,18 +56,20 @@ def precompute(
 
     Raises:
         TypeError: No scene, a system of another kind, or a material that no system can have.
-        ValueError: There is no such system or part, the size is no power of two, a part's material is not one that
-            its system can have, or the store at `path` was made from something else.
+        ValueError: There is no such system or part, the size is no power of two, there are more than 2 bounces, a
+            part's material is not one that its system can have, or the store at `path` was made from something else.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if size is not None and (size < 1 or size & (size - 1)):
         raise ValueError(f"size must be a power of two, got {size}")
+    require.between("bounces", bounces, 0, reflection.MOST)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     if system is None:
         wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
         system, size = wanted.recipes, wanted.size if size is None else size
+        bounces = wanted.bounces if bounces is None else bounces
     size = 64 if size is None else size
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name]) for part in scene.parts]
@@ -73,7 +79,11 @@ def precompute(
         at = folder and folder / f"{number}_{_file_name(part.name)}"
         job = Job(mesh, size=size, path=at, executor=executor, progress=progress)
         systems.append(recipes[part.name].make(shading, job))
-    return RelitScene(scene, Joined(tuple(systems)), shadings)
+    reflected = None
+    if bounces:
+        job = Job(mesh, path=folder and folder / f"{bounces}", executor=executor, progress=progress)
+        reflected = reflection.make(shadings, bounces, job)
+    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
 
 
 def _checked(part: Part, recipe: Recipe) -> Shading:

@@ -89,15 +89,29 @@ class Report(NamedTuple):
         return "\n".join([*rows, f"in all: {self.nbytes / 1e6:.2f} MB, {times}"])
 
 
-def measure(system: Joined, scene: Scene, shadings: Sequence[Shading], environments: Sequence[Environment]) -> Report:
-    """Measures the parts of a scene against the exact sum, on a sample of their vertices, from eight views."""
+def measure(
+    direct: Joined,
+    system: System,
+    scene: Scene,
+    shadings: Sequence[Shading],
+    environments: Sequence[Environment],
+) -> Report:
+    """Measures the parts of a scene against the exact sum, on a sample of their vertices, from eight views.
+
+    Args:
+        direct: The systems of all parts, whose radiance is that of direct light.
+        system: The system whose bytes and times are reported, with bounces if there are any.
+        scene: The scene.
+        shadings: What its parts are to systems.
+        environments: Lights of one size.
+    """
     size, mesh = checked(environments, 1.0, 1.0), scene.mesh
     views, blends = views_around(mesh), [each.blend for each in shadings]
-    seen = [system.view(jnp.asarray(eye), blends) for eye in views]
-    lit = [system.light(each) for each in environments]
-    color = np.stack([[np.asarray(system.combine(light, view)) for view in seen] for light in lit])
+    seen = [direct.view(jnp.asarray(eye), blends) for eye in views]
+    lit = [direct.light(each) for each in environments]
+    color = np.stack([[np.asarray(direct.combine(light, view)) for view in seen] for light in lit])
     parts, first = [], 0
-    for part, shading, each in zip(scene.parts, shadings, system.part, strict=True):
+    for part, shading, each in zip(scene.parts, shadings, direct.part, strict=True):
         count = len(part.mesh.position)
         few = max(_FEWEST, round(_JUDGED * count / len(mesh.position)))
         vertex = np.sort(np.random.default_rng(1).permutation(count)[:few])
@@ -109,8 +123,18 @@ def measure(system: Joined, scene: Scene, shadings: Sequence[Shading], environme
         errors = tuple(_relative(a[facing], b[facing]) for a, b in pairs)
         parts.append(PartReport(part.name, count, errors, protocol.memory(each)))
         first += count
-    new_light = _seconds(lambda: system.combine(system.light(environments[0]), seen[0]))
-    new_view = _seconds(lambda: system.combine(lit[0], system.view(jnp.asarray(views[0]), blends)))
+
+    def arriving():
+        return system.shade(system.light(environments[0]), blends)
+
+    def view():
+        return system.view(jnp.asarray(views[0]), blends)
+
+    arrived, viewed = arriving(), view()
+    new_light, new_view = (
+        _seconds(lambda: system.combine(arriving(), viewed)),
+        _seconds(lambda: system.combine(arrived, view())),
+    )
     return Report(tuple(parts), new_light, new_view, protocol.memory(system))
 
 

@@ -9,10 +9,13 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import numpy as np
 import tqdm
+from jaxtyping import Float
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
+from jaxprt.relit import reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import MEMBERS, Candidate, Sample, checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
@@ -62,6 +65,9 @@ class Plan(eqx.Module):
 
     Attributes:
         part: One plan for each part of the scene.
+        reflected: How much of each part's light was reflected once at least before, and twice at least: relative L2,
+            estimated for matte surfaces.
+        bounces: As many as leave no more than the error of any part's light out.
         asked: The error that was asked for.
         rate: Frames per second that were asked for.
         size: Edge of the lights' cubemap faces in texels.
@@ -69,6 +75,8 @@ class Plan(eqx.Module):
     """
 
     part: tuple[PartPlan, ...]
+    reflected: Float[np.ndarray, "b p"]
+    bounces: int
     asked: float
     rate: float
     size: int
@@ -86,7 +94,7 @@ class Plan(eqx.Module):
 
     @property
     def nbytes(self) -> int:
-        """Size of transport and BRDFs in bytes."""
+        """Size of transport and BRDFs in bytes, without those of bounces."""
         return sum(each.chosen.nbytes for each in self.part)
 
     @property
@@ -100,6 +108,12 @@ class Plan(eqx.Module):
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
             rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
+        shares = (
+            f"{part.name} " + " and ".join(f"{100 * each:.1f} %" for each in own)
+            for part, own in zip(self.part, self.reflected.T, strict=True)
+        )
+        rows.append(f"reflected light, once and more, twice and more: {', '.join(shares)}")
+        rows.append(f"bounces: {self.bounces}")
         total = f"{100 * self.error:.1f} %, {1e3 * self.seconds:.1f} ms a frame, {self.nbytes / 1e6:.2f} MB"
         slow = "" if self.seconds * self.rate <= 1 else f"; slower than the {self.rate:g} frames per second asked for"
         return "\n".join([*rows, f"in all: {total}{slow}"])
@@ -119,6 +133,9 @@ def plan(
     that it did not see, the error is then below `error` if they are of the same kind: a plan made under an overcast sky
     promises nothing for a sun. If no system reaches the rate, the fastest one is taken, and the table says so.
 
+    Errors, times and bytes are those of direct light. Light that the parts reflect onto each other is left out if it is
+    less than `error` of every part's; else the plan asks for as many bounces as leave no more out, two at most.
+
     Args:
         scene: The scene.
         environments: Lights that the error must hold for, of one size; the scene's own, or else the two embedded ones.
@@ -127,7 +144,7 @@ def plan(
         progress: Whether to show a progress bar.
 
     Returns:
-        The plan, for `jaxprt.precompute(scene, system=plan.recipes)`.
+        The plan, for `jaxprt.precompute(scene, system=plan.recipes, bounces=plan.bounces)`.
 
     Raises:
         TypeError: No scene.
@@ -139,8 +156,10 @@ def plan(
     size = checked(environments, error, rate)
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, parts = len(mesh.position), []
-    for part in tqdm.tqdm(scene.parts, desc="plan", unit="part", disable=not progress):
-        sample = Sample.make(of_part(part), mesh, total, size, environments, views)
+    shadings = [of_part(part) for part in scene.parts]
+    pairs = zip(scene.parts, shadings, strict=True)
+    for part, shading in tqdm.tqdm(pairs, desc="plan", unit="part", total=len(shadings), disable=not progress):
+        sample = Sample.make(shading, mesh, total, size, environments, views)
         count = len(part.mesh.position)
         considered = tuple(_considered(sample, error, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= error]
@@ -153,7 +172,9 @@ def plan(
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         parts.append(PartPlan(part.name, count, chosen, considered))
-    return Plan(tuple(parts), float(error), float(rate), size, key_of(scene, environments))
+    reflected = reflection.shares(shadings, environments)
+    bounces = reflection.needed(reflected, error)
+    return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key_of(scene, environments))
 
 
 def key_of(scene: Scene, environments: Sequence[Environment]) -> str:

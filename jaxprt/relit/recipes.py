@@ -106,9 +106,7 @@ class Harmonics(eqx.Module):
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.precompute_diffuse(shading.mesh, **options, **job.options(f"vectors_{self.degree}"))
             return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
-        # Lobes between knots move and widen; harmonics are interpolated linearly, and need more knots.
-        finer = {"knot": tuple(map(_finer, shading.knot)), "error": _VARYING} if shading.knot else {}
-        table = harmonic.tabulate(shading.brdf, degree=self.degree, **finer)
+        table = harmonic_table(shading, degree=self.degree)
         matrices = harmonic.precompute(shading.mesh, **options, **job.options(f"matrices_{self.degree}"))
         return harmonic.HarmonicSystem(matrices, table, self.laplacian)
 
@@ -191,6 +189,14 @@ def _bright(system: System, visible, shading: Shading, texels: int, size: int) -
     sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     samples = bright_texels.samples_for(sharpest, size=size)
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
+
+
+def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:
+    """The BRDF of a part in harmonics, over its roughness if that varies."""
+    if not shading.knot:
+        return harmonic.tabulate(shading.brdf, degree=degree)
+    # Lobes between knots move and widen; harmonics are interpolated linearly, and need more knots.
+    return harmonic.tabulate(shading.brdf, degree=degree, knot=tuple(map(_finer, shading.knot)), error=_VARYING)
 
 
 def _finer(knot: np.ndarray) -> np.ndarray:

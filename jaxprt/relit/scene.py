@@ -17,7 +17,8 @@ from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import background
 from jaxprt.systems import protocol
-from jaxprt.systems.protocol import Blend, Joined, System
+from jaxprt.systems.bounces import PartBounces
+from jaxprt.systems.protocol import Blend, Joined, System, Total
 
 
 class SceneView(eqx.Module):
@@ -41,25 +42,28 @@ class RelitScene(System):
 
     Attributes:
         scene: The scene.
-        system: The systems of its parts.
+        direct: The systems of its parts.
         shading: What its parts are to the systems.
+        bounces: Light that the parts reflect onto each other; None without.
         mesh: The mesh of all parts, with the scene's own normals.
         camera: The scene's first camera; one around it, a little from above, where it has none.
     """
 
     scene: Scene
-    system: Joined
+    direct: Joined
     shading: tuple[Shading, ...]
+    bounces: PartBounces | None
     mesh: Mesh
     camera: Camera
 
-    def __init__(self, scene: Scene, system: Joined, shading: Sequence[Shading]):
+    def __init__(self, scene: Scene, direct: Joined, shading: Sequence[Shading], bounces: PartBounces | None = None):
         """Joins the parts' meshes.
 
         Args:
             scene: The scene.
-            system: The systems of its parts, in order.
+            direct: The systems of its parts, in order.
             shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
+            bounces: Light that the parts reflect onto each other; None without.
         """
         # What is no array cannot be an argument of a jitted function.
         parts = [
@@ -69,8 +73,13 @@ class RelitScene(System):
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
-        self.system, self.shading, self.mesh = system, tuple(shading), scene.mesh
+        self.direct, self.shading, self.bounces, self.mesh = direct, tuple(shading), bounces, scene.mesh
         self.camera = scene.cameras[0] if scene.cameras else orbit(self.mesh, azimuth=0.5, elevation=0.3)
+
+    @property
+    def system(self) -> Joined | Total:
+        """The system of all vertices, without what they emit: direct light, and bounces where there are any."""
+        return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """What a light is to all parts."""
@@ -144,7 +153,8 @@ class RelitScene(System):
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of the parts against the exact sum, times and bytes, measured on this machine.
 
-        Errors are those of a sample of each part's vertices, from eight views around the scene.
+        Errors are those of direct light alone, of a sample of each part's vertices, from eight views around the scene;
+        times and bytes are those of all light.
 
         Args:
             environments: Lights of one size; the scene's own, or else the two embedded ones.
@@ -156,7 +166,7 @@ class RelitScene(System):
             ValueError: No lights, lights of different sizes, or NaN or infinity in them.
         """
         lights = measuring.lights_of(self.scene) if environments is None else environments
-        return measuring.measure(self.system, self.scene, self.shading, lights)
+        return measuring.measure(self.direct, self.system, self.scene, self.shading, lights)
 
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
         """Materials evaluated at the vertices: once for all views.

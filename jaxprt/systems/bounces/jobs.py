@@ -112,7 +112,7 @@ class _PathJob(separable.clustered.ClusterJob, visibility.rays.VisibilityJob):
             local[own] = np.arange(len(own))
             # Padded to a power of two groups, so that few shapes are compiled; what is added weighs nothing.
             spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
-            owner, corner, weight, texel = (np.pad(x, ((0, spare), *[(0, 0)] * (x.ndim - 1))) for x in rays)
+            owner, corner, weight, texel = (np.concatenate([x, np.zeros((spare, *x.shape[1:]), x.dtype)]) for x in rays)
             fixed = (owner, local[corner], weight, way[texel], measure[texel])
             arrived = gather.arrive(response, self.frame[own], basis, *map(jax.device_put, fixed), points=len(part))
             result.append(np.asarray(arrived))

@@ -162,6 +162,11 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
         area = jnp.where(tensor.region == number, tensor.area, 0)
         diffuse, specular = (_mean(each, area) for each in (material.diffuse, material.specular))
         rows.append(functions.weights(factor, material.share, diffuse, specular))
+    return gathered(tensor, rows)
+
+
+def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "p _"]]) -> Float[Array, "q c"]:
+    """Weights of the functions that the tensor keeps, given those of all functions of each region."""
     colors = max(each.shape[1] for each in rows)
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
 

@@ -45,7 +45,7 @@ class SecondBounce(eqx.Module):
 
     Attributes:
         weight: Weights of the components of its cluster, for each row.
-        core: For each cluster: texels of the light, components, harmonics, functions of the first and the second bounce.
+        core: For each cluster: texels of the light, components, harmonics, functions of the first and second bounce.
         error: Relative L2 error of each cluster's tensor that the components make, as that of one bounce.
     """
 

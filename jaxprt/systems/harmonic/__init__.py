@@ -15,7 +15,7 @@ from jaxprt.systems.harmonic.relight import (
     view_coefficients,
     world_view,
 )
-from jaxprt.systems.harmonic.system import DiffuseSystem, HarmonicSystem
+from jaxprt.systems.harmonic.system import DiffuseSystem, HarmonicSystem, blended_view
 from jaxprt.systems.harmonic.table import HarmonicBrdf, tabulate
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, precompute, precompute_diffuse
 
@@ -25,6 +25,7 @@ __all__ = [
     "HarmonicSystem",
     "TransferMatrix",
     "TransferVector",
+    "blended_view",
     "combine",
     "diffuse_radiance",
     "interreflect",

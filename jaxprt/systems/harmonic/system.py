@@ -51,13 +51,7 @@ class HarmonicSystem(protocol.System):
 
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
         """The BRDF's harmonics for each vertex's view: `jaxprt.harmonic.view_coefficients`."""
-        protocol.check_blend(materials)
-        parameter = () if materials is None else materials.parameter
-        row = view_coefficients(self.brdf, self.transport.position, self.transport.frame, *parameter, eye=eye)
-        if materials is None:
-            return row
-        materials.check(self.vertices, row.shape[1])
-        return jnp.einsum("ikv,vkc->icv", row, materials.weight)
+        return blended_view(self.brdf, self.transport.position, self.transport.frame, materials, eye=eye)
 
     def combine(self, light: Float[Array, "lm c v"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
         """Radiance: the dot product of light and BRDF."""
@@ -127,3 +121,26 @@ def _projected(environment: Environment, degree: int) -> Float[Array, "lm c"]:
     if environment.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(environment.radiance.shape)}")
     return project(environment, degree=degree)
+
+
+def blended_view(
+    brdf: HarmonicBrdf,
+    position: Float[Array, "v 3"],
+    frame: Float[Array, "v 3 3"],
+    materials: Blend | None,
+    *,
+    eye: Float[Array, "3"],
+) -> Float[Array, "lm c v"]:
+    """`jaxprt.harmonic.view_coefficients` of a table whose channels and parameters a blend has for each vertex.
+
+    Raises:
+        TypeError: The materials are no `Blend`.
+        ValueError: They are of other vertices or channels.
+    """
+    protocol.check_blend(materials)
+    parameter = () if materials is None else materials.parameter
+    row = view_coefficients(brdf, position, frame, *parameter, eye=eye)
+    if materials is None:
+        return row
+    materials.check(len(position), row.shape[1])
+    return jnp.einsum("ikv,vkc->icv", row, materials.weight)

@@ -1,0 +1,116 @@
+"""Light that the parts of a scene reflect onto each other: what it is worth, and how it is precomputed."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt.brdf import Lambert
+from jaxprt.relit.channels import Shading
+from jaxprt.relit.recipes import Job, harmonic_table
+from jaxprt.scene import Environment, Mesh
+from jaxprt.scene.mesh import join
+from jaxprt.sphere import directions
+from jaxprt.systems import bounces, harmonic, separable
+from jaxprt.systems.bounces import PartBounces, ReflectingPart
+from jaxprt.systems.bounces.jobs import DEGREE
+from jaxprt.systems.harmonic import TransferVector
+
+MOST = 2  # bounces
+_TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
+_LEAST = 1e-3  # of what arrives: functions that bring less are left out
+_DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
+_VIEWS = 16  # over whose angles albedo is averaged
+
+
+def make(shadings: Sequence[Shading], count: int, job: Job) -> PartBounces:
+    """Precomputes reflected light between all parts.
+
+    Args:
+        shadings: What the parts are to systems.
+        count: How many times light is reflected, 1 or 2.
+        job: Where that is done; occluder, size and vertices are not used.
+
+    Returns:
+        The system of reflected light alone.
+    """
+    mesh = _joined(shadings)
+    paths = [_factored(each) for each in shadings]
+    tensor = bounces.precompute(mesh, paths, bounces=count, least=_LEAST, **job.options("bounces"))
+    frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
+    parts = [
+        ReflectingPart(each.mesh.position, axes, harmonic_table(each, degree=DEGREE))
+        for each, axes in zip(shadings, frame, strict=True)
+    ]
+    return PartBounces(tensor, tuple(parts))
+
+
+def shares(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
+    """How much of the light that each part sends on was reflected once at least before, and twice at least.
+
+    An estimate: surfaces count as matte, with the mean albedo of their parts, and three bounces or more as none.
+
+    Args:
+        shadings: What the parts are to systems.
+        environments: Lights; that with the largest share counts.
+
+    Returns:
+        Relative L2, by bounces and parts.
+    """
+    mesh, albedo = _joined(shadings), np.stack([_albedo(each) for each in shadings])
+    options = {"size": _REFLECTED, "progress": False}
+    direct = harmonic.precompute_diffuse(mesh, degree=_DEGREE, size=_DIRECT, progress=False)
+    each = [direct.vector]
+    for _ in range(MOST):
+        last = TransferVector(each[-1], direct.position)
+        both = harmonic.interreflect_diffuse(mesh, last, albedo, bounces=1, **options)
+        each.append(both.vector - each[-1])
+    region, result = np.asarray(mesh.region), np.zeros((MOST, len(shadings)))
+    for light in environments:
+        coefficient = harmonic.project(light, degree=_DEGREE)
+        lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
+        for part in range(len(shadings)):
+            own = lit[:, region == part]
+            whole = max(float(np.linalg.norm(own.sum(0))), 1e-30)
+            left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, MOST + 1)]
+            result[:, part] = np.maximum(result[:, part], np.asarray(left))
+    return result
+
+
+def needed(shares: Float[np.ndarray, "b p"], error: float) -> int:
+    """How many bounces leave no more than an error of any part's light out; all that there are if none does."""
+    enough = np.flatnonzero(np.all(shares <= error, 1))
+    return int(enough[0]) if enough.size else len(shares)
+
+
+def _joined(shadings: Sequence[Shading]) -> Mesh:
+    """The meshes of all parts as one, whose regions are the parts."""
+    one = [eqx.tree_at(lambda mesh: mesh.region, each.mesh, jnp.zeros_like(each.mesh.region)) for each in shadings]
+    return join(one)
+
+
+def _factored(shading: Shading) -> separable.SeparableBrdf:
+    """What a part reflects light with on its way to others."""
+    brdf = _still(shading)
+    terms = 1 if isinstance(brdf, Lambert) else _TERMS
+    return separable.factor(brdf, terms=terms, resolution=_RESOLUTION)
+
+
+def _albedo(shading: Shading) -> Float[np.ndarray, "3"]:
+    """Mean albedo of a part, over its vertices and over views from above."""
+    cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Evenly spread in projected solid angle.
+    wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
+    table = harmonic.tabulate(_still(shading), degree=0)
+    channel = np.sqrt(4 * np.pi) * np.mean(table.coefficients(jnp.asarray(wo))[0], -1)
+    color = channel if shading.blend is None else channel @ np.mean(shading.blend.weight, 0)
+    return np.clip(np.broadcast_to(color, 3), 0, 1)
+
+
+def _still(shading: Shading) -> Callable:
+    """The BRDF of a part, at the mean roughness if that varies."""
+    if not shading.knot:
+        return shading.brdf
+    assert shading.blend is not None
+    return shading.brdf(jnp.asarray(np.mean(shading.blend.parameter[0])))

@@ -1,0 +1,129 @@
+"""Bounces between the parts of a scene, each with one BRDF of channels that its vertices weight: textures."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.scene.environment import Environment
+from jaxprt.systems import harmonic, protocol
+from jaxprt.systems.bounces.jobs import DEGREE
+from jaxprt.systems.bounces.relight import LitTransfer, collect, gathered, light_side
+from jaxprt.systems.bounces.tensor import TransferTensor
+from jaxprt.systems.harmonic import HarmonicBrdf
+from jaxprt.systems.protocol import Blend
+
+
+class ReflectingPart(eqx.Module):
+    """The vertices of a part, and what they make of light that arrives as harmonics.
+
+    Attributes:
+        position: Positions of the vertices.
+        frame: Their frames; rows are tangent, bitangent, normal.
+        brdf: Table of degree 3, from `jaxprt.harmonic.tabulate`.
+    """
+
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    brdf: HarmonicBrdf
+
+    def __check_init__(self):
+        """Refuses tables of another degree than that of the light that arrives."""
+        require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
+        if self.brdf.degree != DEGREE:
+            raise ValueError(f"the BRDF must have degree {DEGREE}, that of reflected light, got {self.brdf.degree}")
+
+
+class PartBounces(protocol.System):
+    """Light that the parts of a scene reflect onto each other and themselves, without the direct light.
+
+    Materials are a `Blend` for each part, or None for one whose BRDF is as it was tabulated. What a part sends to
+    others has its mean weights over its area; what its vertices make of light that arrives has their own.
+
+    Attributes:
+        tensor: From `jaxprt.bounces.precompute` with one factored BRDF for each part, of the same channels.
+        part: The parts, whose vertices follow each other.
+    """
+
+    tensor: TransferTensor
+    part: tuple[ReflectingPart, ...] = eqx.field(converter=tuple)
+
+    def __check_init__(self):
+        """Refuses tensors of sets, of other vertices and of parts in another order."""
+        require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
+        counts = [len(each.position) for each in self.part]
+        found = [each.ndim for each in self.tensor.factor]
+        if found != [2] * len(counts):
+            raise ValueError(
+                f"the tensor must be of one factored BRDF for each of {len(counts)} parts, got {len(found)}, "
+                f"{sum(each == 3 for each in found)} of them sets"
+            )
+        if len(self.tensor.place) != sum(counts):
+            raise ValueError(f"the tensor must be of the parts' {sum(counts)} vertices, got {len(self.tensor.place)}")
+        if isinstance(self.tensor.region, Tracer):
+            return
+        if np.any(np.asarray(self.tensor.region) != np.repeat(np.arange(len(counts)), counts)):
+            raise ValueError("the tensor's regions must be the parts in their order, one after the other")
+
+    def light(self, environment: Environment) -> LitTransfer:
+        """What bounces make of a light, for all materials: `jaxprt.bounces.light_side`."""
+        return light_side(self.tensor, environment)
+
+    def shade(
+        self, light: LitTransfer, materials: Sequence[Blend | None] | None = None
+    ) -> tuple[Float[Array, "lm c v"], ...]:
+        """Harmonics of the light that arrives at the vertices of each part, in their frames, with all materials."""
+        require.kind("the light", light, LitTransfer, source="PartBounces.light")
+        blends = zip(self.part, self._given(materials), strict=True)
+        means = [self._mean(number, *each) for number, each in enumerate(blends)]
+        rows = [own if mean is None else own @ mean for own, mean in zip(self.tensor.factor, means, strict=True)]
+        arriving = collect(self.tensor, light, gathered(self.tensor, rows))
+        each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
+        return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))
+
+    def view(
+        self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
+    ) -> tuple[Float[Array, "lm d v"], ...]:
+        """Harmonics of each vertex's BRDF for its view."""
+        require.position("the eye", eye)
+        pairs = zip(self.part, self._given(materials), strict=True)
+        return tuple(harmonic.blended_view(part.brdf, part.position, part.frame, own, eye=eye) for part, own in pairs)
+
+    def combine(
+        self, light: tuple[Float[Array, "lm c v"], ...], view: tuple[Float[Array, "lm d v"], ...]
+    ) -> Float[Array, "v e"]:
+        """Radiance of reflected light."""
+        require.kind("the light", light, tuple, source="PartBounces.shade")
+        require.kind("the view", view, tuple, source="PartBounces.view")
+        rows = [harmonic.combine(*sides) for sides in zip(light, view, strict=True)]
+        colors = max(each.shape[1] for each in rows)
+        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.tensor.place)
+
+    def _mean(self, number: int, part: ReflectingPart, blend: Blend | None) -> Float[Array, "k c"] | None:
+        """Mean weights of a part's channels over its area; None without any."""
+        if blend is None:
+            return None
+        blend.check(len(part.position), self.tensor.factor[number].shape[1])
+        first = sum(len(each.position) for each in self.part[:number])
+        area = self.tensor.area[first : first + len(part.position)]
+        whole = jnp.sum(area)
+        return jnp.einsum("v,vkc->kc", area, blend.weight) / jnp.where(whole > 0, whole, 1)
+
+    def _given(self, materials: Any) -> Sequence[Blend | None]:
+        if materials is None:
+            return [None] * len(self.part)
+        if not isinstance(materials, Sequence) or len(materials) != len(self.part):
+            raise TypeError(f"the materials must be a list, one for each of {len(self.part)} parts, got {materials}")
+        for each in materials:
+            protocol.check_blend(each)
+        return materials
