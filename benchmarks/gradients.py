@@ -205,7 +205,7 @@ def changing():
 def mixed(family, material) -> Material:
     """A material of diffuse and specular weights and coordinates."""
     diffuse, specular, place = material
-    return Material(family.navigation.share(place), diffuse, specular)
+    return Material(family.navigation.weight(place), diffuse, specular)
 
 
 def arguments() -> dict[str, PyTree]:

@@ -172,9 +172,9 @@ def draw(mesh: Mesh, size: int, quick: bool) -> list[Triple]:
 
 def materials(plane, triple: Triple, adjustable: int) -> list:
     """Those of a triple; a second region has the roles of its weights exchanged."""
-    share = plane.share(jnp.asarray(triple.coordinate))
-    first = dynamic.Material(share, jnp.asarray(triple.diffuse), jnp.asarray(triple.specular))
-    second = dynamic.Material(share, jnp.asarray(0.8 * triple.specular), jnp.asarray(triple.diffuse))
+    weight = plane.weight(jnp.asarray(triple.coordinate))
+    first = dynamic.Material(weight, jnp.asarray(triple.diffuse), jnp.asarray(triple.specular))
+    second = dynamic.Material(weight, jnp.asarray(0.8 * triple.specular), jnp.asarray(triple.diffuse))
     return [first, second if adjustable == 2 else None]
 
 
@@ -204,11 +204,11 @@ def errors(mesh: Mesh, transport, brdfs, triples, material, quick: bool) -> dict
         eye = jnp.asarray(triple.eye)
         options = {"eye": eye, "texels": TEXELS, "samples": samples_for(triple, transport.size)}
         color = dynamic.radiance(transport, brdfs, matter, triple.light, **options)
-        dull = [each and dynamic.Material(each.share, each.diffuse, 0 * each.specular) for each in matter]
+        dull = [each and dynamic.Material(each.weight, each.diffuse, 0 * each.specular) for each in matter]
         matte = dynamic.radiance(transport, brdfs, dull, triple.light, **options)
         white = exact(Lambert(1.0), triple)
         glossy = exact(CookTorrance(diffuse=0.0, specular=1.0, roughness=roughness, f0=f0), triple)
-        fitted = exact(brdfs[0].at(matter[0].share), triple)
+        fitted = exact(brdfs[0].at(matter[0].weight), triple)
         sums = np.zeros((3, len(vertex), 3))
         for place, each in enumerate(matter):
             diffuse, specular = (0.5, 0.0) if each is None else (np.asarray(each.diffuse), np.asarray(each.specular))
@@ -234,7 +234,7 @@ def gradient(
     fixed = materials(plane, triple, common["adjustable"])
 
     def loss(light, diffuse, specular, coordinate):
-        first = dynamic.Material(plane.share(coordinate), diffuse, specular)
+        first = dynamic.Material(plane.weight(coordinate), diffuse, specular)
         color = dynamic.radiance(transport, brdfs, [first, fixed[1]], Environment(light), eye=view.eye, texels=TEXELS)
         return jnp.mean(raster.interpolate(fragments, mesh.face, color) ** 2)
 

@@ -313,8 +313,8 @@ class Draw:
 
     def material(self, vertices=3):
         """What ``regions`` is made of; the color of its lobes is a texture."""
-        share = np.asarray(self.uniform(2))
-        return dynamic.Material(self.array(share / share.sum()), self.uniform(3), self.uniform(vertices, 3))
+        weight = np.asarray(self.uniform(2))
+        return dynamic.Material(self.array(weight / weight.sum()), self.uniform(3), self.uniform(vertices, 3))
 
     def transfer(self, vertices):
         """Bounces of ``changing``, with what is stored in half precision in the one under test."""
@@ -583,7 +583,7 @@ EXAMPLES = {
     "systems.lobe.table.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
     "systems.lobe.table.mean": example(
         lambda draw: call(draw.changing().lobe, draw.uniform(2)),
-        gradient=("table", "share"),
+        gradient=("table", "weight"),
     ),
     "systems.dynamic.brdf_set.Mixed": example(
         lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),

@@ -1,7 +1,7 @@
-"""Navigation: moving among the BRDFs of a set, as shares of each that sum to one.
+"""Navigation: moving among the BRDFs of a set, by a weight for each; the weights sum to one.
 
 A set holds purely specular gray BRDFs of unit weight; diffuse and specular weights and colors are applied elsewhere.
-Shares of BRDFs are shares of all that is linear in them: of their coefficients and of the radiance that they reflect.
+They also weigh all that is linear in the BRDFs: their coefficients, and the radiance that they reflect.
 
 Reference: Sun et al. 2007, "Interactive relighting with dynamic BRDFs", section 4.2.
 """
@@ -48,8 +48,8 @@ class Line(eqx.Module):
 
     knot: Float[Array, " m"]
 
-    def share(self, coordinate: Float[ArrayLike, ""]) -> Float[Array, " m"]:
-        """Share of each BRDF; not negative, their sum is one.
+    def weight(self, coordinate: Float[ArrayLike, ""]) -> Float[Array, " m"]:
+        """Weight of each BRDF; not negative, their sum is one.
 
         Differentiable in the coordinate and the knots: at a knot from above, at the last one from below.
 
@@ -84,8 +84,8 @@ class Plane(eqx.Module):
     edge: Int[Array, "e 2"]
     chart: Callable[[Array], Array] = eqx.field(static=True, default=_identity)
 
-    def share(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
-        """Share of each BRDF; not negative, their sum is one, and three at most are not zero.
+    def weight(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
+        """Weight of each BRDF; not negative, their sum is one, and three at most are not zero.
 
         Continuous. Differentiable in the coordinate and the points, with the triangulation fixed: the derivative is
         that of the triangle or edge which was picked, one-sided where several meet, and zero where the nearest point
@@ -94,7 +94,7 @@ class Plane(eqx.Module):
         Raises:
             ValueError: There are not two coordinates.
         """
-        return _share(self, _checked(coordinate, (2,)))
+        return _weight(self, _checked(coordinate, (2,)))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is inside the boundary or on it, up to rounding."""
@@ -107,7 +107,7 @@ class Family(eqx.Module):
 
     Attributes:
         brdf: Purely specular gray BRDFs of unit weight. Material m is diffuse_m / pi + specular_m brdf_m.
-        navigation: Turns coordinates into a share of each.
+        navigation: Turns coordinates into a weight for each.
         name: What each is called.
         diffuse: Diffuse reflectance of each material in linear RGB; zero where there are no materials.
         specular: Weight of its lobe in linear RGB; one where there are no materials.
@@ -297,8 +297,8 @@ def _number(row: dict, column: str, line: int) -> float:
 
 
 @jax.jit
-def _share(plane: Plane, coordinate: Array) -> Array:
-    """`Plane.share` of two numbers that are finite: some sixty operations, as one program."""
+def _weight(plane: Plane, coordinate: Array) -> Array:
+    """`Plane.weight` of two numbers that are finite: some sixty operations, as one program."""
     point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
     # What is picked is not differentiated.
     still, fixed = jax.lax.stop_gradient((point, spot))
@@ -360,7 +360,7 @@ def _barycentric(corner: Array, spot: Array) -> tuple[Array, Array]:
 
 
 def _project(segment: Array, spot: Array) -> tuple[Array, Array]:
-    """The nearest points of segments: the share of their second end, and where they are."""
+    """The nearest points of segments: how far along they lie, from 0 to 1, and where they are."""
     start, way = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
     square = jnp.sum(way**2, -1)
     along = _clip(jnp.sum((spot - start) * way, -1) / jnp.where(square > 0, square, 1), 0, 1)

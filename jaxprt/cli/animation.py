@@ -99,10 +99,10 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
         away = np.sin(np.pi * turn) ** 2
         m, f0 = float(model.roughness), jnp.mean(model.f0)
         rough = m ** (1 - away) * ROUGHNESS[-1 if m < ROUGHNESS[2] else 0] ** away
-        share = ready.family.navigation.share(jnp.stack([f0, jnp.asarray(rough, f0.dtype)]))
+        weight = ready.family.navigation.weight(jnp.stack([f0, jnp.asarray(rough, f0.dtype)]))
         hue = 1 + away * np.cos(2 * np.pi * (number / 3 + np.arange(3) / 3))
         tint = jnp.asarray(hue / hue.max(), f0.dtype)
-        result.append(Material(share, model.diffuse * tint, model.specular))
+        result.append(Material(weight, model.diffuse * tint, model.specular))
     return result
 
 

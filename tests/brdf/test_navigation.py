@@ -44,8 +44,8 @@ def make(kind):
 @jax.jit
 def _look(plane, spot):
     def each(spot):
-        weight, pull = jax.vjp(lambda plane, spot: plane.share(spot), plane, spot)
-        ahead = jax.jacfwd(plane.share)(spot)
+        weight, pull = jax.vjp(lambda plane, spot: plane.weight(spot), plane, spot)
+        ahead = jax.jacfwd(plane.weight)(spot)
         by_plane, by_spot = pull(jnp.cos(jnp.arange(len(weight), dtype=weight.dtype)))
         return weight, plane.inside(spot), ahead, by_plane.point, by_spot
 
@@ -54,7 +54,7 @@ def _look(plane, spot):
 
 @jax.jit
 def _place(plane, spot):
-    return jax.vmap(lambda spot: (plane.share(spot), plane.inside(spot)))(spot)
+    return jax.vmap(lambda spot: (plane.weight(spot), plane.inside(spot)))(spot)
 
 
 def ask(function, plane, spot):
@@ -74,14 +74,14 @@ def ask(function, plane, spot):
 
 
 def look(plane, spot):
-    """Shares, whether inside, their derivatives, and gradients of sum_m cos(m) share_m in the points and the spot."""
+    """Weights, whether inside, their derivatives, and gradients of sum_m cos(m) weight_m in the points and the spot."""
     count = len(plane.point)
     weight, within, ahead, by_point, by_spot = ask(_look, plane, spot)
     by_point[:, 0] += np.sum(by_point[:, count:], 1)
     return weight[:, :count], within, ahead[:, :count], by_point[:, :count], by_spot
 
 
-def share(plane, spot):
+def weights(plane, spot):
     return ask(_place, plane, spot)[0][:, : len(plane.point)]
 
 
@@ -96,8 +96,8 @@ def scaled(plane, coordinate):
 
 
 def placed(plane, spot):
-    """Where shares put spots, in the scaled plane."""
-    return np.asarray(share(plane, spot), float) @ scaled(plane, plane.point)
+    """Where weights put spots, in the scaled plane."""
+    return np.asarray(weights(plane, spot), float) @ scaled(plane, plane.point)
 
 
 def around(plane, count=400, seed=1):
@@ -141,22 +141,22 @@ def nearest(plane, spot, samples=4000):
 @pytest.mark.parametrize("coordinate", [0.3, [0.3], [0.3, 0.1, 0.1], [[0.3, 0.1]]])
 def test_a_place_in_a_plane_has_two_coordinates(coordinate, unchecked):
     with pytest.raises(ValueError, match="a point of this set has two coordinates not an array of shape"):
-        cook_torrance().navigation.share(coordinate)
+        cook_torrance().navigation.weight(coordinate)
     with pytest.raises(ValueError, match="a point of this set has one coordinate, a number, not an array of shape"):
-        Line(jnp.array([1.0, 2.0])).share([1.5])
+        Line(jnp.array([1.0, 2.0])).weight([1.5])
 
 
 def test_infinite_coordinates_are_far_away(unchecked):
     plane = cook_torrance().navigation
-    np.testing.assert_array_equal(plane.share([np.inf, 0.2]), plane.share([1e30, 0.2]))
-    np.testing.assert_array_equal(Line(jnp.array([1.0, 2.0])).share(-np.inf), [1, 0])
+    np.testing.assert_array_equal(plane.weight([np.inf, 0.2]), plane.weight([1e30, 0.2]))
+    np.testing.assert_array_equal(Line(jnp.array([1.0, 2.0])).weight(-np.inf), [1, 0])
 
 
 # Lines.
 
 
-line = jax.jit(jax.vmap(lambda knot, spot: Line(knot).share(spot), (None, 0)))
-line_slope = jax.jit(jax.vmap(jax.jacrev(lambda knot, spot: Line(knot).share(spot), (0, 1)), (None, 0)))
+line = jax.jit(jax.vmap(lambda knot, spot: Line(knot).weight(spot), (None, 0)))
+line_slope = jax.jit(jax.vmap(jax.jacrev(lambda knot, spot: Line(knot).weight(spot), (0, 1)), (None, 0)))
 
 
 def test_a_line_interpolates_as_numpy_does(x64, close):
@@ -185,7 +185,7 @@ def test_derivatives_at_the_knots_of_a_line_are_those_of_one_side(x64, close):
 
 
 @each_plane
-def test_shares_are_not_negative_and_sum_to_one_and_all_is_finite_everywhere(kind, close):
+def test_weights_are_not_negative_and_sum_to_one_and_all_is_finite_everywhere(kind, close):
     plane = make(kind)
     weight, _, *derivative = look(plane, np.concatenate([around(plane), special(plane), far()]))
     assert np.all(weight >= 0)
@@ -196,7 +196,7 @@ def test_shares_are_not_negative_and_sum_to_one_and_all_is_finite_everywhere(kin
 
 
 @pytest.mark.parametrize("kind", ["scattered", "one triangle"])
-def test_shares_inside_are_those_of_scipy(kind, x64, close):
+def test_weights_inside_are_those_of_scipy(kind, x64, close):
     plane = make(kind)
     value = np.random.default_rng(4).standard_normal((len(plane.point), 3))
     spot = around(plane, 2000)
@@ -204,11 +204,11 @@ def test_shares_inside_are_those_of_scipy(kind, x64, close):
     known = np.isfinite(expected[:, 0])
     np.testing.assert_array_equal(inside(plane, spot), known)
     assert 200 < np.sum(known) < 1800
-    close((share(plane, spot) @ value)[known], expected[known])
+    close((weights(plane, spot) @ value)[known], expected[known])
 
 
 @each_plane
-def test_shares_put_what_is_inside_where_it_is_and_what_is_outside_at_the_nearest_point_of_the_hull(kind, x64, close):
+def test_weights_put_what_is_inside_where_it_is_and_what_is_outside_at_the_nearest_point_of_the_hull(kind, x64, close):
     plane = make(kind)
     spot = around(plane, 1000)
     found, goal, within = placed(plane, spot), scaled(plane, spot), inside(plane, spot)
@@ -227,20 +227,20 @@ def test_points_and_edges_are_inside_though_rounded(kind, dtype):
     with jax.enable_x64(dtype == "float64"):
         plane = make(kind)
         bound = 100 * np.finfo(dtype).eps
-        np.testing.assert_allclose(share(plane, plane.point), np.eye(len(plane.point)), atol=bound)
+        np.testing.assert_allclose(weights(plane, plane.point), np.eye(len(plane.point)), atol=bound)
         assert np.all(inside(plane, special(plane)))
         np.testing.assert_allclose(placed(plane, special(plane)), scaled(plane, special(plane)), atol=bound)
 
 
 @each_plane
-def test_shares_are_continuous(kind, x64):
+def test_weights_are_continuous(kind, x64):
     """Also across edges, at vertices and across the boundary: no jump over a step of 1e-9 of the extent."""
     plane = make(kind)
     spot = np.concatenate([special(plane), around(plane)])
-    before = share(plane, spot)
+    before = weights(plane, spot)
     for seed in range(4):
         step = 1e-9 * np.random.default_rng(seed).standard_normal(spot.shape) * np.ptp(plane.point, axis=0)
-        assert np.max(np.abs(share(plane, spot + step) - before)) < 1e-6
+        assert np.max(np.abs(weights(plane, spot + step) - before)) < 1e-6
 
 
 @each_straight_plane
@@ -263,17 +263,17 @@ def test_derivatives_are_finite_differences_inside_and_outside(kind, x64, close)
     assert 0 < np.sum(within[:6]) < 6
     for axis in (0, 1):
         step = np.eye(2)[axis] * unit
-        slope = (share(plane, spot + step) - share(plane, spot - step)) / 2
+        slope = (weights(plane, spot + step) - weights(plane, spot - step)) / 2
         close(ahead[..., axis] * unit[axis], slope, tolerance=1e-6)
         close(by_spot[:, axis] * unit[axis], slope @ np.cos(np.arange(len(plane.point))), tolerance=1e-6)
     move = np.random.default_rng(10).standard_normal(plane.point.shape) * unit
-    up, down = (share(eqx.tree_at(lambda p: p.point, plane, plane.point + m), spot) for m in (move, -move))
+    up, down = (weights(eqx.tree_at(lambda p: p.point, plane, plane.point + m), spot) for m in (move, -move))
     close(np.sum(by_point * move, (1, 2)), (up - down) @ np.cos(np.arange(len(plane.point))) / 2, tolerance=1e-5)
 
 
 @each_straight_plane
 def test_derivatives_on_edges_and_at_vertices_are_those_of_a_side(kind, x64):
-    """Shares put a spot where it is, so that its place has the identity for a derivative."""
+    """Weights put a spot where it is, so that its place has the identity for a derivative."""
     plane = make(kind)
     extent = np.ptp(plane.point, axis=0)
     found = np.einsum("sma,mb->sab", look(plane, special(plane))[2] * extent, plane.point / extent)
@@ -295,25 +295,25 @@ def test_a_loop_agrees(close):
     assert plane.chart is LOG
     spot = around(plane, 20)
     weight, within, *_ = look(plane, spot)
-    one = jax.jit(lambda plane, spot: (plane.share(spot), plane.inside(spot)))
+    one = jax.jit(lambda plane, spot: (plane.weight(spot), plane.inside(spot)))
     alone = [one(plane, each) for each in jnp.asarray(spot)]
     close(np.stack([each for each, _ in alone]), weight)
     np.testing.assert_array_equal([each for _, each in alone], within)
 
 
-def test_moved_scaled_and_permuted_points_have_the_same_shares(x64, close):
+def test_moved_scaled_and_permuted_points_have_the_same_weights(x64, close):
     point, order = scattered(), np.random.default_rng(6).permutation(25)
     plane, factor, offset = triangulate(point), np.array([7.0, 1e-4]), np.array([-3.0, 5.0])
     spot = around(plane)
-    close(share(triangulate(point * factor + offset), spot * factor + offset), share(plane, spot), tolerance=1e-10)
-    close(share(triangulate(point[order]), spot), share(plane, spot)[:, order])
+    close(weights(triangulate(point * factor + offset), spot * factor + offset), weights(plane, spot), tolerance=1e-10)
+    close(weights(triangulate(point[order]), spot), weights(plane, spot)[:, order])
 
 
 def test_a_chart_is_the_same_as_coordinates_that_were_mapped_before(x64, close):
     plane, before = make("lattice in a chart"), triangulate(LOG(jnp.asarray(lattice())))
     np.testing.assert_array_equal(plane.triangle, before.triangle)
     spot = around(plane)
-    close(share(plane, spot), share(before, LOG(jnp.asarray(spot))))
+    close(weights(plane, spot), weights(before, LOG(jnp.asarray(spot))))
 
 
 @each_plane
@@ -345,7 +345,7 @@ def test_slivers_along_the_hull_are_no_trouble(dtype):
         np.testing.assert_allclose(np.sum(weight, -1), 1, atol=1e-6)
         assert all(np.all(np.isfinite(each)) for each in derivative)
         if height < np.finfo(dtype).eps:
-            # Along the row the shares are those of a line.
+            # Along the row the weights are those of a line.
             expected = np.stack([np.interp(along[:, 0], [0, 0.3, 0.7, 1], unit) for unit in np.eye(4)], -1)
             np.testing.assert_allclose(weight[:200, :4], expected, atol=20 * np.finfo(dtype).eps)
 
@@ -356,7 +356,7 @@ def test_triangles_without_an_inside_are_passed_over():
     plane, spot = Plane(point, triangle, edge), np.array([[0.2, 0.2], [0.5, 0.0], [0.25, 0.0], [0.0, 1.0], [-1.0, 3.0]])
     for seen in look(plane, spot):
         assert np.all(np.isfinite(seen))
-    np.testing.assert_allclose(share(plane, spot) @ point, np.vstack([spot[:4], [[0, 1]]]), atol=1e-6)
+    np.testing.assert_allclose(weights(plane, spot) @ point, np.vstack([spot[:4], [[0, 1]]]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -468,7 +468,7 @@ def test_brdfs_between_differentiate_in_their_coordinate(x64, close):
     _, within, ahead, *_ = look(family.navigation, spot)
     assert list(within) == [True, True, False, False, False]
     step = STEP * np.eye(2)[:, None]
-    slope = np.stack([share(family.navigation, spot + s) - share(family.navigation, spot - s) for s in step], -1)
+    slope = np.stack([weights(family.navigation, spot + s) - weights(family.navigation, spot - s) for s in step], -1)
     close(np.einsum("sma,m->sa", ahead, value), np.einsum("sma,m->sa", slope, value) / (2 * STEP), tolerance=1e-6)
 
 
@@ -489,14 +489,14 @@ def test_all_measured_materials_are_in_the_plane_at_their_own_place(table, measu
     assert list(measured.name) == [line["material"] for line in row]
     place = jnp.array([[float(line["F0"]), float(line["m"])] for line in row])
     close(measured.navigation.point, place)
-    np.testing.assert_allclose(share(measured.navigation, place), np.eye(86), atol=1e-4)
+    np.testing.assert_allclose(weights(measured.navigation, place), np.eye(86), atol=1e-4)
     parameter = [(brdf.f0[0], brdf.roughness, brdf.diffuse[0], brdf.specular[0]) for brdf in measured.brdf]
     np.testing.assert_array_equal(parameter, [(f0, m, 0, 1) for f0, m in np.asarray(place)])
     specular = [[float(line[f"ks_{color}"]) for color in "rgb"] for line in row]
     close(measured.specular, np.array(specular) * [1, 1.15, 1.66], tolerance=1e-6)
 
 
-def test_shares_among_measured_materials_hold_everywhere(measured):
+def test_weights_among_measured_materials_hold_everywhere(measured):
     plane = measured.navigation
     weight, _, *derivative = look(plane, np.concatenate([special(plane), around(plane), scattered(), far()]))
     assert np.all(weight >= 0)

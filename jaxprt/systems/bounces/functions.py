@@ -139,13 +139,13 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
 
 @jax.jit
 def weights(
-    factor: Float[Array, "m f h"], share: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
+    factor: Float[Array, "m f h"], weight: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
 ) -> Float[Array, "p e"]:
     """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
 
     Args:
         factor: The set's `jaxprt.dynamic.DynamicBrdf.factor`.
-        share: Of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
+        weight: Of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
         diffuse: Albedo of the diffuse part.
         specular: What the BRDF of the set is multiplied by.
 
@@ -153,11 +153,11 @@ def weights(
         The weights, the diffuse part's last. Differentiable in all but the set.
 
     Raises:
-        ValueError: The shares are not one for each BRDF of the set.
+        ValueError: The weights are not one for each BRDF of the set.
     """
-    if share.shape != factor.shape[:1]:
-        raise ValueError(f"shares must be one for each of {len(factor)} BRDFs, got {list(share.shape)}")
-    sharp = jnp.einsum("m,mch->hc", share, factor) * specular
+    if weight.shape != factor.shape[:1]:
+        raise ValueError(f"weights must be one for each of {len(factor)} BRDFs, got {list(weight.shape)}")
+    sharp = jnp.einsum("m,mch->hc", weight, factor) * specular
     colors = max(sharp.shape[1], len(diffuse))
     rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]
     return jnp.concatenate(rows)

@@ -161,7 +161,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
         dynamic.relight.check_material(number, material, len(factor), len(tensor.place))
         area = jnp.where(tensor.region == number, tensor.area, 0)
         diffuse, specular = (_mean(each, area) for each in (material.diffuse, material.specular))
-        rows.append(functions.weights(factor, material.share, diffuse, specular))
+        rows.append(functions.weights(factor, material.weight, diffuse, specular))
     return gathered(tensor, rows)
 
 

@@ -87,30 +87,30 @@ class DynamicBrdf(eqx.Module):
         tensor = (self.core, self.factor, self.view_map, self.light_map)
         return sum(each.nbytes for each in tensor) + (0 if self.lobe is None else self.lobe.nbytes)
 
-    def at(self, share: Float[Array, " m"]) -> Mixed:
-        """The BRDF with given shares of those in the set, as `jaxprt.brdf.navigation` makes them from coordinates.
+    def at(self, weight: Float[Array, " m"]) -> Mixed:
+        """The BRDF with a weight for each of the set, as `jaxprt.brdf.navigation` makes them from coordinates.
 
-        Shares sum to one. Terms are mixed; lobes move, from the place and width they have in one BRDF to those they
-        have in the next, unless they are where all have them, as the published ones. Differentiable in the shares.
+        Weights sum to one. Terms are mixed; lobes move, from the place and width they have in one BRDF to those they
+        have in the next, unless they are where all have them, as the published ones. Differentiable in the weights.
 
         Raises:
-            ValueError: The shares are not one for each BRDF of the set.
+            ValueError: The weights are not one for each BRDF of the set.
         """
-        if share.shape != (self.size,):
-            raise ValueError(f"shares must be one for each of {self.size} BRDFs, got {list(share.shape)}")
-        view = jnp.einsum("m,mch,hoi,oyx->iyxc", share, self.factor, self.core, self.view_map)
+        if weight.shape != (self.size,):
+            raise ValueError(f"weights must be one for each of {self.size} BRDFs, got {list(weight.shape)}")
+        view = jnp.einsum("m,mch,hoi,oyx->iyxc", weight, self.factor, self.core, self.view_map)
         terms = SeparableBrdf(self.light_map[..., None], view, self.error, self.coordinates)
-        lobe = None if self.lobe is None else mean(self.lobe, share)
-        return Mixed(terms, lobe, jax.tree.map(lambda x: _between(x, share), self.brdf))
+        lobe = None if self.lobe is None else mean(self.lobe, weight)
+        return Mixed(terms, lobe, jax.tree.map(lambda x: _between(x, weight), self.brdf))
 
 
-def _between(parameter: Array, share: Array) -> Array:
+def _between(parameter: Array, weight: Array) -> Array:
     """Mean of a parameter: of a width or exponent, which have no colors, in its logarithm, as lobes have it."""
-    linear = jnp.tensordot(share, parameter, 1)
+    linear = jnp.tensordot(weight, parameter, 1)
     if parameter.ndim > 1:
         return linear
     positive = jnp.all(parameter > 0)
-    return jnp.where(positive, jnp.exp(share @ jnp.log(jnp.where(positive, parameter, 1))), linear)
+    return jnp.where(positive, jnp.exp(weight @ jnp.log(jnp.where(positive, parameter, 1))), linear)
 
 
 def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable | None = None) -> LobeBrdf:

@@ -25,7 +25,7 @@ from jaxprt.systems.lobe import LobeLight, LobeView
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.separable.factorization import check_mark
 
-_ROUNDED = 1e-4  # By which a sum of shares is off where they are in single precision.
+_ROUNDED = 1e-4  # By which a sum of weights is off where they are in single precision.
 
 
 def _floating(value: ArrayLike) -> Array:
@@ -35,17 +35,17 @@ def _floating(value: ArrayLike) -> Array:
 class Material(eqx.Module):
     """What a region is made of at present. Numbers, lists and NumPy arrays become arrays.
 
-    Relighting refuses shares that are negative or do not sum to one, negative weights, and values that are not finite.
-    Inside `jax.jit`, `jax.grad` and the like values are not known, and nothing is refused: shares that sum to two make
+    Relighting refuses weights that are negative or do not sum to one, negative colors, and values that are not finite.
+    Inside `jax.jit`, `jax.grad` and the like values are not known, and nothing is refused: weights that sum to two make
     twice as bright lobes, and a NaN in one region reaches every vertex to which that region sends light.
 
     Attributes:
-        share: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
+        weight: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
         diffuse: Albedo of the diffuse part: gray, a color, or a texture of one for each vertex of the mesh.
         specular: What the BRDF of the set is multiplied by; the same.
     """
 
-    share: Float[Array, " m"] = eqx.field(converter=_floating)
+    weight: Float[Array, " m"] = eqx.field(converter=_floating)
     diffuse: Float[Array, "*v c"] = eqx.field(converter=_floating)
     specular: Float[Array, "*w d"] = eqx.field(converter=_floating)
 
@@ -137,7 +137,7 @@ def radiance(
     Raises:
         TypeError: The light is no Environment, a BRDF is neither dynamic nor factored, or a material is no Material.
         ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
-            be, shares of another number of BRDFs, weights of two or more than three colors, values that `Material`
+            be, weights of another number of BRDFs, colors of two or more than three channels, values that `Material`
             refuses, an eye that is not one position, a light of another size, or an eye or a light that is not finite.
             Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
 
@@ -215,7 +215,7 @@ def mix(
             continue
         assert material is not None
         diffuse, specular = (_by_row(each, own.vertex) for each in (material.diffuse, material.specular))
-        result.append(RegionBrdf(_mixed(brdf, material.share), diffuse, specular))
+        result.append(RegionBrdf(_mixed(brdf, material.weight), diffuse, specular))
     return tuple(result)
 
 
@@ -246,8 +246,8 @@ def combine(
 
 
 @isolated
-def _mixed(brdf: DynamicBrdf, share: Array) -> Mixed:
-    return brdf.at(share)
+def _mixed(brdf: DynamicBrdf, weight: Array) -> Mixed:
+    return brdf.at(weight)
 
 
 def _glossy(view: LobeView) -> LobeView:
@@ -311,14 +311,16 @@ def check_material(number: int, material: Material, brdfs: int, vertices: int) -
     """
     if not isinstance(material, Material):
         raise TypeError(f"the material of region {number} must be a Material, got {type(material).__name__}")
-    if material.share.shape != (brdfs,):
-        shape = list(material.share.shape)
-        raise ValueError(f"the shares of region {number} must be one for each of its {brdfs} BRDFs, got {shape}")
-    require.at_least(f"the shares of region {number}", material.share, 0.0, slack=_ROUNDED)
-    if not isinstance(material.share, Tracer):
-        total = float(np.sum(np.asarray(material.share, np.float64)))
+    if material.weight.shape != (brdfs,):
+        shape = list(material.weight.shape)
+        raise ValueError(f"the weights of region {number} must be one for each of its {brdfs} BRDFs, got {shape}")
+    require.at_least(f"the weights of region {number}", material.weight, 0.0, slack=_ROUNDED)
+    if not isinstance(material.weight, Tracer):
+        total = float(np.sum(np.asarray(material.weight, np.float64)))
         if abs(total - 1) > _ROUNDED:
-            raise ValueError(f"the shares of region {number} must sum to 1, got {material.share}, whose sum is {total}")
+            raise ValueError(
+                f"the weights of region {number} must sum to 1, got {material.weight}, whose sum is {total}"
+            )
     for name in ("diffuse", "specular"):
         shape = getattr(material, name).shape
         if len(shape) > 2 or (len(shape) == 2 and shape[0] != vertices) or shape[-1] not in (1, 3):

@@ -161,24 +161,24 @@ class LobeBrdf(eqx.Module):
 
 
 @jax.jit
-def mean(table: LobeBrdf, share: Float[Array, " m"]) -> LobeBrdf:
+def mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
     """Lobes between those along the first parameter of a table, which then has no axis.
 
-        w = sum_h s_h w_h,    (m, log k) = sum_h s_h w_h (m_h, log k_h) / w
+        w = sum_h a_h w_h,    (m, log k) = sum_h a_h w_h (m_h, log k_h) / w
 
-    with shares s that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
+    with weights a that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
 
     Raises:
-        ValueError: The shares are not one for each BRDF along the parameter.
+        ValueError: The weights are not one for each BRDF along the parameter.
     """
-    if share.shape != table.scale.shape[1:2]:
-        raise ValueError(f"shares must be one for each of {table.scale.shape[1]} BRDFs, got {list(share.shape)}")
-    share = share.reshape(-1, *[1] * (table.scale.ndim - 2))
-    part = jnp.maximum(share * jnp.sum(table.weight, 0), 0) + _TINY
+    if weight.shape != table.scale.shape[1:2]:
+        raise ValueError(f"weights must be one for each of {table.scale.shape[1]} BRDFs, got {list(weight.shape)}")
+    weight = weight.reshape(-1, *[1] * (table.scale.ndim - 2))
+    part = jnp.maximum(weight * jnp.sum(table.weight, 0), 0) + _TINY
     part = part / jnp.sum(part, 1, keepdims=True)
-    place, weight = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * share, 2)
-    scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * share, 1)
-    return LobeBrdf(place, scale, weight, diffuse, table.knot[1:], table.error)
+    place, strength = jnp.sum(table.mean * part, 2), jnp.sum(table.weight * weight, 2)
+    scale, diffuse = jnp.sum(table.scale * part, 1), jnp.sum(table.diffuse * weight, 1)
+    return LobeBrdf(place, scale, strength, diffuse, table.knot[1:], table.error)
 
 
 def diffuse(albedo: Float[Array, " c"]) -> LobeBrdf:

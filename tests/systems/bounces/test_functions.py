@@ -35,10 +35,10 @@ def sent(tables):
     def found(terms):
         return smooth @ (terms.view(wo)[..., 0] @ (terms.light(wi)[..., 0].T @ light))
 
-    shares = jnp.eye(len(MEMBERS))
+    weights = jnp.eye(len(MEMBERS))
     return (
         jnp.stack([exact(each) for each in MEMBERS]),
-        [jnp.stack([found(each.at(share).terms) for share in shares]) for each in tables],
+        [jnp.stack([found(each.at(weight).terms) for weight in weights]) for each in tables],
     )
 
 
@@ -53,7 +53,7 @@ def factored():
 
 @pytest.fixture(scope="module")
 def errors():
-    """What tables say of their error, and what they miss: of all members of a set, each by its own share."""
+    """What tables say of their error, and what they miss: of all members of a set, each by its own weight."""
     tensor = dynamic.reflected.reflect(MEMBERS, None, resolution=RESOLUTION)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dynamic.reflected, "reflect", lambda *_, **__: tensor)  # Integrated once for all tables.
@@ -104,12 +104,12 @@ def test_sets_of_fewer_than_four_brdfs_have_as_many_functions(count):
 def test_functions_of_a_set_make_its_brdfs():
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
     table = bounces.factor(members, functions=2, terms=4, resolution=8)
-    share, diffuse, specular = jnp.array([0.3, 0.7]), jnp.array([0.1, 0.2, 0.3]), jnp.array([0.5, 0.4, 0.3])
+    weight, diffuse, specular = jnp.array([0.3, 0.7]), jnp.array([0.1, 0.2, 0.3]), jnp.array([0.5, 0.4, 0.3])
     random = np.random.default_rng(0).normal(size=(2, 50, 3))
     random[..., 2] = np.abs(random[..., 2]) + 0.2
     wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.float32)
-    value = bounces.functions.basis(table)(wi, wo) @ bounces.functions.weights(table.factor, share, diffuse, specular)
-    np.testing.assert_allclose(value, table.at(share)(wi, wo) * specular + diffuse / np.pi, rtol=1e-5, atol=1e-6)
+    value = bounces.functions.basis(table)(wi, wo) @ bounces.functions.weights(table.factor, weight, diffuse, specular)
+    np.testing.assert_allclose(value, table.at(weight)(wi, wo) * specular + diffuse / np.pi, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(

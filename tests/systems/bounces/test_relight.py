@@ -177,8 +177,8 @@ def test_reflected_radiance_by_light_and_material_is_finite_differences(transpor
     lamp, direction = light(), light(1).radiance - 0.5
     view = bounces.view_side(transport, dynamic.mix(transport, brdfs, [material(), None]), eye=EYE)
 
-    def mean(step, color, share):
-        now, lights = [Material(share, color, 0.6), None], Environment(lamp.radiance + step * direction)
+    def mean(step, color, weight):
+        now, lights = [Material(weight, color, 0.6), None], Environment(lamp.radiance + step * direction)
         arrived = bounces.arriving(transport, tensor, bounces.light_side(tensor, lights), now)
         return jnp.mean(bounces.combine(transport, arrived, view))
 
@@ -206,7 +206,7 @@ def test_what_does_not_fit_is_refused(transport, tensor, brdfs, unchecked):
         bounces.light_side(tensor, 3)
     with pytest.raises(ValueError, match=r"diffuse of region 0 must be gray .* each of 136 vertices"):
         bounces.relight.weights(tensor, [material(np.ones((135, 1))), None])
-    with pytest.raises(ValueError, match="shares of region 0 must sum to 1"):
+    with pytest.raises(ValueError, match="weights of region 0 must sum to 1"):
         bounces.relight.weights(tensor, [Material(jnp.array([3.0, 3.0]), 0.4, 0.6), None])
     with pytest.raises(ValueError, match="must be one environment"):
         bounces.light_side(tensor, Environment(lamp.radiance[None]))

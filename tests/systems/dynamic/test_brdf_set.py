@@ -80,9 +80,9 @@ def value(brdf, wi, wo):
 
 
 @jax.jit
-def mixed_value(table, share, wi, wo):
+def mixed_value(table, weight, wi, wo):
     """Value of a set's BRDF at some place."""
-    return table.at(share)(wi, wo)
+    return table.at(weight)(wi, wo)
 
 
 @jax.jit
@@ -93,7 +93,7 @@ def seen(brdfs, table, view):
         wi, area = hemisphere.arcs(wo * jnp.array([-1, -1, 1]), rings=32, sectors=48)
         basis = jnp.concatenate([jnp.ones_like(wi[:, :1]), wi, wi[:, :1] * wi[:, 2:]], 1) * (wi[:, 2:] * area[:, None])
         wo = jnp.broadcast_to(wo, wi.shape)
-        found = [table.at(share)(wi, wo) for share in jnp.eye(len(brdfs))]
+        found = [table.at(weight)(wi, wo) for weight in jnp.eye(len(brdfs))]
         return [basis.T @ jnp.stack(each) for each in ([brdf(wi, wo) for brdf in brdfs], found)]
 
     return jax.lax.map(one, view)
@@ -137,12 +137,12 @@ def test_between_fresnel_reflectances_lobes_without_light_have_no_say(pairs):
 
 
 def test_the_model_between_members_is_as_wide_as_the_lobes_there_and_reflects_the_mean():
-    share = np.array([0.5, 0.25, 0.25])
+    weight = np.array([0.5, 0.25, 0.25])
     members = [lobe_of(m, f0) for m, f0 in zip(ROUGH, (0.1, 0.5, 0.9), strict=True)]
-    mixed = dynamic.factor(members, None, ranks=(1, 1, 1), resolution=8).at(jnp.asarray(share))
+    mixed = dynamic.factor(members, None, ranks=(1, 1, 1), resolution=8).at(jnp.asarray(weight))
     assert isinstance(mixed.brdf, CookTorrance)
-    np.testing.assert_allclose(mixed.brdf.roughness, np.exp(share @ np.log(ROUGH)), rtol=1e-5)
-    np.testing.assert_allclose(mixed.brdf.f0, share @ [0.1, 0.5, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(mixed.brdf.roughness, np.exp(weight @ np.log(ROUGH)), rtol=1e-5)
+    np.testing.assert_allclose(mixed.brdf.f0, weight @ [0.1, 0.5, 0.9], rtol=1e-6)
 
 
 @pytest.mark.parametrize("ranks", [(1, 4, 4), (2, 8, 8), (3, 24, 24)])
@@ -171,8 +171,8 @@ def test_turned_views_equal_views_one_by_one(monkeypatch):
     monkeypatch.setattr(dynamic.reflected, "is_isotropic", lambda brdf: False)
     slow = dynamic.factor(SET, None, ranks=(2, 4, 4), resolution=6)
     np.testing.assert_allclose(fast.error, slow.error, rtol=1e-4)
-    share = jnp.array([0.2, 0.5, 0.3])
-    view, other = (each.at(share).terms for each in (fast, slow))
+    weight = jnp.array([0.2, 0.5, 0.3])
+    view, other = (each.at(weight).terms for each in (fast, slow))
     both = [np.einsum("kxyl,kuvl->xyuv", each.light_map, each.view_map, optimize=True) for each in (view, other)]
     assert relative(*both) < 1e-4
 
@@ -222,17 +222,17 @@ def test_lobes_alone_take_more_directions_than_a_block_has(lobes, pairs, monkeyp
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_shares_of_another_number_of_brdfs_are_refused(lobes, count, unchecked):
-    """One share would else count for all."""
-    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+def test_weights_of_another_number_of_brdfs_are_refused(lobes, count, unchecked):
+    """One weight would else count for all."""
+    with pytest.raises(ValueError, match=rf"weights must be one for each of 3 BRDFs, got \[{count}\]"):
         dynamic.factor(SET, lobes).at(jnp.ones(count))
-    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+    with pytest.raises(ValueError, match=rf"weights must be one for each of 3 BRDFs, got \[{count}\]"):
         lobe.table.mean(lobes, jnp.ones(count))
-    with pytest.raises(ValueError, match=rf"shares must be one for each of 3 BRDFs, got \[{count}\]"):
+    with pytest.raises(ValueError, match=rf"weights must be one for each of 3 BRDFs, got \[{count}\]"):
         bounces.functions.weights(jnp.ones((3, 1, 2)), jnp.ones(count), jnp.ones(1), jnp.ones(1))
 
 
-def test_shares_of_either_sign_are_finite(lobes, pairs):
+def test_weights_of_either_sign_are_finite(lobes, pairs):
     assert np.isfinite(mixed_value(dynamic.factor(SET, lobes), jnp.array([-1.0, 1.0, 1.0]), *pairs)).all()
 
 
@@ -250,17 +250,17 @@ def test_ranks_that_are_not_three_whole_numbers_are_refused(ranks, unchecked):
         dynamic.factor(SET, None, ranks=ranks, resolution=8)
 
 
-def test_derivatives_by_shares(lobes, pairs):
+def test_derivatives_by_weights(lobes, pairs):
     table = dynamic.factor(SET, lobes, ranks=(2, 4, 4), resolution=RESOLUTION)
     wi, wo = pairs
 
     @jax.jit
-    def total(share):
-        return jnp.mean(table.at(share)(wi, wo))
+    def total(weight):
+        return jnp.mean(table.at(weight)(wi, wo))
 
-    share, step = np.float32([0.5, 0.3, 0.2]), np.float32([0.02, -0.02, 0.0])
-    slope = np.asarray(jax.grad(total)(share)) @ step
-    np.testing.assert_allclose(slope, (total(share + step) - total(share - step)) / 2, rtol=1e-3)
+    weight, step = np.float32([0.5, 0.3, 0.2]), np.float32([0.02, -0.02, 0.0])
+    slope = np.asarray(jax.grad(total)(weight)) @ step
+    np.testing.assert_allclose(slope, (total(weight + step) - total(weight - step)) / 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -24,19 +24,19 @@ def quick():
 
 
 @jax.jit
-def value(family, share, wi, wo):
-    return family.at(share)(wi, wo)
+def value(family, weight, wi, wo):
+    return family.at(weight)(wi, wo)
 
 
 @jax.jit
-def slope(family, share, wi, wo):
-    """Value, and derivative of its sum by the shares."""
-    return value(family, share, wi, wo), jax.grad(lambda share: jnp.sum(value(family, share, wi, wo)))(share)
+def slope(family, weight, wi, wo):
+    """Value, and derivative of its sum by the weights."""
+    return value(family, weight, wi, wo), jax.grad(lambda weight: jnp.sum(value(family, weight, wi, wo)))(weight)
 
 
 @jax.jit
-def shares(plane, coordinate):
-    return plane.share(coordinate), jax.jacobian(plane.share)(coordinate)
+def weights(plane, coordinate):
+    return plane.weight(coordinate), jax.jacobian(plane.weight)(coordinate)
 
 
 def fit(brdf):
@@ -66,8 +66,8 @@ def transport(mesh, family):
     return dynamic.precompute(mesh, [family], size=SIZE, progress=False)
 
 
-def color(transport, family, share, light, eye=(0.5, 1.0, 3.0), diffuse=0.2, specular=1.0):
-    matter = dynamic.Material(jnp.asarray(share), jnp.full(1, diffuse), jnp.full(1, specular))
+def color(transport, family, weight, light, eye=(0.5, 1.0, 3.0), diffuse=0.2, specular=1.0):
+    matter = dynamic.Material(jnp.asarray(weight), jnp.full(1, diffuse), jnp.full(1, specular))
     return dynamic.radiance(transport, [family], [matter], light, eye=jnp.asarray(eye), texels=4)
 
 
@@ -105,9 +105,9 @@ def test_shininess_at_the_ends():
     family = dynamic.factor(members, dynamic.separate(members, separator=fit))
     wi, wo = directions(0.2, 0.7, 1.0)
     for exponent in (0.0, 1.0, 200.0, 1e9):
-        share = navigation.Line(jnp.array([1.0, 200.0])).share(jnp.asarray(exponent))
-        assert np.isfinite(value(family, share, wi, wo)).all()
-        np.testing.assert_allclose(family.at(share).brdf.exponent, np.clip(exponent, 1, 200), rtol=1e-5)
+        weight = navigation.Line(jnp.array([1.0, 200.0])).weight(jnp.asarray(exponent))
+        assert np.isfinite(value(family, weight, wi, wo)).all()
+        np.testing.assert_allclose(family.at(weight).brdf.exponent, np.clip(exponent, 1, 200), rtol=1e-5)
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-30, 1e-6, 1e-3, 1.0])
@@ -117,10 +117,10 @@ def test_views_down_to_the_horizon(family, number, height):
     assert all(np.isfinite(each).all() for each in slope(family, np.eye(2, dtype=np.float32)[number], wi, wo))
 
 
-@pytest.mark.parametrize("share", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
-def test_zero_light_gives_zero(transport, family, share):
+@pytest.mark.parametrize("weight", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
+def test_zero_light_gives_zero(transport, family, weight):
     dark = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
-    np.testing.assert_array_equal(color(transport, family, share, dark), 0)
+    np.testing.assert_array_equal(color(transport, family, weight, dark), 0)
 
 
 def test_a_sun_in_one_texel_is_exact(mesh, transport, family):
@@ -145,11 +145,11 @@ def test_a_furnace_of_diffuse_parts_is_white(mesh, transport, family):
 @pytest.mark.parametrize("coordinate", [(-1e6, 0.5), (0.5, -3.0), (2.0, 100.0), (0.3, 1e-30), (1.0, 1.0)])
 def test_coordinates_outside_the_hull(coordinate):
     plane = navigation.cook_torrance().navigation
-    share, along = map(np.asarray, shares(plane, jnp.asarray(coordinate)))
-    assert np.isfinite(share).all()
+    weight, along = map(np.asarray, weights(plane, jnp.asarray(coordinate)))
+    assert np.isfinite(weight).all()
     assert np.isfinite(along).all()
-    np.testing.assert_allclose(share.sum(), 1, rtol=1e-5)
-    assert share.min() >= 0
+    np.testing.assert_allclose(weight.sum(), 1, rtol=1e-5)
+    assert weight.min() >= 0
 
 
 def test_an_eye_at_a_vertex(mesh, transport, family):

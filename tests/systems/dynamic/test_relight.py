@@ -57,8 +57,8 @@ def light():
 
 
 def material(line, roughness, diffuse=(0.3, 0.2, 0.1), specular=(0.5, 0.5, 0.4)):
-    share = line.share(jnp.log(jnp.asarray(roughness)))
-    return dynamic.Material(share, jnp.asarray(diffuse), jnp.asarray(specular))
+    weight = line.weight(jnp.log(jnp.asarray(roughness)))
+    return dynamic.Material(weight, jnp.asarray(diffuse), jnp.asarray(specular))
 
 
 def by_region(mesh, value, other):
@@ -154,7 +154,7 @@ def test_staged_calls_equal_the_whole(transport, family, fixed, line, light):
 
 
 def test_gradients_by_roughness_and_weight_add_up_to_differences(transport, family, fixed, line, light):
-    """`test_contract` holds those by the light, the eye and the shares to finite differences in float64."""
+    """`test_contract` holds those by the light, the eye and the weights to finite differences in float64."""
     there = [material(line, 0.6, 0.9 * np.ones(3)), None]
     target = dynamic.radiance(transport, [family, fixed], there, light, eye=EYE)
     lit = dynamic.light_side(transport, light)
@@ -205,7 +205,7 @@ def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light,
             "BRDF of region 1 must be the one that the transport was made for, got another",
         ),
         (
-            lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.share, m[0], jnp.ones(2)), None]),
+            lambda t, b, m: (t, b, [eqx.tree_at(lambda x: x.weight, m[0], jnp.ones(2)), None]),
             r"of its 3 BRDFs, got \[2\]",
         ),
         (
@@ -223,13 +223,13 @@ def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, cha
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (([3, 3], 0.5, 1), r"shares of region 4 must sum to 1, got \[3. 3.\], whose sum is 6.0"),
-        (([0.3, 0.6], 0.5, 1), "shares of region 4 must sum to 1, got "),
+        (([3, 3], 0.5, 1), r"weights of region 4 must sum to 1, got \[3. 3.\], whose sum is 6.0"),
+        (([0.3, 0.6], 0.5, 1), "weights of region 4 must sum to 1, got "),
         (
             ([2, -1], 0.5, 1),
-            r"shares of region 4 must be at least 0, got 1 of 2 values that are not, first at \(1,\): -1",
+            r"weights of region 4 must be at least 0, got 1 of 2 values that are not, first at \(1,\): -1",
         ),
-        (([np.nan, 1], 0.5, 1), "shares of region 4 must be finite, got 1 of 2 values"),
+        (([np.nan, 1], 0.5, 1), "weights of region 4 must be finite, got 1 of 2 values"),
         (([1, 0], -1, 1), "diffuse of region 4 must be at least 0, got 1 of 1 values"),
         (([1, 0], [0.1, np.inf, 0.2], 1), "diffuse of region 4 must be finite, got 1 of 3 values"),
         (([1, 0], 0.5, -np.ones((3, 1))), "specular of region 4 must be at least 0, got 3 of 3 values"),
@@ -241,16 +241,16 @@ def test_values_that_no_material_has_are_refused_with_the_region_and_the_field(v
         dynamic.relight.check_material(4, dynamic.Material(*values), 2, 3)
 
 
-def test_shares_of_a_navigation_and_traced_materials_pass(unchecked):
+def test_weights_of_a_navigation_and_traced_materials_pass(unchecked):
     dynamic.relight.check_material(0, dynamic.Material([1 / 3 - 2e-6, 2 / 3 + 3e-6, -1e-6], 0, [0.2, 2, 0]), 3, 3)
     plane = navigation.triangulate(np.random.default_rng(0).uniform(size=(5, 2)))
     for spot in np.random.default_rng(1).uniform(-0.5, 1.5, (8, 2)).astype(np.float32):
-        dynamic.relight.check_material(0, dynamic.Material(plane.share(spot), 0.5, 0.5), 5, 3)
+        dynamic.relight.check_material(0, dynamic.Material(plane.weight(spot), 0.5, 0.5), 5, 3)
 
     def slope(value):
         matter = dynamic.Material(jnp.stack([value, -value]), value, -value)
         dynamic.relight.check_material(0, matter, 2, 3)
-        return matter.share[0]
+        return matter.weight[0]
 
     assert jax.grad(slope)(3.0) == 1
 
