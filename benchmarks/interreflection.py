@@ -251,7 +251,7 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
                 "first_error": norm(mine[1], *(each[1] for each in exact)) / indirect,
                 "second_error": norm(mine[2], *(each[2] for each in exact)) / indirect,
                 "light_error": norm(0, *(a - b[1] for a, b in zip(blurred, exact, strict=True))) / indirect,
-                "indirect_share": indirect / norm(0, *whole),
+                "indirect_fraction": indirect / norm(0, *whole),
             }
         )
         print({key: round(value, 4) for key, value in rows[-1].items()}, roughness, flush=True)

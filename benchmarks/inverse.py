@@ -138,7 +138,7 @@ class Case(NamedTuple):
     quick: bool
 
 
-class Shares(eqx.Module):
+class Fresnel(eqx.Module):
     """The lobe of Ashikhmin and Shirley's model where the surface reflects all at normal incidence, and where none.
 
     It is linear in that reflectance: between the two in one table.
@@ -163,7 +163,7 @@ def tabulated(quick: bool) -> LobeBrdf:
     knot = np.log(KNOTS[::2] if quick else KNOTS)
     lobes = 3 if quick else 8
     nodes = 12 if quick else 32
-    return lobe.tabulate(lambda u, v: Shares(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot])
+    return lobe.tabulate(lambda u, v: Fresnel(jnp.exp(u), jnp.exp(v)), lobes=lobes, resolution=nodes, knot=[knot, knot])
 
 
 class Coated:

@@ -82,7 +82,7 @@ def main(options: Sequence[str] | None = None) -> None:
             "rays_per_vertex": rays / len(start),
             "mrays_per_second": rays / seconds / 1e6,
             "embree_mrays_per_second": count.rays / embree_seconds / 1e6,
-            "supersampled_share": count.supersampled / count.texels,
+            "supersampled_fraction": count.supersampled / count.texels,
             "peak_bytes": harness.peak_memory(),
         },
         arguments.output,

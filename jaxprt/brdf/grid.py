@@ -42,12 +42,12 @@ def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
 def place(knot: Float[Array, " k"], parameter: Float[Array, "*v"]) -> Float[Array, "*v"]:
     """Where parameters lie among knots: 1.5 halfway between the second and the third; the ends for those outside."""
     low = jnp.clip(jnp.searchsorted(knot, parameter, side="right") - 1, 0, len(knot) - 2)
-    share = (parameter - knot[low]) / (knot[low + 1] - knot[low])
-    return jnp.clip(low + share, 0, len(knot) - 1)
+    fraction = (parameter - knot[low]) / (knot[low + 1] - knot[low])
+    return jnp.clip(low + fraction, 0, len(knot) - 1)
 
 
 def neighbors(place: Float[Array, "*v"], *, size: int) -> tuple[Int[Array, "*v"], Float[Array, "*v"]]:
-    """The lower of the two neighbors of a place among so many, and the share of the upper; the ends for those outside.
+    """The lower of the two neighbors of a place among so many, and the weight of the upper; the ends for those outside.
 
     Differentiable in the place within the ends.
     """
@@ -60,9 +60,9 @@ def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float
     """Rows of a table, multilinearly between the neighbors on each of the axes of their nodes."""
     count = len(axis[0][0])
     spot, weight = jnp.zeros((1, count), jnp.int32), jnp.ones((1, count), axis[0][1].dtype)
-    for size, (low, share) in zip(row.shape[1:], axis, strict=True):
+    for size, (low, upper) in zip(row.shape[1:], axis, strict=True):
         spot = jnp.concatenate([spot * size + low, spot * size + low + 1])
-        weight = jnp.concatenate([weight * (1 - share), weight * share])
+        weight = jnp.concatenate([weight * (1 - upper), weight * upper])
     # Row by row, so that a row stays in the cache while all views read it.
     return jax.lax.map(
         lambda one: sum(one.at[s].get(mode="promise_in_bounds") * w for s, w in zip(spot, weight, strict=True)),

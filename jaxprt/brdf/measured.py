@@ -89,7 +89,7 @@ class HalfDifferenceTable(eqx.Module):
     """
 
     root: Float[Array, "h d p c"] = eqx.field(converter=jnp.asarray)
-    filled: Float[Array, ""] = eqx.field(converter=lambda share: jnp.asarray(share, jnp.result_type(float)), default=0)
+    filled: Float[Array, ""] = eqx.field(converter=lambda value: jnp.asarray(value, jnp.result_type(float)), default=0)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""

@@ -168,7 +168,7 @@ def _run(options: argparse.Namespace) -> None:
         made["dynamic"] = animation.made(changing, view, reflected=True)
         for name, light in found["lights"].items() if changing.reflected is not None else ():
             stops = light["exposure_stops"]
-            light["dynamic"]["reflected_share"] = animation.reflect(changing, view, name, stops, options.output)
+            light["dynamic"]["reflected_fraction"] = animation.reflect(changing, view, name, stops, options.output)
         if options.animate:
             animation.animate(changing, view, options.output, frames=options.animate)
     found["times"] = {system: report.times(view, each) for system, each in made.items()}
@@ -325,9 +325,9 @@ def _tell(found: dict[str, Any], path: Path) -> None:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
             error = light[system]["image_error"]
             print(f"{name}, {system}: relative L2 error of the picture {error:.1%}; of vertex radiance: {parts}")
-            if "reflected_share" in light[system]:
-                share = light[system]["reflected_share"]
-                print(f"{name}, {system}: {share:.1%} of the picture's light comes from other surfaces")
+            if "reflected_fraction" in light[system]:
+                fraction = light[system]["reflected_fraction"]
+                print(f"{name}, {system}: {fraction:.1%} of the picture's light comes from other surfaces")
     for system, times in found["times"].items():
         milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
         print(f"{system}: {milliseconds.replace('_', ' ')}")

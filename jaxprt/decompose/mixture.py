@@ -178,20 +178,20 @@ def fit(
         return _expect(jnp.concatenate([lobe, fixed], 1), mass, every)
 
     def step(carry, _):
-        every, mean, concentration, share = carry
-        taken = share[:, :count]
+        every, mean, concentration, responsibility = carry
+        taken = responsibility[:, :count]
         found = jnp.sum(taken, 0)
         mean = _mean(taken, sample, mean)
         away = sum((sample[:, i, None] - mean[:, i]) ** 2 for i in range(3)) / 2 + extent[:, None]
         spread = jnp.sum(taken * away, 0) / jnp.where(found > 0, found, 1)
         sharper = jnp.clip(concentration_of(spread), least, most)
         concentration = jnp.where(found > 0, sharper, concentration)
-        fresh = jnp.sum(share, 0)
-        share, likelihood = expect(fresh, mean, concentration)
-        return (fresh, mean, concentration, share), (likelihood, jnp.sum(jnp.abs(fresh - every)) / 2)
+        fresh = jnp.sum(responsibility, 0)
+        responsibility, likelihood = expect(fresh, mean, concentration)
+        return (fresh, mean, concentration, responsibility), (likelihood, jnp.sum(jnp.abs(fresh - every)) / 2)
 
-    share, first = expect(every, start.mean, start.concentration)
-    carry = (every, start.mean, start.concentration, share)
+    responsibility, first = expect(every, start.mean, start.concentration)
+    carry = (every, start.mean, start.concentration, responsibility)
     (every, mean, concentration, _), (likelihood, residual) = jax.lax.scan(step, carry, None, length=steps)
     every = every * total
     likelihood = jnp.concatenate([first[None], likelihood])
@@ -220,8 +220,8 @@ def weigh(
     mass = mass / jnp.where(total > 0, total, 1)
 
     def step(weight, _):
-        share, likelihood = _expect(density, mass, weight)
-        return jnp.sum(share, 0), likelihood
+        responsibility, likelihood = _expect(density, mass, weight)
+        return jnp.sum(responsibility, 0), likelihood
 
     weight = weight / jnp.where(jnp.sum(weight) > 0, jnp.sum(weight), 1)
     weight, likelihood = jax.lax.scan(step, weight, None, length=steps)

@@ -147,8 +147,8 @@ def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2)
 
     def error(core):
         left = jnp.maximum(whole - jnp.vdot(core, core), 0)
-        share = jnp.where(whole > 0, left / jnp.where(whole > 0, whole, 1), 0)
-        return jnp.where(share > 0, jnp.sqrt(jnp.where(share > 0, share, 1)), 0)
+        left = jnp.where(whole > 0, left / jnp.where(whole > 0, whole, 1), 0)
+        return jnp.where(left > 0, jnp.sqrt(jnp.where(left > 0, left, 1)), 0)
 
     errors, factor, core = [error(now.core)], list(now.factor), now.core
     for _ in range(sweeps):

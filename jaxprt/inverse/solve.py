@@ -18,7 +18,7 @@ with warnings.catch_warnings():
 
 DENSE = 512  # numbers whose derivatives are held, all of them
 _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told from rounding
-_SHARE = 1e-3  # of a number's square outside what is known, that makes it unknown
+_UNKNOWN = 1e-3  # of a number's square outside what is known, that makes it unknown
 _BLOCKS = 32  # of pixels
 _TINY = 1e-30
 _ROUNDED = 1e-9  # of squared singular values
@@ -111,7 +111,7 @@ def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndar
 def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
     """Of each number; infinite outside the directions."""
     deviation = np.linalg.norm(axis @ scores, axis=1)
-    return np.where(1 - np.sum(axis**2, 1) > _SHARE, np.inf, deviation)
+    return np.where(1 - np.sum(axis**2, 1) > _UNKNOWN, np.inf, deviation)
 
 
 def _finite(*arrays: Array) -> None:

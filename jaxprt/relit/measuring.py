@@ -149,7 +149,7 @@ class Sample(eqx.Module):
     Attributes:
         shading: The part.
         job: Which vertices, and what they see.
-        share: How many times as many the part has.
+        vertex_ratio: How many times as many the part has.
         judged: Which of them are judged.
         facing: Which of the judged ones face each view.
         exact: Their exact radiance.
@@ -160,7 +160,7 @@ class Sample(eqx.Module):
 
     shading: Shading
     job: Job
-    share: float
+    vertex_ratio: float
     judged: np.ndarray
     facing: np.ndarray
     exact: np.ndarray
@@ -185,8 +185,8 @@ class Sample(eqx.Module):
         job = Job(scene, size=size, vertex=vertex, visible=visible, progress=False)
         facing = _facing(visible, judged, views)
         exact = _exact(visible, judged, _exact_brdf(shading, vertex[judged]), environments, views)
-        share = count / len(vertex)
-        return cls(shading, job, share, judged, facing, exact, tuple(environments), views, seconds)
+        vertex_ratio = count / len(vertex)
+        return cls(shading, job, vertex_ratio, judged, facing, exact, tuple(environments), views, seconds)
 
     @property
     def blend(self) -> Blend | None:
@@ -198,9 +198,9 @@ class Sample(eqx.Module):
         """What a recipe brings and costs."""
         start = time.perf_counter()
         system = recipe.make(self.shading, self.job)
-        seconds = self.share * (self.rays_seconds + time.perf_counter() - start)
+        seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
         wrong = max(self._error(system, *each) for each in zip(self.environments, self.exact, strict=True))
-        return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.share), seconds)
+        return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
 
     def _error(self, system: System, light: Environment, exact: np.ndarray) -> float:
         """Relative L2 error over all views, as far as vertices face the viewer."""
@@ -215,7 +215,7 @@ class Sample(eqx.Module):
         lit, view = system.light(light), system.view(eye, self.blend)
         once = _seconds(lambda: system.light(light))
         rest = _seconds(lambda: system.view(eye, self.blend)) + _seconds(lambda: system.combine(lit, view))
-        return once * (self.share if system.shared_light is None else 1) + self.share * rest
+        return once * (self.vertex_ratio if system.shared_light is None else 1) + self.vertex_ratio * rest
 
 
 def checked(environments: Sequence[Environment], error: float, rate: float) -> int:
@@ -271,14 +271,14 @@ def _exact(visible, judged: np.ndarray, brdf: Callable, environments, views: np.
     return exact
 
 
-def _bytes(system: System, share: float) -> int:
+def _bytes(system: System, vertex_ratio: float) -> int:
     """Bytes of a system of so many times as many vertices."""
     if isinstance(system, BrightTexels):
         transports: list[Array] = jax.tree.leaves((system.system.transport, system.visibility))  # pyright: ignore
     else:
         transports = jax.tree.leaves(system.transport)  # pyright: ignore[reportAttributeAccessIssue]
     grown = sum({id(each): each.nbytes for each in transports}.values())
-    return int(protocol.memory(system) - grown + share * grown)
+    return int(protocol.memory(system) - grown + vertex_ratio * grown)
 
 
 def _seconds(function: Callable) -> float:

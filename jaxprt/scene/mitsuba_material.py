@@ -110,7 +110,7 @@ class MaterialMaker:
         """Roughnesses alpha along and across the tangent are equal to Mitsuba's, anisotropy included."""
         self._rest(item, name, {"base_color", "metallic", "roughness", "specular", "eta", "anisotropic"})
         field = self._color(item, "base_color", 0.5, name)
-        field |= self._share(item, "metallic", 0.0, name) | self._share(item, "roughness", 0.5, name)
+        field |= self._scalar(item, "metallic", 0.0, name) | self._scalar(item, "roughness", 0.5, name)
         field["ior"] = float(item.get("eta", 1.5))
         if "specular" in item:
             field["ior"] = 2 / (1 - math.sqrt(0.08 * float(item["specular"]))) - 1
@@ -173,7 +173,7 @@ class MaterialMaker:
             }
         return {"base_color": rgb(item.get(key, default) if value is None else value, f"{key} of {name}")}
 
-    def _share(self, item: Mapping[str, Any], key: str, default: float, name: str) -> dict[str, Any]:
+    def _scalar(self, item: Mapping[str, Any], key: str, default: float, name: str) -> dict[str, Any]:
         value = self._resolved(item.get(key), name)
         if value is not None and value.get("type") == "bitmap":
             return {key: 1.0, f"{key}_texture": self._texture(value, f"{key} of {name}", colors=False)}

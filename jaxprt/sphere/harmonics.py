@@ -320,7 +320,7 @@ def natural(*, degree: int) -> Float[Array, " l"]:
     return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
-def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
+def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) -> Float[Array, " l"]:
     """The window that rings least for what it changes: 1 / (1 + lambda l^2 (l+1)^2).
 
     It minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere; lambda
@@ -328,24 +328,24 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""])
 
     Args:
         coefficient: What will be windowed.
-        share: Of its squared Laplacian, from 0 to 1, that may remain. Share 0 keeps the mean alone.
+        kept: Share of its squared Laplacian that remains, from 0 to 1. 0 keeps the mean alone.
 
     Returns:
         One factor for each band, for `convolve`; ones where there is no Laplacian to reduce. Inside `jax.jit`, where
-        shares are not known, NaN for negative ones.
+        the share is not known, NaN for a negative one.
 
     Raises:
         ValueError: The share is not from 0 to 1.
 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
-    if not isinstance(share, Tracer) and not 0 <= np.asarray(share) <= 1:
-        raise ValueError(f"the share of the squared Laplacian must be from 0 to 1, got {share}")
-    return _least_laplacian(coefficient, share)
+    if not isinstance(kept, Tracer) and not 0 <= np.asarray(kept) <= 1:
+        raise ValueError(f"the share of the squared Laplacian must be from 0 to 1, got {kept}")
+    return _least_laplacian(coefficient, kept)
 
 
 @jax.jit
-def _least_laplacian(coefficient: Array, share: Array) -> Array:
+def _least_laplacian(coefficient: Array, kept: Array) -> Array:
     degree = degree_of(coefficient.shape[0])
     band = _band(degree)
     energy = jnp.sum(coefficient.reshape(len(band), -1) ** 2, -1)
@@ -359,15 +359,15 @@ def _least_laplacian(coefficient: Array, share: Array) -> Array:
         # Newton's method for 1 / sqrt(what remains), which is a line for one band and concave for several: from 0
         # it climbs to the root and never passes it, quickly however small the share.
         factor = 1 / (1 + strength * weight)
-        remains = jnp.where(some, jnp.sum(spectrum * factor**2), share)
+        remains = jnp.where(some, jnp.sum(spectrum * factor**2), kept)
         slope = jnp.where(some, jnp.sum(spectrum * factor**3 * weight), 1)
-        return strength + remains / slope * (jnp.sqrt(remains / some_share) - 1), None
+        return strength + remains / slope * (jnp.sqrt(remains / some_kept) - 1), None
 
     # Nothing remains in the limit of an infinite strength.
-    some_share = jnp.where(share == 0, 1, share)
+    some_kept = jnp.where(kept == 0, 1, kept)
     strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
     factor = 1 / (1 + jnp.maximum(strength, 0) * weight)
-    return jnp.where((share == 0) & some, weight == 0, factor)
+    return jnp.where((kept == 0) & some, weight == 0, factor)
 
 
 @functools.partial(jax.jit, static_argnames="degree")

@@ -156,8 +156,8 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
     flux = jnp.sum(radiance, -1) * cubemap.solid_angle(size=size).ravel()
     texel = _largest(jax.lax.stop_gradient(flux), count + 1)
     bright = flux[texel]
-    share = jnp.maximum(1 - bright[-1] / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
-    texel, excess = texel[:-1], radiance[texel[:-1]] * share[:, None].astype(radiance.dtype)
+    fraction = jnp.maximum(1 - bright[-1] / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
+    texel, excess = texel[:-1], radiance[texel[:-1]] * fraction[:, None].astype(radiance.dtype)
     rest = radiance.at[texel].add(-excess).reshape(light.radiance.shape)
     return texel, excess, Environment(rest)
 

@@ -24,9 +24,9 @@ def hits(
     area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
     direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
     point, texel = np.nonzero(normal @ area.T > 0)
-    triangle, _, share = occluder.hit(start[point], direction[texel])
+    triangle, _, barycentric = occluder.hit(start[point], direction[texel])
     met = np.flatnonzero(triangle >= 0)
-    return point[met], texel[met], occluder.face[triangle[met]], share[met], len(point)
+    return point[met], texel[met], occluder.face[triangle[met]], barycentric[met], len(point)
 
 
 def front(

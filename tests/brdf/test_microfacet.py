@@ -235,12 +235,12 @@ def test_normal_incidence_reflects_what_one_integral_says(roughness, x64):
     # At normal incidence only the light is masked: the integral of D cos_h G1(2 theta_h) over theta_h up to 45 degrees.
     square = roughness**4
 
-    def share(theta):
+    def reflected(theta):
         c, distribution = np.cos(2 * theta), square / (np.pi * (np.cos(theta) ** 2 * (square - 1) + 1) ** 2)
         masking = 2 * c / (c + np.sqrt(square + (1 - square) * c**2))
         return 2 * np.pi * np.sin(theta) * np.cos(theta) * distribution * masking
 
-    expected = integrate.quad(share, 0, np.pi / 4, points=[roughness**2 / 4])[0]
+    expected = integrate.quad(reflected, 0, np.pi / 4, points=[roughness**2 / 4])[0]
     assert _albedo(GGX(1.0, roughness), 0.0) == pytest.approx(expected, rel=2e-4)
 
 

@@ -330,7 +330,7 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     glossy = ["--brdf", "cook-torrance", "--roughness", "0.4", "--specular", "0.6", "0.5", "0.3"]
     assert run(place, "--ground", "--system", "dynamic", "--animate", "2", *glossy, output=output) == 0
     told = report(output)
-    assert 0 < told["lights"]["sky"]["dynamic"]["reflected_share"] < 0.5
+    assert 0 < told["lights"]["sky"]["dynamic"]["reflected_fraction"] < 0.5
     assert told["lights"]["sky"]["dynamic"]["image_error"] < 0.3
     assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
     frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]

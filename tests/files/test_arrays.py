@@ -238,8 +238,8 @@ def test_sketches_are_as_far_apart_as_the_arrays_and_tell_where_values_are(monke
     value = random.normal(size=(30, 50))
     first = arrays.sketch(value)
     np.testing.assert_allclose(first[:2], [1e-3, np.linalg.norm(value)])
-    for share in (1e-3, 1.0):
-        change = share * random.normal(size=value.shape)
+    for scale in (1e-3, 1.0):
+        change = scale * random.normal(size=value.shape)
         distance = np.linalg.norm(np.subtract(arrays.sketch(value + change)[2:], first[2:]))
         assert 0.6 < distance / np.linalg.norm(change) < 1.5
     for other in (value[::-1], value.T, -value, np.roll(value, 64)):

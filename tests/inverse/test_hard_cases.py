@@ -92,8 +92,8 @@ def test_saturated_pixels_do_not_count(mesh, matte, sky, view, image):
     assert wrong > 0.3
 
 
-def noisy(image, share, seed=0):
-    noise = share * np.sqrt(np.mean(image[image > 0] ** 2))
+def noisy(image, relative, seed=0):
+    noise = relative * np.sqrt(np.mean(image[image > 0] ** 2))
     return np.maximum(image + noise * np.random.default_rng(seed).normal(size=image.shape), 0).astype(np.float32)
 
 

@@ -140,12 +140,12 @@ def test_regions_relit_apart_see_what_they_see_together(name):
     assert np.abs(seen[0] - seen[1]).max(initial=0) < APART * 16 * 3 * 8 * 8
 
 
-@pytest.mark.parametrize(("name", "share"), [("sides", 0.026), ("room", 0.27), ("corner", 0.025), ("ring", 0.027)])
-def test_few_vertices_see_no_light(name, share):
+@pytest.mark.parametrize(("name", "fraction"), [("sides", 0.026), ("room", 0.27), ("corner", 0.025), ("ring", 0.027)])
+def test_few_vertices_see_no_light(name, fraction):
     """Those beneath the pieces and the ring; in the room those between furniture, and what looks away from windows."""
     start, normal = (each[::3] for each in (starts(name), np.asarray(make(name).normal)))
     seen, _ = visibility.fractional(occluder(name), start, normal, size=8)
-    assert 0.9 * share < np.mean(seen.sum(1) == 0) < share
+    assert 0.9 * fraction < np.mean(seen.sum(1) == 0) < fraction
 
 
 def test_the_sides_are_the_pieces_of_the_chess_scene_on_both_sides_of_the_diagonal():

@@ -78,7 +78,7 @@ def test_texture_coordinates_of_a_ply_have_either_name(tmp_path, names):
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 @pytest.mark.parametrize(("kind", "dtype"), [(5121, np.uint8), (5123, np.uint16)])
-def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_shares(tmp_path, suffix, kind, dtype):
+def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_fractions(tmp_path, suffix, kind, dtype):
     most = np.iinfo(dtype).max
     # Rows are of four bytes at least, as glTF wants vertex attributes.
     raw = np.array([[0, most], [most, most], [most, 0], [most // 5, 0]], dtype)
@@ -286,14 +286,14 @@ def test_only_rotations_turn_a_mesh(matrix):
         rotate(make_mesh(SQUARE, SQUARE_FACE), matrix)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.995])
+@pytest.mark.parametrize("fraction", [0.05, 0.3, 0.6, 0.9, 0.995])
 @pytest.mark.parametrize("suffix", ["ply", "off"])
-def test_text_that_is_cut_off_is_refused(tmp_path, suffix, share):
+def test_text_that_is_cut_off_is_refused(tmp_path, suffix, fraction):
     text = ball().export(file_type=suffix, **({"encoding": "ascii"} if suffix == "ply" else {}))
     text = text if isinstance(text, bytes) else text.encode()
     assert len(load_mesh(write(tmp_path, f"whole.{suffix}", text)).face) == 320
     with pytest.raises(ValueError, match=rf"cut.{suffix} must be an undamaged {suffix.upper()} file"):
-        load_mesh(write(tmp_path, f"cut.{suffix}", text[: int(share * len(text))]))
+        load_mesh(write(tmp_path, f"cut.{suffix}", text[: int(fraction * len(text))]))
 
 
 def test_text_that_ends_within_its_last_face_is_refused_and_more_than_is_counted_is_not(tmp_path):

@@ -277,23 +277,23 @@ def laplacian(coefficient):
     return float(np.sum((l * (l + 1))[:, None] ** 2 * np.asarray(coefficient) ** 2))
 
 
-@pytest.mark.parametrize("share", [1.0, 0.9, 0.1, 1e-3, 1e-6])
+@pytest.mark.parametrize("kept", [1.0, 0.9, 0.1, 1e-3, 1e-6])
 @pytest.mark.parametrize("degree", [1, 14, DEGREE])
-def test_the_window_of_least_laplacian_leaves_the_share_that_was_asked_for(share, degree, x64, close):
+def test_the_window_of_least_laplacian_leaves_the_share_that_was_asked_for(kept, degree, x64, close):
     coefficient = normal(15, (degree + 1) ** 2, 3)
-    factor = harmonics.least_laplacian(coefficient, jnp.array(share))
+    factor = harmonics.least_laplacian(coefficient, jnp.array(kept))
     assert (np.diff(factor) <= 0).all()
     assert factor[0] == 1
     left = laplacian(harmonics.convolve(coefficient, factor)) / laplacian(coefficient)
-    close(np.array(left), np.array(share), tolerance=1e-9)
+    close(np.array(left), np.array(kept), tolerance=1e-9)
 
 
 def test_no_other_window_of_its_laplacian_changes_the_function_less(x64):
     coefficient = normal(16, 81, 3)
     for window in (harmonics.hann(degree=8), harmonics.lanczos(degree=8)):
         other = harmonics.convolve(coefficient, window)
-        share = laplacian(other) / laplacian(coefficient)
-        least = harmonics.convolve(coefficient, harmonics.least_laplacian(coefficient, jnp.array(share)))
+        kept = laplacian(other) / laplacian(coefficient)
+        least = harmonics.convolve(coefficient, harmonics.least_laplacian(coefficient, jnp.array(kept)))
         assert laplacian(least) == pytest.approx(laplacian(other), rel=1e-9)
         assert np.linalg.norm(least - coefficient) < 0.999 * np.linalg.norm(other - coefficient)
 
@@ -301,9 +301,9 @@ def test_no_other_window_of_its_laplacian_changes_the_function_less(x64):
 def test_a_share_of_zero_keeps_the_mean_alone_and_shares_out_of_range_are_refused(x64):
     factor = harmonics.least_laplacian(normal(17, 25, 3), jnp.array(0.0))
     np.testing.assert_array_equal(factor, [1, 0, 0, 0, 0])
-    for share in (-0.1, 1.5, np.nan):
+    for kept in (-0.1, 1.5, np.nan):
         with pytest.raises(ValueError, match="share of the squared Laplacian must be from 0 to 1, got"):
-            harmonics.least_laplacian(normal(17, 25, 3), jnp.array(share))
+            harmonics.least_laplacian(normal(17, 25, 3), jnp.array(kept))
 
 
 def test_whole_numbers_are_projected_and_evaluated_as_the_floating_point_numbers_that_they_are(close):

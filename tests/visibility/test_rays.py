@@ -38,7 +38,7 @@ def texels(size):
     return area, corner
 
 
-def share(mesh, seen, *, vertex=slice(None)):
+def visible_fraction(mesh, seen, *, vertex=slice(None)):
     """Cosine-weighted share of the hemisphere that is seen."""
     area, _ = texels(round((seen.shape[1] / 6) ** 0.5))
     flux = np.maximum(np.asarray(mesh.normal, np.float64)[vertex] @ area.T, 0)
@@ -102,7 +102,7 @@ def test_vertices_of_convex_meshes_see_their_whole_upper_hemisphere(name):
     mesh = CONVEX[name]()
     seen = trace(mesh, size=8)
     assert (seen[wholly_above(mesh.normal, 8)] == 16).all()
-    assert share(mesh, seen).min() > 1 - CUT
+    assert visible_fraction(mesh, seen).min() > 1 - CUT
     area, _ = texels(8)
     assert (seen[np.asarray(mesh.normal, np.float64) @ area.T < -1e-6] == 0).all()
 
@@ -119,7 +119,7 @@ def test_a_point_under_a_parallel_square_sees_the_analytic_share(half):
     # Form factor of a rectangle over its corner, four times.
     x = half / 0.7
     corner = 2 * x / np.sqrt(1 + x * x) * np.arctan(x / np.sqrt(1 + x * x)) / (2 * np.pi)
-    assert abs(share(mesh, seen, vertex=[center])[0] - (1 - 4 * corner)) < 2e-3
+    assert abs(visible_fraction(mesh, seen, vertex=[center])[0] - (1 - 4 * corner)) < 2e-3
 
 
 def test_the_inside_of_a_closed_box_sees_nothing():
@@ -150,7 +150,7 @@ def test_shading_normals_of_other_rooms_do_not_blacken_a_coarse_sphere():
     mesh = builtin.sphere(rings=5, sectors=7)
     bent = make_mesh(mesh.position, mesh.face, normal=mesh.normal + 0.6 * random.normal(size=mesh.normal.shape))
     facing = np.sum(np.asarray(bent.normal * mesh.normal), 1) > 0.2
-    assert share(bent, trace(bent))[facing].min() > 0.3
+    assert visible_fraction(bent, trace(bent))[facing].min() > 0.3
 
 
 @pytest.mark.parametrize("rate", [0.3, 1.0])
@@ -207,7 +207,7 @@ def test_moving_a_thousand_sizes_away_leaves_visibility_nearly_as_it_is(make):
     mesh = make()
     far = moved(mesh, shift=[4000.0, -4000.0, 4000.0])
     assert difference(trace(far), trace(mesh)) < 0.02
-    assert (share(mesh, trace(far)) > share(mesh, trace(mesh)) - 0.05).all()
+    assert (visible_fraction(mesh, trace(far)) > visible_fraction(mesh, trace(mesh)) - 0.05).all()
 
 
 @pytest.mark.parametrize("name", ["box", "sphere"])
@@ -245,7 +245,7 @@ def test_a_simplified_occluder_does_not_shadow_what_it_stands_for(scale):
     fine = builtin.sphere(rings=30, sectors=48)
     coarse = moved(builtin.sphere(rings=12, sectors=24), scale=scale)
     seen = trace(fine, occluder=coarse)
-    assert share(fine, seen).min() > 0.97
+    assert visible_fraction(fine, seen).min() > 0.97
 
 
 def test_a_simplified_occluder_still_shadows_other_things():

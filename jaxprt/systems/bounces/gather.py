@@ -151,7 +151,7 @@ def rays(
     Returns:
         The rays that meet each region that is met; where a triangle has corners of several, each region has its own.
     """
-    point, texel, corner, share, _ = visibility.hits.hits(occluder, start, normal, size=size)
+    point, texel, corner, barycentric, _ = visibility.hits.hits(occluder, start, normal, size=size)
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
     seen = visibility.hits.front(occluder, frame[:, 2], corner, way)
     result = {}
@@ -162,8 +162,8 @@ def rays(
         place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
         groups = -(-count // _HITS)
         group = (np.cumsum(groups) - groups)[point[own]] + place // _HITS
-        padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, share, texel)]
-        for whole, each in zip(padded, (corner[own], (share * inside)[own], texel[own]), strict=True):
+        padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, barycentric, texel)]
+        for whole, each in zip(padded, (corner[own], (barycentric * inside)[own], texel[own]), strict=True):
             whole[group, place % _HITS] = each
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result

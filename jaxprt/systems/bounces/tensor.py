@@ -130,8 +130,8 @@ class TransferTensor(eqx.Module):
         if (error is None) == (nbytes is None):
             raise ValueError(f"give either error or nbytes, got error={error} and nbytes={nbytes}")
         energy, whole = (np.asarray(each, np.float64) for each in _energy(self))
-        share = energy / np.where(whole > 0, whole, 1)[:, None, None]
-        left = np.where(whole[:, None, None] > 0, 1 - share.cumsum(1).cumsum(2), 0)
+        fraction = energy / np.where(whole > 0, whole, 1)[:, None, None]
+        left = np.where(whole[:, None, None] > 0, 1 - fraction.cumsum(1).cumsum(2), 0)
         wrong = np.sqrt(np.maximum(left, 0).mean(0))  # [e, n]
         modes, components = (np.arange(1, n + 1) for n in wrong.shape)
         clusters, _, _, *shape = self.core.shape
@@ -220,8 +220,8 @@ def precompute(
         modes=min(modes, 6 * edge * edge),
     )
     found = run.compute(job, "clusters", "bounce")
-    share = _shares(found["energy"], job.scale)
-    function = np.flatnonzero(share >= least)
+    contribution = _contributions(found["energy"], job.scale)
+    function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
     weight = found["weight"].reshape(*member.shape, -1)
     core = found["core"][..., function]
@@ -232,7 +232,7 @@ def precompute(
         second, brought = _second(again, member, job.white[function], least, run)
         worth.append(brought)
     if progress:
-        _tell(share, function, worth, second, bounces)
+        _tell(contribution, function, worth, second, bounces)
     rows = (separable.clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
     judged = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
@@ -344,7 +344,7 @@ def scales(factor: Sequence[Array]) -> Float[Array, " q"]:
     return jnp.maximum(whole, _LEAST * jnp.max(whole, initial=0))
 
 
-def _shares(energy: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _contributions(energy: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """What each function brings at its largest weight, as a share of what all bring."""
     size = np.sqrt(energy.sum(0)) * scale
     return size / max(np.linalg.norm(size), np.finfo(np.float32).tiny)
@@ -354,10 +354,10 @@ def _rms(value: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(value, dtype=np.float64))))
 
 
-def _tell(share: np.ndarray, function: np.ndarray, worth: list[float], second, bounces: int) -> None:
-    gone = len(share) - len(function)
+def _tell(contribution: np.ndarray, function: np.ndarray, worth: list[float], second, bounces: int) -> None:
+    gone = len(contribution) - len(function)
     if gone:
-        left = np.linalg.norm(np.delete(share, function))
-        tqdm.tqdm.write(f"transfer: left out {gone} of {len(share)} functions, {left:.2g} of what arrives")
+        left = np.linalg.norm(np.delete(contribution, function))
+        tqdm.tqdm.write(f"transfer: left out {gone} of {len(contribution)} functions, {left:.2g} of what arrives")
     if bounces == 2 and second is None and len(worth) > 1:
         tqdm.tqdm.write(f"transfer: left out the second bounce, {worth[1]:.2g} of the light of an open surface")

@@ -252,7 +252,7 @@ def _mixed(brdf: DynamicBrdf, weight: Array) -> Mixed:
 
 def _glossy(view: LobeView) -> LobeView:
     """Lobes alone: their diffuse part is lit by the diffuse term."""
-    return LobeView(view.place, view.share, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
+    return LobeView(view.place, view.visible, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
 
 
 @isolated

@@ -132,19 +132,19 @@ def _shade(
     region: Int[Array, " v"],
     brdf: tuple[HarmonicBrdf, ...],
     corner: Int[Array, "m 3"],
-    weight: Float[Array, "m 3"],
+    barycentric: Float[Array, "m 3"],
     direction: Float[Array, "m 3"],
 ) -> Float[Array, "m l lm"]:
     """What leaves the hit points against the rays, as a linear map of the light."""
 
     def one(total, k):
-        vertex, share = corner[:, k], weight[:, k]
+        vertex, weight = corner[:, k], barycentric[:, k]
         wo = jnp.sum(frame[vertex] * -direction[:, None], -1)
         view = sum(
             jnp.where(region[vertex] == number, each.coefficients(wo), 0).swapaxes(0, 2)
             for number, each in enumerate(brdf)
         )
-        view = jnp.broadcast_to(view, (len(wo), *rows.shape[1:3])) * share[:, None, None]
+        view = jnp.broadcast_to(view, (len(wo), *rows.shape[1:3])) * weight[:, None, None]
         return total + jnp.einsum("mlo,mloi->mli", view, rows[vertex]), None
 
     start = jnp.zeros((corner.shape[0], rows.shape[1], rows.shape[3]), rows.dtype)
@@ -193,7 +193,7 @@ class _BounceJob(visibility.rays.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = visibility.hits.hits(
+        vertex, texel, corner, barycentric, count = visibility.hits.hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
@@ -201,7 +201,7 @@ class _BounceJob(visibility.rays.VisibilityJob):
         for first in range(0, len(vertex), _RAYS):
             # Padded with a hit's copies, so that one compiled function serves all.
             at = np.minimum(np.arange(first, first + _RAYS), len(vertex) - 1)
-            shaded = _shade(*self.shading, corner[at], weight[at], direction[texel[at]])
+            shaded = _shade(*self.shading, corner[at], barycentric[at], direction[texel[at]])
             leaving[vertex[at], texel[at]] = shaded
         return {"matrix": np.asarray(_arriving(leaving, self.frame[part]))}, count
 
@@ -229,13 +229,13 @@ class _DiffuseBounceJob(visibility.rays.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, weight, count = visibility.hits.hits(
+        vertex, texel, corner, barycentric, count = visibility.hits.hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
         flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
         seen = visibility.hits.front(self.rays, self.frame[:, 2], corner, area[texel])
-        leaving = np.einsum("mk,mkli->mli", weight * (seen * flux)[:, None], self.rows[corner])
+        leaving = np.einsum("mk,mkli->mli", barycentric * (seen * flux)[:, None], self.rows[corner])
         total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
         np.add.at(total, vertex, leaving)
         return {"vector": total.transpose(2, 1, 0)}, count

@@ -139,12 +139,12 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     flux = _flux(seen, frame)
-    share = seen.astype(frame.dtype) / visibility.LEVELS
-    mean = jnp.sum(share * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
-    visible = _project(jnp.where(flux > 0, share, mean), degree=2 * degree)
+    visible = seen.astype(frame.dtype) / visibility.LEVELS
+    mean = jnp.sum(visible * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
+    coefficient = _project(jnp.where(flux > 0, visible, mean), degree=2 * degree)
     node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
-    value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ visible)
+    value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ coefficient)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
     return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
 

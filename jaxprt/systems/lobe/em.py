@@ -93,11 +93,12 @@ def improve(
 
 @partial(jax.jit, static_argnames=("nodes",))
 def blend(
-    wo: Float[Array, "v 3"], lobe: mixture.Mixture, share: Float[Array, ""], *, nodes: tuple[int, ...]
+    wo: Float[Array, "v 3"], lobe: mixture.Mixture, smoothing: Float[Array, ""], *, nodes: tuple[int, ...]
 ) -> mixture.Mixture:
     """Draws the lobes of each node to those of its neighbors: slopes of half vectors, logarithms, parts of the weight.
 
-    A neighbor counts by its lobe's weight, since lobes without weight may be anywhere.
+    The two neighbors along an axis together have the weight `smoothing`. Each counts by its lobe's weight, since
+    lobes without weight may be anywhere.
     """
     total = jnp.sum(lobe.weight, 1, keepdims=True)
     part = (lobe.weight / jnp.where(total > 0, total, 1))[..., None]
@@ -108,7 +109,7 @@ def blend(
         rim = [(1, 1) if i == axis else (0, 0) for i in range(every.ndim)]
         e, s = jnp.pad(every * sure, rim, mode="edge"), jnp.pad(sure, rim, mode="edge")
         low, own, high = ([jax.lax.slice_in_dim(x, k, k + nodes[axis], axis=axis) for x in (e, s)] for k in range(3))
-        top, sure = ((1 - share) * b + share / 2 * (a + c) for a, b, c in zip(low, own, high, strict=True))
+        top, sure = ((1 - smoothing) * b + smoothing / 2 * (a + c) for a, b, c in zip(low, own, high, strict=True))
         every = top / sure
     every = every.reshape(-1, count, 4)
     mean = _reflected(wo, every[..., :2], 0.0)

@@ -14,7 +14,7 @@ def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) ->
 
     Args:
         row: Means, logarithms of concentrations, weights and diffuse albedos of all lobes, on knots and nodes.
-        knot: Lower neighbor and share of the upper one, for each parameter of each view.
+        knot: Lower neighbor and weight of the upper one, for each parameter of each view.
         axis: The same for the nodes of the view.
         lobes: Number of lobes.
     """
@@ -32,8 +32,8 @@ def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) ->
     total = jnp.zeros((), row.dtype)
     for corner in itertools.product((0, 1), repeat=len(axis)):
         node, weight = jnp.zeros((), jnp.int32), jnp.ones((), row.dtype)
-        for up, size, (low, share) in zip(corner, nodes, axis, strict=True):
-            node, weight = node * size + low + up, weight * (share if up else 1 - share)
+        for up, size, (low, upper) in zip(corner, nodes, axis, strict=True):
+            node, weight = node * size + low + up, weight * (upper if up else 1 - upper)
         total = total + weight * read(jnp.zeros((), jnp.int32), node, list(zip(sizes, knot, strict=True)))
     return total
 
@@ -45,5 +45,5 @@ def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
     strong = [jnp.sum(each[2].reshape(-1, lobes, each[2].shape[1]), 0) for each in parts]
     low, high = jnp.maximum((1 - upper) * strong[0], 0) + _TINY, jnp.maximum(upper * strong[1], 0) + _TINY
     high = high / (low + high)
-    shares = jnp.tile(high, (3, 1)), high, upper, upper
-    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, shares, strict=True)])
+    weight = jnp.tile(high, (3, 1)), high, upper, upper
+    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, weight, strict=True)])

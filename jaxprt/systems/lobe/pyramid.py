@@ -61,7 +61,7 @@ class LobeTransport(eqx.Module):
         value = self.level.at[:, byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
 
-    def share(
+    def lobe_visibility(
         self, face: Int[Array, "l v"], s: Float[Array, "l v"], t: Float[Array, "l v"], spread: Float[Array, "l v"]
     ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
         """What each vertex sees of its lobes: the mean visibility over each, its horizon included, and the slopes.
@@ -75,7 +75,7 @@ class LobeTransport(eqx.Module):
             spread: Mean of 1 - cos of the angle to the lobe's direction, as from `jaxprt.decompose.mixture.drop`.
 
         Returns:
-            Shares from 0 to 1, and their derivatives by s and t.
+            Visible parts of the lobes, from 0 to 1, and their derivatives by s and t.
         """
         # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
         address, bit = _addresses(face, s, t, spread, size=self.size)
@@ -148,7 +148,7 @@ class Scales(NamedTuple):
 
 
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
-    """The scale below each spread, and the share of the one above."""
+    """The scale below each spread, and the weight of the one above."""
     known = jnp.asarray(scale.spread, spread.dtype)
     number = jnp.sum(spread[..., None] >= known[1:-1], -1)
     low, high = known[number], known[number + 1]

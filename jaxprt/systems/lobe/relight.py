@@ -55,7 +55,7 @@ class LobeView(eqx.Module):
 
     Attributes:
         place: Texels of the blurred light, eight for each lobe.
-        share: What each texel counts, visibility included; may be negative.
+        visible: Weight of each texel, visibility included; may be negative.
         weight: Of each lobe, gray or per color.
         diffuse: Albedo of the diffuse part.
         vector: Its transfer vectors.
@@ -63,7 +63,7 @@ class LobeView(eqx.Module):
     """
 
     place: tuple[Int[Array, "l v"], ...]
-    share: tuple[Float[Array, "l v"], ...]
+    visible: tuple[Float[Array, "l v"], ...]
     weight: Float[Array, "c l v"]
     diffuse: Float[Array, "c v"]
     vector: Float[Array, "lm v"]
@@ -143,10 +143,10 @@ def view_lobes(
     """
     require.position("the eye", eye)
     lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye, *parameter)
-    place, share = _taps(
-        face, s, t, spread, lobe.concentration, transport.share(face, s, t, spread), size=transport.size
+    place, visible = _taps(
+        face, s, t, spread, lobe.concentration, transport.lobe_visibility(face, s, t, spread), size=transport.size
     )
-    return LobeView(place, share, lobe.weight, lobe.diffuse, transport.vector, transport.size)
+    return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, transport.size)
 
 
 @isolated
@@ -160,9 +160,9 @@ def _places(
 
 
 @partial(isolated, static=("size",))
-def _taps(face, s, t, spread, concentration, share, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Texels of the blurred light, and what each counts."""
-    seen, by_s, by_t = share
+    seen, by_s, by_t = visible
     # Slopes on the face as a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
     variance = (1 + s**2 + t**2) / (concentration * (1 - spread))
     along_s = variance * (by_s * (1 + s**2) + by_t * s * t)
@@ -194,8 +194,8 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     def one(color):
         row = light.level[min(color, len(light.level) - 1)]
         weight = view.weight[min(color, len(view.weight) - 1)]
-        taps = zip(view.place, view.share, strict=True)
-        lit = reduce(jnp.add, (row.at[place].get(mode="promise_in_bounds") * share for place, share in taps))
+        taps = zip(view.place, view.visible, strict=True)
+        lit = reduce(jnp.add, (row.at[place].get(mode="promise_in_bounds") * visible for place, visible in taps))
         return reduce(jnp.add, (a * b for a, b in zip(lit, weight, strict=True)))
 
     glossy = jnp.stack([one(color) for color in range(colors)])

@@ -24,7 +24,7 @@ from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems.lobe import em, knots
 
 _STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
-# How many times these, and the share that neighbors in the table have in a lobe after them.
+# How many times these, and the weight of neighbors in the table by which lobes are smoothed after them.
 _ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0))
 _DEGREE = 24  # of the natural light by which a table is judged
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
@@ -286,11 +286,11 @@ def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array,
     nodes = wo.shape[:-1]
     view, (sample, mass, fixed, extent) = np.asarray(wo).reshape(-1, 3), samples
     gray, lobe, least, weight = _begin(view, sample, mass, lobes=lobes)
-    for times, share in _ROUNDS:
+    for times, smoothing in _ROUNDS:
         for _ in range(times):
             lobe, weight = em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
-        if share:
-            lobe = em.blend(view, lobe, jnp.asarray(share, wo.dtype), nodes=nodes)
+        if smoothing:
+            lobe = em.blend(view, lobe, jnp.asarray(smoothing, wo.dtype), nodes=nodes)
     return _end(lobe, em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
 
 

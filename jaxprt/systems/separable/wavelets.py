@@ -94,10 +94,10 @@ def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: Separ
     Reference: Wang, Tran, Luebke 2004, section 3.3.
     """
     size = haar.face_edge(seen.shape[1])
-    share = seen.astype(frame.dtype) / visibility.LEVELS
+    visible = seen.astype(frame.dtype) / visibility.LEVELS
     value = jnp.zeros((), frame.dtype)
     for direction, area in zip(*_points(size), strict=True):
-        flux = jnp.maximum(directions.to_local(frame, area.astype(frame.dtype))[..., 2], 0) * share
+        flux = jnp.maximum(directions.to_local(frame, area.astype(frame.dtype))[..., 2], 0) * visible
         value += brdf.light(directions.to_local(frame, direction.astype(frame.dtype))) * flux[..., None, None]
     faces = value.reshape(seen.shape[0] * 6, size, size, -1)
     return haar.forward(faces).reshape(value.shape)

@@ -88,9 +88,9 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
     occluder = visibility.Occluder(mesh)
     start, normal, region = visibility.start_points(mesh, occluder), np.asarray(mesh.normal), np.asarray(mesh.region)
     way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
-    point, through, corner, share, _ = visibility.hits.hits(occluder, start, normal, size=SIZE)
+    point, through, corner, barycentric, _ = visibility.hits.hits(occluder, start, normal, size=SIZE)
     front = visibility.hits.front(occluder, normal, corner, way[through])
-    point, through, corner, share = (each[front] for each in (point, through, corner, share))
+    point, through, corner, barycentric = (each[front] for each in (point, through, corner, barycentric))
     wo = np.einsum("hkij,hj->hki", frame[corner], -way[through])
     wo[..., 2] = np.maximum(wo[..., 2], 1e-3)
     wo /= np.linalg.norm(wo, axis=-1, keepdims=True)
@@ -112,7 +112,7 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
                 factor = np.asarray(value(wi[v].astype(np.float32), wo[h, k].astype(np.float32)))
                 sent[h, k] = np.einsum("hdc,hdc->hc", factor, met[v])
         result = np.zeros((len(start), len(way), 3))
-        result[point, through] = np.einsum("hk,hkc->hc", share, sent)
+        result[point, through] = np.einsum("hk,hkc->hc", barycentric, sent)
         return result
 
     texel, fold = 6, SEEN // 2  # Of 24, from the side of +y.

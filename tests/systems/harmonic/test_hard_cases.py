@@ -197,8 +197,8 @@ def test_a_sun_in_one_texel_rings_and_windows_calm_it(degree):
     area = float(cubemap.solid_angle(size=SIZE)[2, 3, 4])
     center = cubemap.direction(size=SIZE)[2, 3, 4]
     np.testing.assert_allclose(light[0, 0], 1000 * area * np.sqrt(1 / (4 * np.pi)), rtol=1e-5)
-    share, depth = negative(light)
-    assert share > 0.25
+    fraction, depth = negative(light)
+    assert fraction > 0.25
     assert depth > 0.1
     softest = harmonics.least_laplacian(light, jnp.asarray(0.05))
     for window, bound in (
@@ -208,7 +208,7 @@ def test_a_sun_in_one_texel_rings_and_windows_calm_it(degree):
     ):
         calmed = harmonics.convolve(light, window)
         less, lower = negative(calmed)
-        assert less < bound * share
+        assert less < bound * fraction
         assert lower < bound * depth
         np.testing.assert_allclose(calmed[0], light[0], rtol=1e-6)  # No energy is lost.
         brightest = cubemap.direction(size=32).reshape(-1, 3)

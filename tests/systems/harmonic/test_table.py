@@ -329,8 +329,8 @@ def test_parameters_interpolate_linearly_and_clamp_to_their_knots(varying, rando
 
 
 def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
-    def made(share):
-        return Lambert(0.5) if share < 0.5 else Lambert([0.5, 0.25, 0.1])
+    def made(place):
+        return Lambert(0.5) if place < 0.5 else Lambert([0.5, 0.25, 0.1])
 
     table = tabulate(made, degree=0, resolution=4, knot=(np.array([0.0, 1.0]),))
     assert table.table.shape == (1, 3, 2, 4)

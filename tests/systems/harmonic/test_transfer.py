@@ -110,11 +110,11 @@ def test_open_diffuse_vertices_have_the_cosine_kernel_in_closed_form(random, clo
 def test_any_visibility_gives_the_sum_over_fine_texels(random, close):
     seen, frame, fine = visible(random, 2), frames(random, 2), 16
     flux = np.maximum(directions.to_local(frame, cubemap.vector_area(size=SIZE).reshape(-1, 3))[..., 2], 0)
-    share = np.asarray(seen) / 16
-    share = np.where(flux > 0, share, np.sum(share * flux, 1, keepdims=True) / np.sum(flux, 1, keepdims=True))
-    share = share.reshape(-1, 6, SIZE, 1, SIZE, 1) * np.ones((fine, 1, fine))
+    visible = np.asarray(seen) / 16
+    visible = np.where(flux > 0, visible, np.sum(visible * flux, 1, keepdims=True) / np.sum(flux, 1, keepdims=True))
+    visible = visible.reshape(-1, 6, SIZE, 1, SIZE, 1) * np.ones((fine, 1, fine))
     wi = cubemap.direction(size=SIZE * fine).reshape(-1, 3)
-    weight = share.reshape(2, -1) * np.asarray(cubemap.solid_angle(size=SIZE * fine)).reshape(-1)
+    weight = visible.reshape(2, -1) * np.asarray(cubemap.solid_angle(size=SIZE * fine)).reshape(-1)
     world = np.asarray(harmonics.evaluate(wi, degree=3), float)
     local = np.asarray(harmonics.evaluate(directions.to_local(frame, wi), degree=3), float)
     expected = np.einsum("bd,bdo,di->boi", weight, local, world, optimize=True)

@@ -148,13 +148,13 @@ def test_a_mirror_has_no_diffuse_part_and_its_lobes_are_the_finest_in_its_direct
     np.testing.assert_allclose(mean.T, lobe.em.mirror(wo), atol=0.01)
 
 
-@pytest.mark.parametrize(("name", "share"), [("zero", 0), ("mirror", 1)])
-def test_published_lobes_of_a_mirror_are_the_sharpest_and_of_nothing_nothing(name, share):
+@pytest.mark.parametrize(("name", "glossy"), [("zero", 0), ("mirror", 1)])
+def test_published_lobes_of_a_mirror_are_the_sharpest_and_of_nothing_nothing(name, glossy):
     table = mirror_lobes(BRDF[name], resolution=RESOLUTION)
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in (table.mean, table.scale, table.weight))
     whole = np.sum(table.weight[0], 0)
     np.testing.assert_allclose(table.weight[0, 0], whole, rtol=0.01)
-    assert np.all((whole > 0) == share)
+    assert np.all((whole > 0) == glossy)
 
 
 SIZE = 16

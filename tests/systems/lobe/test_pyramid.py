@@ -38,7 +38,7 @@ def read(transport, direction, spread):
     """Shares of one lobe in the same world direction for all vertices."""
     count = len(transport.position)
     face, s, t = cubemap.project(*(jnp.full((1, count), float(x)) for x in direction))
-    return transport.share(face, s, t, jnp.full((1, count), spread))
+    return transport.lobe_visibility(face, s, t, jnp.full((1, count), spread))
 
 
 def exact(seen, direction, spread):
@@ -75,22 +75,22 @@ def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
     transport = lobe.LobeTransport(level, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
     for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
         for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
-            share, by_s, by_t = read(transport, direction, spread)
-            np.testing.assert_allclose(share, value / 16, atol=1e-6)
+            visible, by_s, by_t = read(transport, direction, spread)
+            np.testing.assert_allclose(visible, value / 16, atol=1e-6)
             np.testing.assert_allclose(jnp.stack([by_s, by_t]), 0, atol=1e-4)
 
 
 @pytest.mark.parametrize("spread", [3e-3, 0.01, 0.03, 0.1, 0.3])
-def test_shares_are_the_means_over_lobes(compressed, seen, spread):
+def test_visible_parts_are_the_means_over_lobes(compressed, seen, spread):
     random = np.random.default_rng(0).normal(size=(12, 3))
     wrong = []
     for direction in random / np.linalg.norm(random, axis=1, keepdims=True):
-        share, *_ = read(compressed, direction, spread)
-        wrong.append(np.asarray(share)[0] - exact(seen, direction, spread))
+        visible, *_ = read(compressed, direction, spread)
+        wrong.append(np.asarray(visible)[0] - exact(seen, direction, spread))
     assert np.sqrt(np.mean(np.square(wrong))) < FRACTION
 
 
-def test_shares_at_a_scale_of_bytes_are_its_means(compressed, seen):
+def test_visible_parts_at_a_scale_of_bytes_are_its_means(compressed, seen):
     """At the center of a texel, and at the scale's own spread, nothing is interpolated."""
     scale = lobe.pyramid.scales(SIZE)
     mean = seen.reshape(-1, 6, 4, 4, 4, 4).astype(float) / 16
@@ -98,23 +98,25 @@ def test_shares_at_a_scale_of_bytes_are_its_means(compressed, seen):
     mean = (mean * area).sum((3, 5)) / area.sum((2, 4))
     for face, row, column in ((0, 1, 2), (3, 2, 1), (5, 0, 3)):
         direction = np.asarray(cubemap.direction(size=4))[face, row, column]
-        share, *_ = read(compressed, direction, float(scale.spread[2]))
-        np.testing.assert_allclose(share[0], mean[:, face, row, column], atol=BYTE + 1e-5)
+        visible, *_ = read(compressed, direction, float(scale.spread[2]))
+        np.testing.assert_allclose(visible[0], mean[:, face, row, column], atol=BYTE + 1e-5)
 
 
-def test_slopes_are_those_of_the_shares(compressed):
+def test_slopes_are_those_of_the_visible_parts(compressed):
     count, step = len(compressed.position), 1e-3
     random = np.random.default_rng(1)
     face = jnp.asarray(random.integers(6, size=(3, count)))
     s, t = (jnp.asarray(random.uniform(-0.9, 0.9, (3, count)), jnp.float32) for _ in range(2))
     spread = jnp.asarray(random.uniform(0.02, 0.4, (3, count)), jnp.float32)
-    _, by_s, by_t = compressed.share(face, s, t, spread)
-    along_s = (compressed.share(face, s + step, t, spread)[0] - compressed.share(face, s - step, t, spread)[0]) / (
-        2 * step
-    )
-    along_t = (compressed.share(face, s, t + step, spread)[0] - compressed.share(face, s, t - step, spread)[0]) / (
-        2 * step
-    )
+    _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
+    along_s = (
+        compressed.lobe_visibility(face, s + step, t, spread)[0]
+        - compressed.lobe_visibility(face, s - step, t, spread)[0]
+    ) / (2 * step)
+    along_t = (
+        compressed.lobe_visibility(face, s, t + step, spread)[0]
+        - compressed.lobe_visibility(face, s, t - step, spread)[0]
+    ) / (2 * step)
     for slope, difference in ((by_s, along_s), (by_t, along_t)):
         near = np.isclose(slope, difference, atol=5e-3)
         assert near.mean() > 0.95  # The rest lies across the line between texel centers, where slopes jump.
@@ -123,13 +125,13 @@ def test_slopes_are_those_of_the_shares(compressed):
 def test_slopes_are_what_differentiation_gives(compressed):
     face, s, t = cubemap.project(*(jnp.full((1, len(compressed.position)), x) for x in (0.3, 0.9, 0.2)))
     spread = jnp.full(s.shape, 0.05)
-    _, by_s, by_t = compressed.share(face, s, t, spread)
-    gradient = jax.grad(lambda s, t: jnp.sum(compressed.share(face, s, t, spread)[0]), argnums=(0, 1))(s, t)
+    _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
+    gradient = jax.grad(lambda s, t: jnp.sum(compressed.lobe_visibility(face, s, t, spread)[0]), argnums=(0, 1))(s, t)
     np.testing.assert_allclose(gradient[0], by_s, atol=1e-5)
     np.testing.assert_allclose(gradient[1], by_t, atol=1e-5)
 
 
-def test_shares_are_continuous_over_the_edges_of_the_cube(compressed):
+def test_visible_parts_are_continuous_over_the_edges_of_the_cube(compressed):
     """At scales of bytes, whose faces have a rim; bits end at the edge."""
     for spread in (0.05, 0.2):
         for one, other in (([1, 0.3, 0.9999], [0.9999, 0.3, 1]), ([-0.2, 1, 0.9999], [-0.2, 0.9999, 1])):

@@ -307,9 +307,9 @@ def test_knots_have_the_tables_of_their_brdfs(quick, close):
 
 def test_weights_are_linear_between_knots_and_places_means_by_weight_and_both_clamped_outside(quick, close):
     varying = quick("varying", resolution=4)
-    for place, low, share in ((0.15, 0, 0.5), (0.25, 1, 0.25), (0.4, 1, 1), (0.0, 0, 0), (7.0, 1, 1), (np.inf, 1, 1)):
+    for place, low, high in ((0.15, 0, 0.5), (0.25, 1, 0.25), (0.4, 1, 1), (0.0, 0, 0), (7.0, 1, 1), (np.inf, 1, 1)):
         found = chosen(varying, np.float32(place))
-        part = np.array([1 - share, share])[:, None]
+        part = np.array([1 - high, high])[:, None]
         weight = np.asarray(varying.weight)[:, :, low : low + 2]
         close(found.weight, np.sum(weight * part, 2))
         close(found.diffuse, np.sum(np.asarray(varying.diffuse)[:, low : low + 2] * part, 1))
@@ -433,14 +433,14 @@ def test_a_wrong_number_of_parameters_is_refused(quick):
         quick("varying", resolution=4).lookup(upper(0, 2))
 
 
-def mirror_lobe(degrees, share):
+def mirror_lobe(degrees, weight):
     """A BRDF whose product with the cosine is Gaussian lobes around the mirror direction."""
 
     def brdf(wi, wo):
         away = jnp.sum((wi - lobe.em.mirror(wo)) ** 2, -1, keepdims=True) / 2
         k = 1 / (np.radians(np.array(degrees)) / 3) ** 2
         density = jnp.exp(-k * away) * (k / (2 * np.pi))
-        return jnp.sum(density * np.array(share), -1, keepdims=True) / jnp.maximum(wi[..., 2:], 1e-6)
+        return jnp.sum(density * np.array(weight), -1, keepdims=True) / jnp.maximum(wi[..., 2:], 1e-6)
 
     return brdf
 
@@ -455,12 +455,12 @@ def test_published_lobes_are_in_the_mirror_direction_and_have_the_given_widths()
     np.testing.assert_allclose(found, np.asarray(lobe.em.mirror(wo)).T[:, None] * np.ones((3, 3, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("share", [[0.5, 0, 0], [0, 0.3, 0], [0.2, 0, 0.6]])
-def test_published_lobes_find_a_brdf_that_is_such_lobes_also_where_the_horizon_cuts_them(share):
+@pytest.mark.parametrize("weight", [[0.5, 0, 0], [0, 0.3, 0], [0.2, 0, 0.6]])
+def test_published_lobes_find_a_brdf_that_is_such_lobes_also_where_the_horizon_cuts_them(weight):
     angles = (3.0, 7.0, 21.0)
-    table = mirror_lobes(mirror_lobe(angles, share), angles=angles, resolution=RESOLUTION)
+    table = mirror_lobes(mirror_lobe(angles, weight), angles=angles, resolution=RESOLUTION)
     # The other lobes part from these as EM goes on.
-    np.testing.assert_allclose(table.weight[0], np.outer(share, np.ones(RESOLUTION)), atol=0.01)
+    np.testing.assert_allclose(table.weight[0], np.outer(weight, np.ones(RESOLUTION)), atol=0.01)
 
 
 def test_published_lobes_of_anisotropic_brdfs_are_maps_with_colors():
