@@ -3,8 +3,8 @@
     python -m benchmarks.inverse [--quick] [--store FOLDER] [--output FILE]
 
 The bunny (36,000 vertices), pictures of 256 x 256 pixels by Mitsuba 3's path tracer, direct light. `error` is relative
-L2 of what was found, `residual` that of the pictures, `rank` how many combinations of numbers they tell, `known` how
-many numbers by themselves. Precomputation is `precompute_seconds`, and `table_seconds` of the lobes, and not in
+L2 of what was found, `residual` that of the pictures, `rank` how many combinations of numbers they determine, `known`
+how many numbers by themselves. Precomputation is `precompute_seconds`, and `table_seconds` of the lobes, and not in
 `seconds`, which compile.
 
 Lines `light`: 25 spherical harmonics of the light in three colors from one picture, of what the pictures determine:
@@ -43,7 +43,7 @@ TEXELS = 16
 SAMPLES = 256
 ALBEDO = 0.5
 TRUE = {"diffuse": [0.35, 0.2, 0.1], "specular": 0.3, "nu": 20.0, "nv": 150.0}
-BROAD = TRUE | {"nu": 10.0, "nv": 40.0}  # no sharper than light of degree 4 tells
+BROAD = TRUE | {"nu": 10.0, "nv": 40.0}  # no sharper than light of degree 4 determines
 START = {"diffuse": [0.5, 0.5, 0.5], "specular": 0.1, "nu": 50.0, "nv": 50.0}
 LOWER = {"diffuse": 0.0, "specular": 0.0, "nu": 8.0, "nv": 8.0}
 UPPER = {"diffuse": 1.0, "specular": 1.0, "nu": 400.0, "nv": 400.0}
@@ -52,7 +52,7 @@ NOISE = 0.02
 FINE = 6  # degree of the base's harmonics
 PATCH = 0.5  # albedo of the ground
 ASKED = 0.03
-TOLD = 0.025  # relative L2 to which combinations of harmonics count as told
+DETERMINED = 0.025  # relative L2 to which combinations of harmonics count as determined
 PEER_SAMPLES, PEER_RATE = 16, 0.05  # of prb
 LIGHT_STEPS, MATERIAL_STEPS = 600, 150
 
@@ -98,13 +98,13 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
         image = drawn(mesh, [Lambert(ALBEDO)], light, view, exact, seed=0)
         pixels = inverse.observe(mesh, [inverse.Picture(image, view)])
         start = time.perf_counter()
-        found = inverse.light(radiance, jnp.zeros_like(true), pixels, error=TOLD)
+        found = inverse.light(radiance, jnp.zeros_like(true), pixels, error=DETERMINED)
         seconds = time.perf_counter() - start
         finite = np.isfinite(found.deviation)
         line = {
             **{"case": f"light, {name}, {len(mesh.position)} vertices", "seconds": seconds, "compile_seconds": 0.0},
             **{
-                "error": wrong(found.told, found.value, true),
+                "error": wrong(found.determined, found.value, true),
                 "residual": float(found.residual[-1]),
                 "rank": found.rank,
             },
@@ -114,7 +114,7 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
             path, seconds = prb.fit_light(
                 mesh, ALBEDO, image, view, degree=DEGREE, steps=LIGHT_STEPS, samples=PEER_SAMPLES, rate=PEER_RATE
             )
-            line |= peer([wrong(found.told, each, true) for each in path], seconds)
+            line |= peer([wrong(found.determined, each, true) for each in path], seconds)
         yield line
 
 
@@ -290,9 +290,9 @@ def drawn(mesh: Mesh, models: Sequence[Any], light: Environment, view: Camera, e
     return np.asarray(raster.interpolate(fragments, mesh.face, jnp.asarray(color)))
 
 
-def wrong(told, found, true) -> float:
-    """Of the combinations of numbers that the picture tells, in units of these."""
-    return norm(told @ np.ravel(found - true)) / norm(told @ np.ravel(true))
+def wrong(determined, found, true) -> float:
+    """Of the combinations of numbers that the picture determines, in units of these."""
+    return norm(determined @ np.ravel(found - true)) / norm(determined @ np.ravel(true))
 
 
 def peer(error: list[float], seconds: float) -> dict:

@@ -1,4 +1,4 @@
-"""Light and materials from pictures of a known object: what explains them best, and how well they tell each number.
+"""Light and materials from pictures of a known object: what explains them best, and how well they determine it.
 
     pixels = prt.inverse.observe(mesh, [prt.inverse.Picture(image, camera)])
     found = prt.inverse.light(lambda light, eye: radiance(transport, brdf, light, eye=eye), start, pixels)

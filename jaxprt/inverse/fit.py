@@ -26,8 +26,8 @@ def light(
     """The light under which an object looks as in pictures, painted ones perhaps.
 
     Few numbers without bounds or a prior, as spherical harmonics are, are solved for at once, in the space of what the
-    pictures tell; what they do not stays as it is at the start. Others are found by projected gradients, accelerated,
-    each number in units of what it changes; or by L-BFGS without bounds.
+    pictures determine; what they do not stays as it is at the start. Others are found by projected gradients,
+    accelerated, each number in units of what it changes; or by L-BFGS without bounds.
 
     Args:
         radiance: Of the light and an eye, of every vertex; linear in the light.
@@ -36,8 +36,8 @@ def light(
         lower: Bounds: one number for all, or a pytree like the start, with None where there is no bound.
         upper: The same from above.
         prior: Added to half the squared residual; as `smoothness` of the texels or their sum, times a weight.
-        error: Of what is solved for at once, the relative L2 to which combinations count as told, as far as parts of
-            the pictures disagree about them: the less error, the fewer.
+        error: Of what is solved for at once, the relative L2 to which combinations count as determined, as far as parts
+            of the pictures disagree about them: the less error, the fewer.
         steps: At most so many.
 
     Raises:
@@ -121,8 +121,8 @@ def jointly(
 ) -> Fit:
     """Light and material: the light for the start's material, as by `light`, and then both, as by `material`.
 
-    A light twice as bright and a material half as bright look alike: pictures do not tell which. So the light is held
-    at the norm of the start's, unless something in the scene is known.
+    A light twice as bright and a material half as bright look alike: pictures do not determine which. So the light is
+    held at the norm of the start's, unless something in the scene is known.
 
     Args:
         radiance: Of the light, the material and an eye; linear in the light.

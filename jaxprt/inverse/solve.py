@@ -38,26 +38,26 @@ class Fit(NamedTuple):
     """What explains pictures.
 
     Attributes:
-        value: The light or material, as the start is made; where pictures do not tell, the start's.
+        value: The light or material, as the start is made; what the pictures do not determine keeps its start.
         residual: Difference from the pictures relative to them, in L2: at the start and after each step.
         deviation: Standard deviation of each number, as far as parts of the pictures disagree about it; infinite for
-            what the pictures do not tell, and for numbers at their bounds: the pictures may want them farther out, and
-            do not tell how far. Those of the others hold while these stay. What all parts have in common, as a material
-            that no number can be, is not in it. Of many numbers (over 512) a lower bound, since others may make up for
-            each.
-        told: Orthonormal combinations of the numbers that the pictures tell, in a row as `ravel_pytree` has them; of a
-            material those of its free numbers. None of many numbers.
+            what the pictures do not determine, and for numbers at their bounds: the pictures may want them farther
+            out, and do not determine how far. Those of the others hold while these stay. What all parts have in
+            common, as a material that no number can be, is not in it. Of many numbers (over 512) a lower bound, since
+            others may make up for each.
+        determined: Orthonormal combinations of the numbers that the pictures determine, in a row as `ravel_pytree` has
+            them; of a material those of its free numbers. None of many numbers.
     """
 
     value: Any
     residual: np.ndarray
     deviation: Any
-    told: Float[np.ndarray, "r n"] | None
+    determined: Float[np.ndarray, "r n"] | None
 
     @property
     def rank(self) -> int | None:
-        """How many combinations of numbers the pictures tell."""
-        return None if self.told is None else len(self.told)
+        """How many combinations of numbers the pictures determine."""
+        return None if self.determined is None else len(self.determined)
 
 
 def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m"], Float[Array, "n m"]]]:
@@ -76,8 +76,8 @@ def _slopes(function: Callable, x: Array) -> tuple[Float[Array, " m"], Float[Arr
     return _with_slopes(function)(x)
 
 
-def _told(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions that pictures tell, apart from rounding, and their singular values."""
+def _determined(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions that pictures determine, apart from rounding, and their singular values."""
     square, axis = np.linalg.eigh(rows @ rows.T)
     value = np.sqrt(np.maximum(square, 0))
     known = value > _KNOWN * max(value[-1], np.finfo(np.float32).tiny)
@@ -98,12 +98,12 @@ def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndar
     whole, blocks = np.diag(value**2), []
     for part in np.array_split(np.arange(len(left)), count):
         own = along[:, part]
-        without = whole * (1 + _ROUNDED) - own @ own.T  # Never singular, also where one block tells all.
+        without = whole * (1 + _ROUNDED) - own @ own.T  # Never singular, also where one block determines all.
         blocks.append(np.linalg.solve(without, own @ left[part]))
     moved = np.stack(blocks, 1) * np.sqrt((count - 1) / count)
     least = np.linalg.norm(left) / np.sqrt(max(1, len(left) - len(value))) / value  # of independent noise
     size = np.linalg.norm(moved, axis=1)
-    # So many blocks tell a deviation to one part in sqrt(2 blocks): three of these are no sign of clusters.
+    # So many blocks determine a deviation to one part in sqrt(2 blocks): three of these are no sign of clusters.
     size, known = np.where(size > least * (1 + 3 / np.sqrt(2 * count)), size, least), size
     return moved * (size / np.maximum(known, _TINY))[:, None]
 
@@ -123,18 +123,18 @@ def _finite(*arrays: Array) -> None:
 
 
 def at_once(function: Callable, first: Array, unravel: Callable, error: float) -> Fit:
-    """A linear problem, by singular values; what is not told stays as it is.
+    """A linear problem, by singular values; what is not determined stays as it is.
 
-    Nor are directions told whose deviations would together be more than the error allows of all that is told.
+    Directions are left out whose deviations would together be more than the error allows of all that is determined.
     Truncation as in Hansen 1998, "Rank-deficient and discrete ill-posed problems".
     """
     r, slope = _slopes(function, first)
     _finite(r, slope)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
-    axis, value = _told(rows)
+    axis, value = _determined(rows)
     part = -(axis.T @ (rows @ before)) / value**2
-    # What is told of a direction does not depend on the others. The first pass leaves out those that only follow what
-    # the numbers cannot explain, the second judges by what then remains; more would judge by light left out.
+    # What is determined of a direction does not depend on the others. The first pass leaves out those that only follow
+    # what the numbers cannot explain, the second judges by what then remains; more would judge by light left out.
     for _ in range(2):
         wrong = np.linalg.norm(_scores(axis, value, rows, before + axis @ part @ rows), axis=1)
         best = np.argsort(wrong)
@@ -206,13 +206,13 @@ def marquardt(
             break
     rows, left = np.asarray(state.jac, np.float64).T, np.asarray(state.residual, np.float64)
     rows = np.where(pinned(free)[:, None], 0, rows)
-    axis, value = _told(rows)
+    axis, value = _determined(rows)
     deviation = _deviation(axis, _scores(axis, value, rows, left))
-    told = axis if not held else _told(rows[:, :-held])[0]
+    determined = axis if not held else _determined(rows[:, :-held])[0]
     value, rate = jax.jit(lambda u: jax.jvp(bounded, (u,), (jnp.ones_like(u),)))(free)
     known = np.isfinite(deviation)
     deviation = np.where(known, np.where(known, deviation, 0) * np.abs(rate), np.inf)
-    return Fit(unravel(value), np.array(history), unravel(jnp.asarray(deviation, free.dtype)), told.T)
+    return Fit(unravel(value), np.array(history), unravel(jnp.asarray(deviation, free.dtype)), determined.T)
 
 
 def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:

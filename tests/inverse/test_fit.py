@@ -198,7 +198,7 @@ def test_light_and_material_are_found_up_to_their_scale(mesh, cameras, sky, two_
     lit, made = found.value
     size = np.linalg.norm(start[0])
     assert np.linalg.norm(lit) == pytest.approx(size, rel=1e-4)
-    assert found.rank == sky.size + 4 - 1  # The norm is held and not told.
+    assert found.rank == sky.size + 4 - 1  # The norm is held and not determined.
     assert found.residual[-1] < 1e-3
     factor = np.linalg.norm(sky) / size
     close(factor * lit, sky, tolerance=0.01)

@@ -1,4 +1,4 @@
-"""What pictures do not tell, tell wrongly, or tell of nothing at all."""
+"""What pictures do not determine, determine wrongly, or leave open altogether."""
 
 import functools
 
@@ -106,23 +106,27 @@ def test_noise_leaves_a_residual_of_its_size_and_deviations_that_hold(mesh, matt
     assert np.mean(away > 0.5) > 0.4  # 62 % are.
 
 
-def test_much_noise_leaves_less_that_is_told_and_that_is_right(mesh, matte, sky, view, image):
+def test_much_noise_leaves_less_that_is_determined_and_that_is_right(mesh, matte, sky, view, image):
     for seed in range(5):
         found = fit(mesh, matte, Picture(noisy(image, 0.02, seed), view))
         assert 0.01 < found.residual[-1] < 0.03
         assert 12 <= found.rank < 54
-        wrong = np.linalg.norm(found.told @ np.ravel(found.value - sky)) / np.linalg.norm(found.told @ np.ravel(sky))
+        wrong = np.linalg.norm(found.determined @ np.ravel(found.value - sky)) / np.linalg.norm(
+            found.determined @ np.ravel(sky)
+        )
         # The error that `inverse.light` is asked for: .015 to .040 for these noises, and rounding moves each by .003.
         assert wrong < 0.05
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.1])
 @pytest.mark.parametrize("error", [0.03, 0.1])
-def test_what_is_told_is_as_right_as_asked(mesh, matte, sky, view, image, noise, error):
+def test_what_is_determined_is_as_right_as_asked(mesh, matte, sky, view, image, noise, error):
     pixels = inverse.observe(mesh, [Picture(noisy(image, noise), view)])
     found = inverse.light(matte, jnp.zeros_like(sky), pixels, error=error)
     assert found.rank >= 3
-    wrong = np.linalg.norm(found.told @ np.ravel(found.value - sky)) / np.linalg.norm(found.told @ np.ravel(sky))
+    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - sky)) / np.linalg.norm(
+        found.determined @ np.ravel(sky)
+    )
     assert wrong < 2 * error
 
 
@@ -133,14 +137,16 @@ def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, dull, view):
     image = render(mesh, high(harmonic.project(light, degree=4), view.eye), view)
     found = inverse.light(low, jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
     true = harmonic.project(light, degree=2)
-    wrong = np.linalg.norm(found.told @ np.ravel(found.value - true)) / np.linalg.norm(found.told @ np.ravel(true))
+    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - true)) / np.linalg.norm(
+        found.determined @ np.ravel(true)
+    )
     assert found.residual[-1] > 1e-3
     assert found.rank >= 3
     assert wrong < 0.25  # More than asked for: no block is free of such a pattern.
 
 
 @pytest.mark.parametrize("degree", [2, 3])
-def test_of_a_sun_some_is_told_although_most_of_it_is_too_fine(mesh, dull, view, degree):
+def test_of_a_sun_some_is_determined_although_most_of_it_is_too_fine(mesh, dull, view, degree):
     """Of what is left out nothing may make the rest doubtful, until nothing remains."""
     light = np.zeros((6, 16, 16, 3), np.float32)
     light[2, 8:11, 3:6] = 50
@@ -149,7 +155,9 @@ def test_of_a_sun_some_is_told_although_most_of_it_is_too_fine(mesh, dull, view,
     pixels = inverse.observe(mesh, [Picture(np.maximum(image, 0), view)])
     found = inverse.light(low, jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
     true = harmonic.project(Environment(jnp.asarray(light)), degree=degree)
-    wrong = np.linalg.norm(found.told @ np.ravel(found.value - true)) / np.linalg.norm(found.told @ np.ravel(true))
+    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - true)) / np.linalg.norm(
+        found.determined @ np.ravel(true)
+    )
     assert found.rank >= 9
     assert wrong < 0.1
 
@@ -162,7 +170,7 @@ def test_a_wrong_exposure_scales_the_light_and_nothing_else(mesh, matte, view, i
 
 
 def test_light_from_behind_is_known_badly(mesh, matte, view, image):
-    """A picture of one side tells more of the light from there."""
+    """A picture of one side determines more of the light from there."""
     found = fit(mesh, matte, Picture(image, view, mask=np.broadcast_to(np.arange(EDGE) < EDGE // 3, image.shape[:2])))
     whole = fit(mesh, matte, Picture(image, view))
     known = ~ODD
