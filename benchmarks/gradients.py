@@ -252,9 +252,9 @@ def _clustered(vertices: int, *, terms: int, vectors: int, modes: int, keep: int
 def _seen(vertices: int) -> LobeTransport:
     position, frame = points(vertices)
     count = lobe_system.pyramid.scales(SIZE).total
-    level = np.random.default_rng(1).integers(0, 256, (vertices, count), dtype=np.uint8)
+    pyramid = np.random.default_rng(1).integers(0, 256, (vertices, count), dtype=np.uint8)
     vector = jax.random.normal(jax.random.key(2), ((lobe_system.pyramid.DEGREE + 1) ** 2, vertices))
-    return LobeTransport(jnp.asarray(level), vector, position, frame, SIZE)
+    return LobeTransport(jnp.asarray(pyramid), vector, position, frame, SIZE)
 
 
 def _region(vertices: int) -> DynamicTransport:

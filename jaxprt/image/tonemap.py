@@ -31,9 +31,9 @@ def automatic_exposure(
     image = _floating(image)
     luminance = image @ jnp.asarray(LUMINANCE, image.dtype)
     lit = luminance > 0
-    level = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
-    level = jnp.where(jnp.any(lit), level, white)
-    return jnp.log2(white / level)
+    bright = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
+    bright = jnp.where(jnp.any(lit), bright, white)
+    return jnp.log2(white / bright)
 
 
 @jax.jit

@@ -91,15 +91,15 @@ def test_excess_and_rest_are_the_light(random, colors, strength):
 @pytest.mark.parametrize("count", [1, 5, 40, 300])
 @pytest.mark.parametrize("kind", ["random", "constant", "few"])
 def test_the_brightest_are_taken_and_of_equal_ones_the_first(random, kind, count):
-    level = {
+    brightness = {
         "random": random.random(6 * 32**2),
         "constant": np.ones(6 * 32**2),
         "few": random.integers(3, size=6 * 32**2),
     }
-    light = Environment(jnp.asarray(level[kind].reshape(6, 32, 32, 1), jnp.float32))
+    light = Environment(jnp.asarray(brightness[kind].reshape(6, 32, 32, 1), jnp.float32))
     texel, _, _ = bright_texels.split(light, count=count)
-    brightness = np.asarray(light.radiance[..., 0] * cubemap.solid_angle(size=32)).ravel()
-    np.testing.assert_array_equal(texel, np.argsort(-brightness, kind="stable")[:count])
+    flux = np.asarray(light.radiance[..., 0] * cubemap.solid_angle(size=32)).ravel()
+    np.testing.assert_array_equal(texel, np.argsort(-flux, kind="stable")[:count])
 
 
 def test_a_texel_keeps_its_color(random):

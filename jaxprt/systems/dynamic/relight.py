@@ -163,7 +163,7 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
     blurred = None
     if any(_has_pyramid(each) for each in transport.region):
         blurred = lobe.prefilter(rest)
-        blurred = LobeLight(blurred.level, blurred.coefficient[:0], blurred.size)
+        blurred = LobeLight(blurred.pyramid, blurred.coefficient[:0], blurred.size)
     matte = tuple(bright_texels.irradiance(each.seen, texel, excess) for each in transport.region)
     return DynamicLight(met, blurred, texel, excess, matte)
 
@@ -277,7 +277,7 @@ def _by_row(value: Array, vertex: Array) -> Array:
 
 
 def _has_pyramid(region: RegionTransport) -> bool:
-    return region.seen.level.shape[1] > 6 * region.seen.size**2 // 8
+    return region.seen.pyramid.shape[1] > 6 * region.seen.size**2 // 8
 
 
 def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:

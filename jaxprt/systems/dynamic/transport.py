@@ -175,8 +175,8 @@ def compress(
     seen = lobe.compress(visible)
     # The diffuse part is a term: no transfer vectors. Without lobes nothing reads means.
     lobes = isinstance(brdf, DynamicBrdf) and brdf.lobe is not None
-    level = seen.level if lobes else seen.level[:, : 6 * seen.size**2 // 8]
-    seen = LobeTransport(level, seen.vector[:0], seen.position, seen.frame, seen.size)
+    pyramid = seen.pyramid if lobes else seen.pyramid[:, : 6 * seen.size**2 // 8]
+    seen = LobeTransport(pyramid, seen.vector[:0], seen.position, seen.frame, seen.size)
     return RegionTransport(terms, seen, jnp.arange(count))
 
 

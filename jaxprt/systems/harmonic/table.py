@@ -87,10 +87,10 @@ class HarmonicBrdf(eqx.Module):
         if len(parameter) != len(self.knot):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
         resolution = self.table.shape[-1]
-        # At the normal the azimuth is undefined; there (x, y) / level is 0, as all orders but m = 0 are.
-        level = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
+        # At the normal the azimuth is undefined; there (x, y) / sin_o is 0, as all orders but m = 0 are.
+        sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
         if self.isotropic:
-            spot = level / (1 + jnp.maximum(wo[:, 2], 0)) * ((resolution - 1) / _outermost(resolution))
+            spot = sin_o / (1 + jnp.maximum(wo[:, 2], 0)) * ((resolution - 1) / _outermost(resolution))
             place = [spot]
         else:
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
@@ -101,7 +101,7 @@ class HarmonicBrdf(eqx.Module):
         ] + [grid.neighbors(each, size=resolution) for each in place]
         value = grid.read(self.table.reshape(-1, *self.table.shape[2:]), axis) * (wo[:, 2] > 0)
         value = value.reshape(*self.table.shape[:2], len(wo))
-        return rotation.about_z(value, wo[:, 0] / level, wo[:, 1] / level) if self.isotropic else value
+        return rotation.about_z(value, wo[:, 0] / sin_o, wo[:, 1] / sin_o) if self.isotropic else value
 
     def __call__(
         self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"], *parameter: Float[Array, "*b"]
@@ -302,9 +302,9 @@ def _is_isotropic(brdf: Callable, error: float, degree: int, rule: tuple[int, in
     number = np.arange(_PROBES // 2)
     height, angle = (number + 0.5) / len(number), 1 + number * np.pi * (3 - np.sqrt(5))
     both = jnp.concatenate([_views(height, 0 * angle), _views(height, angle)])
-    level, beside = np.split(_project(brdf, both, degree, rule), 2, -1)
-    cosine, sine = (jnp.asarray(each(angle), level.dtype) for each in (np.cos, np.sin))
-    return _difference(np.asarray(rotation.about_z(jnp.asarray(level), cosine, sine)), beside) <= error
+    straight, turned = np.split(_project(brdf, both, degree, rule), 2, -1)
+    cosine, sine = (jnp.asarray(each(angle), straight.dtype) for each in (np.cos, np.sin))
+    return _difference(np.asarray(rotation.about_z(jnp.asarray(straight), cosine, sine)), turned) <= error
 
 
 def _choose_rule(

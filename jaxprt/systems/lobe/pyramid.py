@@ -36,7 +36,7 @@ class LobeTransport(eqx.Module):
     """Visibility pyramids, and transfer vectors for the diffuse part of BRDFs.
 
     Attributes:
-        level: For each vertex the bits of all texels, four neighbors in each half of a byte, then the means at a
+        pyramid: For each vertex the bits of all texels, four neighbors in each half of a byte, then the means at a
             quarter of the resolution and below, each face with a rim of its neighbors' texels.
         vector: SH coefficients of visibility times cosine over pi.
         position: Vertex positions in world units.
@@ -44,7 +44,7 @@ class LobeTransport(eqx.Module):
         size: Edge of the cubemap's faces in texels.
     """
 
-    level: UInt8[Array, "v n"]
+    pyramid: UInt8[Array, "v n"]
     vector: Float[Array, "lm v"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
@@ -53,12 +53,12 @@ class LobeTransport(eqx.Module):
     @property
     def nbytes(self) -> int:
         """Bytes of pyramids and vectors."""
-        return self.level.nbytes + self.vector.nbytes
+        return self.pyramid.nbytes + self.vector.nbytes
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
         """Whether each vertex sees some texels, 1 or 0: whether it sees at least half of each."""
         byte, bit = _bit(*_split(texel, self.size), self.size)
-        value = self.level.at[:, byte].get(mode="promise_in_bounds")
+        value = self.pyramid.at[:, byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
 
     def lobe_visibility(
@@ -79,7 +79,7 @@ class LobeTransport(eqx.Module):
         """
         # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
         address, bit = _addresses(face, s, t, spread, size=self.size)
-        read = _by_tap(_bytes(self.level, _by_vertex(address)))
+        read = _by_tap(_bytes(self.pyramid, _by_vertex(address)))
         return _decoded(read, bit, s, t, spread, size=self.size)
 
 
@@ -109,8 +109,8 @@ def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
 
 
 @isolated
-def _bytes(level: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
-    return jnp.take_along_axis(level, address, 1, mode="promise_in_bounds")
+def _bytes(pyramid: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
+    return jnp.take_along_axis(pyramid, address, 1, mode="promise_in_bounds")
 
 
 @isolated
@@ -215,8 +215,8 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = visibility.rays.place(mesh, vertex)
-    level, vector = jax.device_put(result["level"]), jax.device_put(result["vector"])
-    return LobeTransport(level, vector, position, jax.device_put(job.frame), size)
+    made, vector, frame = (jax.device_put(each) for each in (result["pyramid"], result["vector"], job.frame))
+    return LobeTransport(made, vector, position, frame, size)
 
 
 def compress(direct: StoredVisibility) -> LobeTransport:
@@ -227,20 +227,20 @@ def compress(direct: StoredVisibility) -> LobeTransport:
     """
     scales(direct.size)
     frame = np.asarray(direct.frame)
-    level, vector = [], []
+    pyramids, vectors = [], []
     for first in range(0, len(frame), _BLOCK):
         part = np.arange(first, min(first + _BLOCK, len(frame)))
         seen = jax.device_put(direct.seen(part))
-        level.append(np.asarray(pyramid(seen)))
-        vector.append(np.asarray(harmonic.transfer.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
-    level, vector = jax.device_put(np.concatenate(level)), jax.device_put(np.concatenate(vector, 1))
-    return LobeTransport(level, vector, direct.position, direct.frame, direct.size)
+        pyramids.append(np.asarray(pyramid(seen)))
+        vectors.append(np.asarray(harmonic.transfer.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
+    made, vector = jax.device_put(np.concatenate(pyramids)), jax.device_put(np.concatenate(vectors, 1))
+    return LobeTransport(made, vector, direct.position, direct.frame, direct.size)
 
 
 def bits(transport: LobeTransport) -> LobeTransport:
     """The same without means and vectors: half the bytes, for single texels alone."""
-    level = transport.level[:, : 6 * transport.size**2 // 8]
-    return LobeTransport(level, transport.vector[:0], transport.position, transport.frame, transport.size)
+    finest = transport.pyramid[:, : 6 * transport.size**2 // 8]
+    return LobeTransport(finest, transport.vector[:0], transport.position, transport.frame, transport.size)
 
 
 @jax.jit
@@ -291,11 +291,11 @@ class _Job(visibility.rays.VisibilityJob):
     @property
     def layout(self) -> Mapping[str, Layout]:
         return {
-            "level": Layout((visibility.rays.BLOCK, scales(self.size).total), 0, "uint8"),
+            "pyramid": Layout((visibility.rays.BLOCK, scales(self.size).total), 0, "uint8"),
             "vector": Layout(((DEGREE + 1) ** 2, visibility.rays.BLOCK), 1, "float32"),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         vector = harmonic.transfer.transfer_diffuse(seen, self.frame[self.part(block)], degree=DEGREE)
-        return {"level": np.asarray(pyramid(seen)), "vector": np.asarray(vector)}, count.rays
+        return {"pyramid": np.asarray(pyramid(seen)), "vector": np.asarray(vector)}, count.rays

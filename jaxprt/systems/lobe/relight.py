@@ -40,12 +40,12 @@ class LobeLight(eqx.Module):
     """A light, blurred by von Mises-Fisher lobes of a dozen widths, each with as many texels as it needs.
 
     Attributes:
-        level: Radiance of all widths, each face with a rim of its neighbors' texels.
+        pyramid: Radiance of all widths, each face with a rim of its neighbors' texels.
         coefficient: SH coefficients of the light itself, for the diffuse part.
         size: Edge of the environment's faces in texels.
     """
 
-    level: Float[Array, "c t"]
+    pyramid: Float[Array, "c t"]
     coefficient: Float[Array, "lm c"]
     size: int = eqx.field(static=True)
 
@@ -189,10 +189,10 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     if light.size != view.size:
         raise ValueError(f"the light's faces must have the transport's {view.size} texels, got {light.size}")
     irradiance = light.coefficient.T @ view.vector
-    colors = max(len(view.weight), len(light.level))
+    colors = max(len(view.weight), len(light.pyramid))
 
     def one(color):
-        row = light.level[min(color, len(light.level) - 1)]
+        row = light.pyramid[min(color, len(light.pyramid) - 1)]
         weight = view.weight[min(color, len(view.weight) - 1)]
         taps = zip(view.place, view.visible, strict=True)
         lit = reduce(jnp.add, (row.at[place].get(mode="promise_in_bounds") * visible for place, visible in taps))

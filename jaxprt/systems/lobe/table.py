@@ -126,9 +126,9 @@ class LobeBrdf(eqx.Module):
         resolution = self.scale.shape[-1]
         square = wo[:, 0] ** 2 + wo[:, 1] ** 2
         pole = square < _TINY
-        level = jnp.sqrt(jnp.where(pole, _TINY, square))
+        sin_o = jnp.sqrt(jnp.where(pole, _TINY, square))
         if self.isotropic:
-            axis = [grid.neighbors(level / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), size=resolution)]
+            axis = [grid.neighbors(sin_o / (1 + jnp.maximum(wo[:, 2], 0)) * (resolution - 1), size=resolution)]
         else:
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
             axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
@@ -146,10 +146,10 @@ class LobeBrdf(eqx.Module):
         mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
         x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
-            cosine, sine = jnp.where(pole, 1, wo[:, 0] / level), jnp.where(pole, 0, wo[:, 1] / level)
+            cosine, sine = jnp.where(pole, 1, wo[:, 0] / sin_o), jnp.where(pole, 0, wo[:, 1] / sin_o)
             x, y = cosine * x - sine * y, sine * x + cosine * y
         length = jnp.sqrt(jnp.maximum(x**2 + y**2 + z**2, _TINY))
-        up = jnp.where(wo[:, 2] > 0, jnp.ones_like(level), 0)
+        up = jnp.where(wo[:, 2] > 0, jnp.ones_like(sin_o), 0)
         strength = strength.reshape(len(self.weight), self.lobes, len(wo))
         return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
 

@@ -45,8 +45,8 @@ def fit(brdf):
 
 def directions(*height):
     """Views at some heights, and incident directions in front, behind and at the same place."""
-    level = [np.sqrt(1 - h**2) for h in height]
-    wo = np.array([[x, 0, h] for x, h in zip(level, height, strict=True)])
+    sine = [np.sqrt(1 - h**2) for h in height]
+    wo = np.array([[x, 0, h] for x, h in zip(sine, height, strict=True)])
     wi = wo[:, None] * np.array([[1, 1, 1], [-1, 1, 1]])
     return jnp.asarray(wi, jnp.float32), jnp.asarray(np.repeat(wo[:, None], 2, 1), jnp.float32)
 

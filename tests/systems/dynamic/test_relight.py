@@ -97,7 +97,7 @@ def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.9) for m in (0.6, 0.8)]
     tensor = dynamic.factor(members, None, ranks=(2, 24, 24), resolution=24)
     transport = dynamic.precompute(mesh, [tensor, fixed], size=SIZE, progress=False)
-    assert transport.region[0].seen.level.shape[1] == 6 * SIZE**2 // 8  # Bits alone.
+    assert transport.region[0].seen.pyramid.shape[1] == 6 * SIZE**2 // 8  # Bits alone.
     matter = dynamic.Material(jnp.array([1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
     color = dynamic.radiance(transport, [tensor, fixed], [matter, None], light, eye=EYE)
     ball = ball_in_view(mesh)
@@ -180,7 +180,7 @@ def test_a_region_that_does_not_change_has_no_machinery(transport):
     changing, static = transport.region
     assert static.terms.terms == 1
     assert changing.terms.terms == 1  # Lobes, and the diffuse part.
-    assert static.seen.level.shape[1] == 6 * SIZE**2 // 8 < changing.seen.level.shape[1]
+    assert static.seen.pyramid.shape[1] == 6 * SIZE**2 // 8 < changing.seen.pyramid.shape[1]
     assert transport.nbytes == changing.nbytes + static.nbytes
 
 

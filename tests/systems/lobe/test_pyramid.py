@@ -58,9 +58,9 @@ def test_single_texels_are_seen_where_at_least_half_of_them_is(compressed, seen)
 
 
 def test_every_texel_is_its_own_bit(seen):
-    level = lobe.pyramid.pyramid(jnp.asarray(seen))
+    pyramid = lobe.pyramid.pyramid(jnp.asarray(seen))
     blank = lobe.LobeTransport(
-        level, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
+        pyramid, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
     )
     np.testing.assert_array_equal(np.asarray(blank.visible(jnp.arange(seen.shape[1]))), (seen >= 8).T)
 
@@ -71,8 +71,8 @@ def test_a_pyramid_takes_six_kilobytes():
 
 @pytest.mark.parametrize("value", [0, 16])
 def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
-    level = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
-    transport = lobe.LobeTransport(level, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
+    pyramid = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
+    transport = lobe.LobeTransport(pyramid, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
     for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
         for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
             visible, by_s, by_t = read(transport, direction, spread)
@@ -151,12 +151,13 @@ def test_tracing_gives_what_compressing_known_visibility_gives(visible, compress
     traced = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
     again = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
     # Known visibility is in four bits, in which 9 sixteenths are 8.
-    assert np.mean(np.asarray(traced.level) != np.asarray(compressed.level)[chosen]) < 0.05
+    assert np.mean(np.asarray(traced.pyramid) != np.asarray(compressed.pyramid)[chosen]) < 0.05
     assert (
-        np.max(np.abs(np.asarray(traced.level)[:, -96:].astype(int) - np.asarray(compressed.level)[chosen, -96:])) <= 2
+        np.max(np.abs(np.asarray(traced.pyramid)[:, -96:].astype(int) - np.asarray(compressed.pyramid)[chosen, -96:]))
+        <= 2
     )
     close(traced.vector, compressed.vector[:, chosen], tolerance=1e-3)
-    np.testing.assert_array_equal(traced.level, again.level)
+    np.testing.assert_array_equal(traced.pyramid, again.pyramid)
 
 
 @pytest.mark.parametrize("size", [4, 12, 0])

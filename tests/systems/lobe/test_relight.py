@@ -83,9 +83,9 @@ def test_light_that_grows_towards_the_open_side_counts_more():
     center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
     area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
     open_side = (center[:, 2] > 0) & (center[:, 0] > 0)
-    level = lobe.pyramid.pyramid(jnp.asarray(np.where(open_side, 16, 0)[None], jnp.uint8))
+    pyramid = lobe.pyramid.pyramid(jnp.asarray(np.where(open_side, 16, 0)[None], jnp.uint8))
     frame = jnp.eye(3)[None]
-    half = lobe.LobeTransport(level, jnp.zeros((49, 1)), jnp.zeros((1, 3)), frame, SIZE)
+    half = lobe.LobeTransport(pyramid, jnp.zeros((49, 1)), jnp.zeros((1, 3)), frame, SIZE)
     radiance = 1 + 0.8 * center[:, 0]
     light = Environment(jnp.asarray(radiance.reshape(6, SIZE, SIZE, 1), jnp.float32))
     for concentration in (8.0, 20.0, 60.0):
@@ -123,14 +123,14 @@ def test_blurred_light_is_the_mean_over_lobes(light):
         place = np.asarray(cubemap.direction(size=edge), np.float64).reshape(-1, 3)
         weight = area * np.exp(concentration * (place @ center.T - 1))
         expected = (weight / weight.sum(1, keepdims=True)) @ radiance
-        level = np.asarray(filtered.level)[:, start : start + 6 * (edge + 2) ** 2].reshape(3, 6, edge + 2, edge + 2)
+        level = np.asarray(filtered.pyramid)[:, start : start + 6 * (edge + 2) ** 2].reshape(3, 6, edge + 2, edge + 2)
         value = level[:, :, 1:-1, 1:-1].reshape(3, -1).T
         assert np.linalg.norm(value - expected) < BLUR * np.linalg.norm(expected)
 
 
 def test_constant_light_stays_constant_at_all_scales(close):
     filtered = lobe.prefilter(Environment(jnp.full((6, SIZE, SIZE, 3), 2.5)))
-    close(filtered.level, np.full(filtered.level.shape, 2.5))
+    close(filtered.pyramid, np.full(filtered.pyramid.shape, 2.5))
 
 
 def test_radiance_is_linear_in_the_light(transport, tables, light, close):
