@@ -5,7 +5,7 @@
 The bunny with Ashikhmin-Shirley (10, 100) on a diffuse ground (from JAXPRT_DATA; a sphere on its ground where that is
 not set, and with --quick), under each light and from every view, at the vertices that face it, against the integral
 over all texels. A configuration is the
-number of terms, vectors, modes and coefficients of the clustered transport, and of texels summed one by one; or a
+number of terms, components, modes and coefficients of the clustered transport, and of texels summed one by one; or a
 number of lobes, the ground's light then by spherical harmonics; the published configuration, four sparse terms with 96
 coefficients, stands beside. One line for each light: `seconds` is a light change (environment to radiance of all
 vertices), `view_seconds` a view change. The peer is the other way to make the picture anew: a light change by the
@@ -34,7 +34,7 @@ from jaxprt.visibility import StoredVisibility
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
 BRDF = AshikhminShirley()
 GROUND = Lambert(0.5)
-# Terms, vectors, modes, coefficients, texels.
+# Terms, components, modes, coefficients, texels.
 FRONT = [
     (8, 8, 32, 384, 4),
     (16, 12, 48, 512, 4),
@@ -48,7 +48,7 @@ FRONT = [
 RESOLUTION = 96  # of the BRDF's maps: 48 or 64 cost more error than half of 128 terms
 LOBES = [(4, 4), (4, 8), (4, 16), (8, 8), (8, 16), (16, 16), (16, 64)]  # lobes, texels
 CLUSTERS = 160
-GROUND_KEEP = (16, 48, 768)  # vectors, modes, coefficients of its one term
+GROUND_KEEP = (16, 48, 768)  # components, modes, coefficients of its one term
 
 
 class Part:
@@ -102,10 +102,10 @@ def measure(quick: bool, store: pathlib.Path | None):
 
     published_line, peer = measure_published(glossy, whole, exact, lights, views, quick)
     yield from published_line
-    for terms, vectors, modes, keep, sun in front[:1] if quick else front:
-        cut = parts[0].transport.truncate(keep, modes=modes, vectors=vectors, terms=terms)
+    for terms, components, modes, keep, sun in front[:1] if quick else front:
+        cut = parts[0].transport.truncate(keep, modes=modes, components=components, terms=terms)
         case = [Part(seen[0], BRDF, factored.truncate(terms), cut), Part(seen[1], GROUND, plain, parts[1].transport)]
-        name = f"{terms} terms, {vectors} vectors, {modes} modes, {keep} coefficients, {sun} texels"
+        name = f"{terms} terms, {components} components, {modes} modes, {keep} coefficients, {sun} texels"
         stored = cut.nbytes + parts[1].transport.nbytes + sum(part.nbytes for part in seen)
         yield from report_case(name, case, sun, exact, lights, views, stored, seconds, repeats, peer)
     yield from measure_lobes(seen, exact, lights, views, rays, repeats, peer, quick)
@@ -169,11 +169,11 @@ def exact_radiance(visible: StoredVisibility, brdf, lights: list[Environment], v
 
 def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, int], path) -> Part:
     """Clustered transport of one object."""
-    vectors, modes, keep = limit
-    vectors = min(vectors, -(-len(visible.position) // clusters))
-    modes = min(modes, vectors * factored.terms, keep)
+    components, modes, keep = limit
+    components = min(components, -(-len(visible.position) // clusters))
+    modes = min(modes, components * factored.terms, keep)
     transport = separable.clustered.precompute(
-        visible, factored, clusters=clusters, vectors=vectors, modes=modes, keep=keep, path=path, progress=False
+        visible, factored, clusters=clusters, components=components, modes=modes, keep=keep, path=path, progress=False
     )
     return Part(visible, brdf, factored, transport)
 

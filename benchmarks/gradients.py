@@ -137,8 +137,8 @@ def separable(vertices: int) -> Case:
 
 
 def clustered(vertices: int) -> Case:
-    """Thirty-two terms, 16 vectors, 64 modes, 768 coefficients."""
-    return _terms(_clustered(vertices, terms=32, vectors=16, modes=64, keep=768), 32)
+    """Thirty-two terms, 16 components, 64 modes, 768 coefficients."""
+    return _terms(_clustered(vertices, terms=32, components=16, modes=64, keep=768), 32)
 
 
 def harmonic(vertices: int) -> Case:
@@ -235,13 +235,13 @@ def _terms(transport, terms: int) -> Case:
     return Case(radiance, {"light": sky(), "material": factored.view_map, "eye": EYE}, transport.nbytes)
 
 
-def _clustered(vertices: int, *, terms: int, vectors: int, modes: int, keep: int) -> ClusteredTransport:
+def _clustered(vertices: int, *, terms: int, components: int, modes: int, keep: int) -> ClusteredTransport:
     clusters, random = vertices // MEMBERS, np.random.default_rng(0)
     position, frame = points(vertices)
     index = random.integers(0, 6 * SIZE * SIZE, (clusters, keep), dtype=np.uint16)
     mode, core, weight = (
         random.standard_normal(shape, dtype=np.float32)
-        for shape in ((clusters, keep, modes), (clusters, modes, vectors, terms), (clusters, MEMBERS, vectors))
+        for shape in ((clusters, keep, modes), (clusters, modes, components, terms), (clusters, MEMBERS, components))
     )
     half = jnp.asarray(mode, jnp.float16), jnp.asarray(core, jnp.float16)
     row = jnp.arange(vertices)
@@ -258,7 +258,7 @@ def _seen(vertices: int) -> LobeTransport:
 
 
 def _region(vertices: int) -> DynamicTransport:
-    terms = _clustered(vertices, terms=1, vectors=24, modes=24, keep=1024)
+    terms = _clustered(vertices, terms=1, components=24, modes=24, keep=1024)
     row = jnp.arange(vertices)
     seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices)))
     return DynamicTransport((RegionTransport(terms, seen, row),), row)

@@ -25,7 +25,7 @@ from jaxprt.visibility import blocks
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
 _PYRAMID, _BITS = 5900, 3072  # least bytes of a vertex of lobes, and of terms with single texels
 
-# Steps up in size, the cheapest first. Terms, resolution, vectors, modes, kept coefficients and texels are in balance.
+# Steps up in size, the cheapest first. Terms, resolution, components, modes, coefficients and texels are in balance.
 _DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
 _HARMONIC = tuple(Harmonics(degree=degree) for degree in (2, 3, 4))
 _LOBES = tuple(Lobes(*each) for each in ((2, 4), (4, 8), (8, 16), (12, 16), (16, 32), (24, 64)))

@@ -140,7 +140,7 @@ class Clusters(eqx.Module):
     Attributes:
         terms: BRDF terms.
         resolution: Edge of their maps in texels.
-        vectors: Principal components along the vertices of a cluster.
+        components: Principal components along the vertices of a cluster.
         modes: Principal components along the light.
         keep: Wavelet coefficients of each cluster.
         texels: Brightest texels that are summed one by one.
@@ -149,7 +149,7 @@ class Clusters(eqx.Module):
 
     terms: int = 32
     resolution: int = 64
-    vectors: int = 16
+    components: int = 16
     modes: int = 80
     keep: int = 768
     texels: int = 16
@@ -166,8 +166,8 @@ class Clusters(eqx.Module):
         clusters = max(1, round(count / self.members))
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
-        vectors, keep = min(self.vectors, count // clusters), min(self.keep, 6 * visible.size**2)
-        limits = {"vectors": vectors, "modes": min(self.modes, keep, vectors * terms), "keep": keep}
+        components, keep = min(self.components, count // clusters), min(self.keep, 6 * visible.size**2)
+        limits = {"components": components, "modes": min(self.modes, keep, components * terms), "keep": keep}
         options = job.options("clusters")
         transport = separable.clustered.precompute(visible, factored, clusters=clusters, **limits, **options)
         system = separable.SeparableSystem(transport, factored)

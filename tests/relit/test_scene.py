@@ -76,7 +76,7 @@ RECIPES = {
     "lobe": Lobes(lobes=4, texels=8),
     "harmonic": Harmonics(degree=3),
     "separable": Terms(terms=4, keep=384, resolution=16),
-    "clusters": Clusters(terms=4, vectors=16, resolution=16, keep=384, texels=4),
+    "clusters": Clusters(terms=4, components=16, resolution=16, keep=384, texels=4),
 }
 
 

@@ -100,8 +100,8 @@ def quantized(name: str, model: str) -> tuple[prt.System, Any]:
 def clustered(name: str, model: str) -> tuple[prt.System, Any]:
     brdf, visible = factored(model), seen(name)
     members = max(1, len(visible.position) // 24)
-    sizes = {"clusters": members, "vectors": min(24, len(visible.position) // members), "modes": 64, "keep": 384}
-    sizes["modes"] = min(sizes["modes"], sizes["vectors"] * brdf.terms)
+    sizes = {"clusters": members, "components": min(24, len(visible.position) // members), "modes": 64, "keep": 384}
+    sizes["modes"] = min(sizes["modes"], sizes["components"] * brdf.terms)
     transport = separable.clustered.precompute(visible, brdf, **sizes, progress=False)
     return separable.SeparableSystem(transport, brdf), None
 
@@ -127,7 +127,7 @@ def bright(name: str, model: str) -> tuple[prt.System, Any]:
 
 def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
     brdfs = [members()] * (1 + (name == "scene"))
-    transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, vectors=16, modes=32, keep=384, progress=False)
+    transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
     white = model == "white"
     material = dynamic.Material(np.full(2, 0.5), 1.0 if white else 0.5, 0.0 if white else 0.5)
     return dynamic.DynamicSystem(transport, brdfs), [material] * len(brdfs)

@@ -75,7 +75,7 @@ def precompute(
     mesh: Mesh,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     *,
-    vectors: int = 24,
+    components: int = 24,
     modes: int = 128,
     keep: int = 1024,
     size: int = 64,
@@ -89,8 +89,8 @@ def precompute(
     Args:
         mesh: The vertices to light.
         brdfs: Of each region, in the order of their numbers: a set, or the one BRDF that it has for good, factored.
-        vectors: Principal components along the vertices of a cluster, or as many as it has.
-        modes: Principal components along the light, which all vectors and terms of a cluster share; likewise.
+        components: Principal components along the vertices of a cluster, or as many as it has.
+        modes: Principal components along the light, which all components and terms of a cluster share; likewise.
         keep: Wavelets of each cluster.
         size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
         occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
@@ -135,7 +135,7 @@ def precompute(
             progress=progress,
         )
         at = folder and folder / "clusters.prt"
-        each = compress(visible, brdf, vectors, modes, keep, path=at, executor=executor, progress=progress)
+        each = compress(visible, brdf, components, modes, keep, path=at, executor=executor, progress=progress)
         regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex, jnp.int32)))
     place = np.argsort(np.concatenate([each.vertex for each in regions]))
     return DynamicTransport(tuple(regions), jnp.asarray(place, jnp.int32), visibility.blocks.scene_key(mesh))
@@ -144,7 +144,7 @@ def precompute(
 def compress(
     visible: StoredVisibility,
     brdf: DynamicBrdf | SeparableBrdf,
-    vectors: int,
+    components: int,
     modes: int,
     keep: int,
     *,
@@ -159,14 +159,14 @@ def compress(
     count = len(visible.position)
     factors = light_factors(brdf)
     clusters = max(1, round(count / _MEMBERS), min(_CLUSTERS, count // _FEWEST))
-    vectors = min(vectors, count // clusters)
+    components = min(components, count // clusters)
     keep = min(keep, visible.level.shape[0])
     terms = separable.clustered.precompute(
         visible,
         factors,
         clusters=clusters,
-        vectors=vectors,
-        modes=min(modes, keep, vectors * factors.terms),
+        components=components,
+        modes=min(modes, keep, components * factors.terms),
         keep=keep,
         path=path,
         executor=executor,

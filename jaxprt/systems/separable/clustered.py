@@ -1,8 +1,8 @@
 """Transport as clustered principal components: a few dense products per cluster of vertices instead of sparse sums.
 
 Vertices that lie and face alike have transport alike. In each cluster the matrices of its vertices, all terms
-together, are combinations of a few vectors, and these distinguish a few modes of the light. Only the modes meet the
-light. So the cost of a term falls from `keep` sparse coefficients a vertex to as many numbers as there are vectors,
+together, are combinations of a few components, and these distinguish a few modes of the light. Only the modes meet the
+light. So the cost of a term falls from `keep` sparse coefficients a vertex to as many numbers as there are components,
 and thirty-two to a hundred terms become affordable.
 """
 
@@ -43,8 +43,8 @@ class ClusteredTransport(eqx.Module):
     Attributes:
         index: Numbers of the coefficients among the 6 n n that each cluster keeps, the most important first.
         mode: Its l modes of the light on those coefficients, the leading first.
-        core: What each mode gives to each of n vectors and each term.
-        weight: What each vertex takes of each vector, the leading first.
+        core: What each mode gives to each of n components and each term.
+        weight: What each vertex takes of each component, the leading first.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
         vertex: Vertex of each row.
@@ -79,16 +79,16 @@ class ClusteredTransport(eqx.Module):
         count: int | None = None,
         *,
         modes: int | None = None,
-        vectors: int | None = None,
+        components: int | None = None,
         terms: int | None = None,
     ) -> "ClusteredTransport":
-        """The first `count` coefficients, modes, vectors and terms (all of them if None)."""
+        """The first `count` coefficients, modes, components and terms (all of them if None)."""
         most = (self.index.shape[1], *self.core.shape[1:])
-        asked = {"count": count, "modes": modes, "vectors": vectors, "terms": terms}
+        asked = {"count": count, "modes": modes, "components": components, "terms": terms}
         for (name, value), limit in zip(asked.items(), most, strict=True):
             require.between(name, value, 1, limit)
         index, mode = self.index[:, :count], self.mode[:, :count, :modes]
-        core, weight = self.core[:, :modes, :vectors, :terms], self.weight[:, :, :vectors]
+        core, weight = self.core[:, :modes, :components, :terms], self.weight[:, :, :components]
         rms = _rms(index, mode, core, weight, size=self.rms.shape[0])
         same = (self.position, self.frame, self.vertex, self.place)
         mark = None if self.mark is None else self.mark[:terms]
@@ -113,7 +113,7 @@ class ClusteredTransport(eqx.Module):
 
 def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
     """Writes each cluster's rows where its vertices are: a gather after the loop would double what is written."""
-    _, modes, vectors, terms = transport.core.shape
+    _, modes, components, terms = transport.core.shape
     light = coefficient[transport.index.astype(jnp.int32)]
     dtype = light.dtype
     count, rows = len(transport.place), len(transport.vertex)
@@ -122,9 +122,9 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
 
     def one(result, argument):
         mode, core, weight, light, at = argument
-        met = light.T @ mode.astype(dtype) @ core.reshape(modes, vectors * terms).astype(dtype)
-        vector = jnp.moveaxis(met.reshape(-1, vectors, terms), 0, 2)
-        found = weight.astype(dtype) @ vector.reshape(vectors, -1)
+        met = light.T @ mode.astype(dtype) @ core.reshape(modes, components * terms).astype(dtype)
+        component = jnp.moveaxis(met.reshape(-1, components, terms), 0, 2)
+        found = weight.astype(dtype) @ component.reshape(components, -1)
         return result.at[at].set(found, mode="drop", unique_indices=True), None
 
     start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
@@ -134,13 +134,13 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
 
 def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
     """Cluster by cluster too: JAX's own would keep modes and cores of all of them in full precision."""
-    clusters, modes, vectors, terms = transport.core.shape
+    clusters, modes, components, terms = transport.core.shape
     dtype = cotangent.dtype
 
     def one(argument):
         mode, core, weight, at, read = argument
-        vector = (weight.astype(dtype).T @ jnp.where(read, cotangent[at], 0)).reshape(vectors, terms, -1)
-        met = core.reshape(modes, vectors * terms).astype(dtype) @ vector.reshape(vectors * terms, -1)
+        component = (weight.astype(dtype).T @ jnp.where(read, cotangent[at], 0)).reshape(components, terms, -1)
+        met = core.reshape(modes, components * terms).astype(dtype) @ component.reshape(components * terms, -1)
         return mode.astype(dtype) @ met
 
     at = transport.vertex.reshape(clusters, -1)
@@ -162,7 +162,7 @@ def precompute(
     *,
     clusters: int = 160,
     member: Int[np.ndarray, "p m"] | None = None,
-    vectors: int = 16,
+    components: int = 16,
     modes: int = 128,
     keep: int = 1024,
     path: str | os.PathLike | None = None,
@@ -179,7 +179,7 @@ def precompute(
         brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.separable.factor` makes them.
         clusters: Number of clusters, made by `cluster`; a few hundred vertices in each pay best.
         member: Vertices of each cluster, in place of `clusters`; a vertex may be in one cluster several times.
-        vectors: Principal components of the vertices of a cluster.
+        components: Principal components of the vertices of a cluster.
         modes: Principal components of the light that it meets.
         keep: Wavelet coefficients kept per cluster.
         path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
@@ -191,7 +191,7 @@ def precompute(
 
     Raises:
         TypeError: The BRDF is not factored.
-        ValueError: Light maps per color, more clusters than vertices, more vectors than vertices in a cluster, more
+        ValueError: Light maps per color, more clusters than vertices, more components than vertices in a cluster, more
             coefficients than there are, or a store at `path` made from something else.
         BlockingIOError: The store is being written by another process.
         RuntimeError: A worker of the executor died.
@@ -210,19 +210,19 @@ def precompute(
             f"member must name all {len(direct.position)} vertices and no others, got {missing} missing and "
             f"numbers from {member.min()} to {member.max()}"
         )
-    if not 1 <= vectors <= member.shape[1]:
-        raise ValueError(f"vectors must be between 1 and the {member.shape[1]} vertices of a cluster, got {vectors}")
+    if not 1 <= components <= member.shape[1]:
+        raise ValueError(
+            f"components must be between 1 and the {member.shape[1]} vertices of a cluster, got {components}"
+        )
     if not 1 <= keep <= direct.level.shape[0]:
         raise ValueError(f"keep must be between 1 and {direct.level.shape[0]}, got {keep}")
-    if not 1 <= modes <= min(keep, vectors * brdf.terms):
-        raise ValueError(
-            f"modes must be between 1 and the smaller of keep and vectors x terms, {min(keep, vectors * brdf.terms)}, "
-            f"got {modes}"
-        )
-    job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, vectors, modes, keep)
+    if not 1 <= modes <= min(keep, components * brdf.terms):
+        most = min(keep, components * brdf.terms)
+        raise ValueError(f"modes must be between 1 and the smaller of keep and components x terms, {most}, got {modes}")
+    job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, components, modes, keep)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
     index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
-    weight = jax.device_put(result["weight"]).reshape(*member.shape, vectors)
+    weight = jax.device_put(result["weight"]).reshape(*member.shape, components)
     row, place = member.ravel(), places(member)
     rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
     same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
@@ -266,13 +266,13 @@ class ClusterJob(visibility.blocks.Job):
         return self.member.shape[1]
 
 
-@partial(jax.jit, static_argnames=("vectors", "modes", "keep"))
+@partial(jax.jit, static_argnames=("components", "modes", "keep"))
 def compress(
     seen: UInt8[Array, "m d"],
     frame: Float[Array, "m 3 3"],
     brdf: SeparableBrdf,
     *,
-    vectors: int,
+    components: int,
     modes: int,
     keep: int,
 ) -> tuple[UInt[Array, " k"], Float16[Array, "k l"], Float16[Array, "l n r"], Float[Array, "m n"], Array, Array]:
@@ -282,14 +282,14 @@ def compress(
         seen: Visibility of each cubemap texel in sixteenths.
         frame: Rows are tangent, bitangent, normal.
         brdf: The factored BRDF, of which only the light maps matter.
-        vectors: How many components along the vertices.
+        components: How many along the vertices.
         modes: How many along the light.
         keep: How many coefficients.
 
     Returns:
         Numbers of the coefficients; modes on them and cores, scaled to largest entries of 1 so that half precision
         holds them; weights; and the squared errors that remain, under light of natural spectrum and relative to the
-        whole, after 0, 1, ... vectors, and after all vectors and 0, 1, ... modes.
+        whole, after 0, 1, ... components, and after all components and 0, 1, ... modes.
     """
     size = haar.face_edge(seen.shape[1])
     importance = jnp.tile(haar.area(size=size).ravel(), 6) ** SPECTRUM
@@ -304,14 +304,14 @@ def compress(
     importance = importance[index, None]
     kept = jax.lax.map(lambda a: transport(a)[index] * importance, (seen, frame)).reshape(len(seen), -1)
     value, vector = jnp.linalg.eigh(kept @ kept.T)
-    value, vector = jnp.maximum(value[::-1], 0), vector[:, ::-1][:, :vectors]
-    basis = jnp.moveaxis((vector.T @ kept).reshape(vectors, keep, -1), 0, 1).reshape(keep, -1)
+    value, vector = jnp.maximum(value[::-1], 0), vector[:, ::-1][:, :components]
+    basis = jnp.moveaxis((vector.T @ kept).reshape(components, keep, -1), 0, 1).reshape(keep, -1)
     strength, mode, _ = eigen.left_singular(basis, terms=modes)
     core = mode.T @ basis
     mode = mode / importance
     # Scales go from modes to cores and from cores to weights.
     scale = _largest(mode, 0)
-    mode, core = mode / scale, (core * scale[:, None]).reshape(modes, vectors, -1)
+    mode, core = mode / scale, (core * scale[:, None]).reshape(modes, components, -1)
     scale = _largest(core, (0, 2))
     core, weight = core / scale[:, None], vector * scale
     small = jnp.uint16 if seen.shape[1] <= 1 << 16 else jnp.uint32
@@ -351,7 +351,7 @@ class _Job(ClusterJob):
     direct: StoredVisibility
     brdf: SeparableBrdf
     member: np.ndarray
-    vectors: int
+    components: int
     modes: int
     count: int
 
@@ -374,10 +374,10 @@ class _Job(ClusterJob):
     @property
     def layout(self) -> Mapping[str, Layout]:
         return {
-            "weight": Layout((self.step, self.vectors), 0, "float32"),
+            "weight": Layout((self.step, self.components), 0, "float32"),
             "index": Layout((1, self.count), 0, "uint16" if self.direct.level.shape[0] <= 1 << 16 else "uint32"),
             "mode": Layout((1, self.count, self.modes), 0, "float16"),
-            "core": Layout((1, self.modes, self.vectors, self.brdf.terms), 0, "float16"),
+            "core": Layout((1, self.modes, self.components, self.brdf.terms), 0, "float16"),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
@@ -390,4 +390,4 @@ class _Job(ClusterJob):
 
     @property
     def _shape(self) -> Mapping[str, int]:
-        return {"vectors": self.vectors, "modes": self.modes, "keep": self.count}
+        return {"components": self.components, "modes": self.modes, "keep": self.count}

@@ -22,8 +22,8 @@ SIZE = 8
 ALL = 6 * SIZE**2
 VERTICES = 39  # Three clusters of ten, and one of nine that repeats its last.
 CLUSTERS, TERMS = 4, 3
-WHOLE = {"clusters": CLUSTERS, "vectors": 10, "modes": 30, "keep": ALL}
-SMALL = {"clusters": CLUSTERS, "vectors": 4, "modes": 8, "keep": 100}
+WHOLE = {"clusters": CLUSTERS, "components": 10, "modes": 30, "keep": ALL}
+SMALL = {"clusters": CLUSTERS, "components": 4, "modes": 8, "keep": 100}
 HALF = 2e-3  # Numbers of half precision have 11 bits: modes and cores lose 5e-4 each; measured 3e-4 together.
 EYE = jnp.array([1.0, 2.0, 3.0])
 
@@ -57,7 +57,7 @@ def exact(seen, brdf):
 
 @pytest.fixture(scope="module")
 def whole(seen, brdf):
-    """All vectors, modes and coefficients."""
+    """All components, modes and coefficients."""
     return precompute(seen, brdf, progress=False, **WHOLE)
 
 
@@ -112,7 +112,7 @@ class Strangers(Executor):
         return future
 
 
-def test_all_vectors_modes_and_coefficients_are_the_uncompressed_transport(whole, exact, close):
+def test_all_components_modes_and_coefficients_are_the_uncompressed_transport(whole, exact, close):
     close(by_vertex(whole), exact, tolerance=HALF)
     assert whole.index.shape == (CLUSTERS, ALL)
     assert (whole.mode.shape, whole.core.shape) == ((CLUSTERS, ALL, 30), (CLUSTERS, 30, 10, TERMS))
@@ -133,15 +133,15 @@ def test_all_of_it_lights_as_uncompressed_transport_does(whole, brdf, expected, 
     assert np.count_nonzero(expected.any(1)) > 10
 
 
-def test_errors_fall_with_vectors_modes_and_coefficients(whole, exact):
+def test_errors_fall_with_components_modes_and_coefficients(whole, exact):
     size = np.linalg.norm(exact)
-    for name, counts in (("vectors", (1, 4)), ("modes", (1, 8)), ("count", (6, 100))):
+    for name, counts in (("components", (1, 4)), ("modes", (1, 8)), ("count", (6, 100))):
         error = [np.linalg.norm(by_vertex(whole.truncate(**{name: each})) - exact) / size for each in counts]
         assert 1 > error[0] > error[1] > HALF
 
 
-def test_the_first_vectors_are_the_best_of_their_number(whole, exact, importance, close):
-    found = by_vertex(whole.truncate(vectors=4)) * importance[:, None]
+def test_the_first_components_are_the_best_of_their_number(whole, exact, importance, close):
+    found = by_vertex(whole.truncate(components=4)) * importance[:, None]
     for vertex in np.asarray(whole.vertex).reshape(CLUSTERS, -1):
         # A repeated vertex counts twice.
         matrix = (exact[vertex] * importance[:, None]).reshape(len(vertex), -1)
@@ -180,13 +180,13 @@ def test_coefficients_are_chosen_by_energy_under_natural_light(whole, small, exa
 def test_remainders_are_those_of_numpys_singular_values(seen, brdf, whole, exact, importance):
     vertex = np.asarray(whole.vertex)[:10]
     options = {name: value for name, value in SMALL.items() if name != "clusters"}
-    index, mode, core, weight, after_vectors, after_modes = separable.clustered.compress(
+    index, mode, core, weight, after_components, after_modes = separable.clustered.compress(
         jnp.asarray(seen.seen(vertex)), seen.frame[vertex], brdf, **options
     )
     kept = (exact[vertex] * importance[:, None])[:, np.asarray(index)]
     u, value, _ = np.linalg.svd(kept.reshape(10, -1), full_matrices=False)
     total = np.sum(value**2)
-    np.testing.assert_allclose(after_vectors, 1 - np.cumsum([0, *value**2]) / total, atol=1e-5)
+    np.testing.assert_allclose(after_components, 1 - np.cumsum([0, *value**2]) / total, atol=1e-5)
     basis = np.einsum("mn,mkr->knr", u[:, :4], kept).reshape(100, -1)
     strength = np.linalg.svd(basis, compute_uv=False)[:8] ** 2
     np.testing.assert_allclose(after_modes, 1 - np.cumsum([0, *strength]) / total, atol=1e-5)
@@ -338,7 +338,7 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
         (darker, brdf, SMALL),
         (seen, other, SMALL),
         (seen, brdf, SMALL | {"keep": 99}),
-        (seen, brdf, SMALL | {"vectors": 3}),
+        (seen, brdf, SMALL | {"components": 3}),
         (seen, brdf, SMALL | {"clusters": 5}),
     ):
         with pytest.raises(ValueError, match=r"a\.prt holds arrays made from something else"):
@@ -350,13 +350,13 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
     [
         ({"clusters": 0}, "clusters must be between 1 and the 39 points, got 0"),
         ({"clusters": 40}, "clusters must be between 1 and the 39 points, got 40"),
-        ({"vectors": 0}, "vectors must be between 1 and the 10 vertices of a cluster, got 0"),
-        ({"vectors": 11}, "vectors must be between 1 and the 10 vertices of a cluster, got 11"),
+        ({"components": 0}, "components must be between 1 and the 10 vertices of a cluster, got 0"),
+        ({"components": 11}, "components must be between 1 and the 10 vertices of a cluster, got 11"),
         ({"keep": 0}, "keep must be between 1 and 384, got 0"),
         ({"keep": 385}, "keep must be between 1 and 384, got 385"),
-        ({"modes": 0}, "smaller of keep and vectors x terms, 30, got 0"),
-        ({"modes": 31}, "smaller of keep and vectors x terms, 30, got 31"),
-        ({"keep": 7}, "smaller of keep and vectors x terms, 7, got 30"),
+        ({"modes": 0}, "smaller of keep and components x terms, 30, got 0"),
+        ({"modes": 31}, "smaller of keep and components x terms, 30, got 31"),
+        ({"keep": 7}, "smaller of keep and components x terms, 7, got 30"),
         ({"member": np.arange(38)[None]}, "member must name all 39 vertices and no others, got 1 missing"),
         ({"member": np.arange(40)[None]}, "and numbers from 0 to 39"),
         ({"member": np.arange(-1, 39)[None]}, "and numbers from -1 to 38"),
@@ -367,7 +367,7 @@ def test_impossible_numbers_are_refused(seen, brdf, options, message):
         precompute(seen, brdf, progress=False, **WHOLE | options)
 
 
-@pytest.mark.parametrize(("name", "limit"), [("count", 100), ("modes", 8), ("vectors", 4), ("terms", 3)], ids=str)
+@pytest.mark.parametrize(("name", "limit"), [("count", 100), ("modes", 8), ("components", 4), ("terms", 3)], ids=str)
 def test_keeping_more_than_there_are_is_refused(small, name, limit):
     for value in (0, -1, limit + 1):
         with pytest.raises(ValueError, match=f"{name} must be between 1 and {limit}, got {value}"):

@@ -233,7 +233,7 @@ def seen():
 
 
 # Two clusters of ten vertices, two of nine. All is kept, so that what is left is the rounding of half precision.
-KEPT = {"clusters": 4, "vectors": 10, "modes": 30, "keep": ALL}
+KEPT = {"clusters": 4, "components": 10, "modes": 30, "keep": ALL}
 HALF = 2e-3
 
 
@@ -291,7 +291,7 @@ def test_clusters_of_a_black_brdf_are_black(seen, light):
 
 def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
     count = len(seen.position)
-    color = clustered_radiance(seen, glossy, light, clusters=count, vectors=1, modes=4)
+    color = clustered_radiance(seen, glossy, light, clusters=count, components=1, modes=4)
     close(color, all_texels(seen, glossy, light), tolerance=HALF)
 
 
