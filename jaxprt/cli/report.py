@@ -15,7 +15,7 @@ from jaxtyping import Array
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.recipes import Job, Recipe
+from jaxprt.relit.recipes import Recipe, Target
 from jaxprt.scene import Camera, Environment, Scene
 from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
@@ -216,10 +216,10 @@ def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[
     """Errors of one system by its sizes, on some vertices of the first part."""
     shading = of_part(view.scene.parts[0])
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    job = Job(view.scene.mesh, size=size, vertex=vertex, progress=False)
+    target = Target(view.scene.mesh, size=size, vertex=vertex, progress=False)
     blend = None if shading.blend is None else jax.tree.map(lambda each: each[vertex], shading.blend)
     rows = []
-    for sizes, system in TABLES[name](shading, job):
+    for sizes, system in TABLES[name](shading, target):
         rows.append({"system": name, **sizes, **_row(system, blend, view, truth)})
     return rows
 
@@ -238,19 +238,19 @@ def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> 
     return row
 
 
-def _separable(shading: Shading, job: Job):
+def _separable(shading: Shading, target: Target):
     """Systems by terms and kept coefficients."""
-    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, job)
+    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, target)
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
         if terms <= full.brdf.terms:
             short = full.transport.truncate(keep, terms=terms)
             yield {"terms": terms, "keep": keep}, SeparableSystem(short, full.brdf.truncate(terms))
 
 
-def _harmonic(shading: Shading, job: Job):
+def _harmonic(shading: Shading, target: Target):
     """Systems by degree, with a window and without."""
     degree = max(TABLE_DEGREES)
-    options = {"degree": degree, **job.traced(), "progress": False}
+    options = {"degree": degree, **target.traced(), "progress": False}
     full = harmonic.precompute(shading.mesh, **options)
     brdf = harmonic.tabulate(shading.brdf, degree=degree, knot=shading.knot)
     for degree, laplacian in itertools.product(TABLE_DEGREES, TABLE_LAPLACIAN):
@@ -260,13 +260,13 @@ def _harmonic(shading: Shading, job: Job):
         yield {"degree": degree, "laplacian": laplacian}, system
 
 
-def _lobe(shading: Shading, job: Job):
+def _lobe(shading: Shading, target: Target):
     """Systems by lobes and single texels."""
-    options = {"size": job.size, **job.traced(), "progress": False}
+    options = {"size": target.size, **target.traced(), "progress": False}
     seen = visibility.precompute(shading.mesh, **options)
-    job = Job(job.occluder, size=job.size, vertex=job.vertex, visible=seen, progress=False)
+    target = Target(target.occluder, size=target.size, vertex=target.vertex, visible=seen, progress=False)
     for lobes, texels in itertools.product(TABLE_LOBES, TABLE_TEXELS):
-        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, job)
+        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
 
 
 TABLES: dict[str, Callable] = {"separable": _separable, "harmonic": _harmonic, "lobe": _lobe}

@@ -13,7 +13,7 @@ from jaxprt.relit import reflection
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.planning import Plan, key_of, plan
-from jaxprt.relit.recipes import SYSTEMS, Job, Recipe, check
+from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.systems.protocol import Joined
@@ -77,12 +77,12 @@ def precompute(
     systems = []
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         at = folder and folder / f"{number}_{_file_name(part.name)}"
-        job = Job(mesh, size=size, path=at, executor=executor, progress=progress)
-        systems.append(recipes[part.name].make(shading, job))
+        target = Target(mesh, size=size, path=at, executor=executor, progress=progress)
+        systems.append(recipes[part.name].make(shading, target))
     reflected = None
     if bounces:
-        job = Job(mesh, path=folder and folder / f"{bounces}", executor=executor, progress=progress)
-        reflected = reflection.make(shadings, bounces, job)
+        target = Target(mesh, path=folder and folder / f"{bounces}", executor=executor, progress=progress)
+        reflected = reflection.make(shadings, bounces, target)
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
 
 

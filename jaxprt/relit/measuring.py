@@ -17,7 +17,7 @@ from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.recipes import Job, Recipe
+from jaxprt.relit.recipes import Recipe, Target
 from jaxprt.scene import Environment, Mesh, Scene, builtin
 from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol, reference, separable
@@ -148,7 +148,7 @@ class Sample(eqx.Module):
 
     Attributes:
         shading: The part.
-        job: Which vertices, and what they see.
+        target: Which vertices, and what they see.
         vertex_ratio: How many times as many the part has.
         judged: Which of them are judged.
         facing: Which of the judged ones face each view.
@@ -159,7 +159,7 @@ class Sample(eqx.Module):
     """
 
     shading: Shading
-    job: Job
+    target: Target
     vertex_ratio: float
     judged: np.ndarray
     facing: np.ndarray
@@ -182,22 +182,22 @@ class Sample(eqx.Module):
         seconds = time.perf_counter() - start
         few = max(_FEWEST, round(_JUDGED * count / total))
         judged = np.sort(np.random.default_rng(1).permutation(len(vertex))[:few])
-        job = Job(scene, size=size, vertex=vertex, visible=visible, progress=False)
+        target = Target(scene, size=size, vertex=vertex, visible=visible, progress=False)
         facing = _facing(visible, judged, views)
         exact = _exact(visible, judged, _exact_brdf(shading, vertex[judged]), environments, views)
         vertex_ratio = count / len(vertex)
-        return cls(shading, job, vertex_ratio, judged, facing, exact, tuple(environments), views, seconds)
+        return cls(shading, target, vertex_ratio, judged, facing, exact, tuple(environments), views, seconds)
 
     @property
     def blend(self) -> Blend | None:
         """What the sampled vertices are made of."""
-        whole, vertex = self.shading.blend, self.job.vertex
+        whole, vertex = self.shading.blend, self.target.vertex
         return None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
 
     def measure(self, recipe: Recipe) -> Candidate:
         """What a recipe brings and costs."""
         start = time.perf_counter()
-        system = recipe.make(self.shading, self.job)
+        system = recipe.make(self.shading, self.target)
         seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
         wrong = max(self._error(system, *each) for each in zip(self.environments, self.exact, strict=True))
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)

@@ -23,7 +23,7 @@ _STEPS = 4  # of harmonics for one of lobes, from knot to knot
 _VARYING = 0.02  # error of tables of harmonics of which roughness varies
 
 
-class Job(eqx.Module):
+class Target(eqx.Module):
     """What a part is made ready for, and where that is done.
 
     Attributes:
@@ -58,7 +58,7 @@ class Job(eqx.Module):
 class Recipe(Protocol):
     """Sizes for one system, and how a part is made ready with them."""
 
-    def make(self, shading: Shading, job: Job) -> System:
+    def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
         ...
 
@@ -74,12 +74,12 @@ class Lobes(eqx.Module):
     lobes: int = 12
     texels: int = 16
 
-    def make(self, shading: Shading, job: Job) -> System:
+    def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
-        if job.visible is None:
-            transport = lobe.precompute(shading.mesh, size=job.size, **job.traced(), **job.options("lobe"))
+        if target.visible is None:
+            transport = lobe.precompute(shading.mesh, size=target.size, **target.traced(), **target.options("lobe"))
         else:
-            transport = lobe.compress(job.visible)
+            transport = lobe.compress(target.visible)
         if isinstance(shading.brdf, Lambert):
             table = lobe.diffuse(shading.brdf.albedo)
         else:
@@ -100,14 +100,14 @@ class Harmonics(eqx.Module):
     degree: int = 4
     laplacian: float = 1.0
 
-    def make(self, shading: Shading, job: Job) -> System:
+    def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
-        options = {"degree": self.degree, "size": min(job.size, _HARMONIC_SIZE), **job.traced()}
+        options = {"degree": self.degree, "size": min(target.size, _HARMONIC_SIZE), **target.traced()}
         if isinstance(shading.brdf, Lambert):
-            vectors = harmonic.precompute_diffuse(shading.mesh, **options, **job.options(f"vectors_{self.degree}"))
+            vectors = harmonic.precompute_diffuse(shading.mesh, **options, **target.options(f"vectors_{self.degree}"))
             return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
         table = harmonic_table(shading, degree=self.degree)
-        matrices = harmonic.precompute(shading.mesh, **options, **job.options(f"matrices_{self.degree}"))
+        matrices = harmonic.precompute(shading.mesh, **options, **target.options(f"matrices_{self.degree}"))
         return harmonic.HarmonicSystem(matrices, table, self.laplacian)
 
 
@@ -124,13 +124,13 @@ class Terms(eqx.Module):
     keep: int = 96
     resolution: int = 48
 
-    def make(self, shading: Shading, job: Job) -> System:
+    def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
         check(self, shading)
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
-        keep = min(self.keep, 6 * job.size**2)
-        options = {"keep": keep, "size": job.size, **job.traced(), **job.options("separable")}
+        keep = min(self.keep, 6 * target.size**2)
+        options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
         return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
 
 
@@ -155,20 +155,20 @@ class Clusters(eqx.Module):
     texels: int = 16
     members: int = 225
 
-    def make(self, shading: Shading, job: Job) -> System:
+    def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
         check(self, shading)
-        visible = job.visible
+        visible = target.visible
         if visible is None:
-            options = {**job.traced(), **job.options("visibility")}
-            visible = visibility.precompute(shading.mesh, size=job.size, **options)
+            options = {**target.traced(), **target.options("visibility")}
+            visible = visibility.precompute(shading.mesh, size=target.size, **options)
         count = len(visible.position)
         clusters = max(1, round(count / self.members))
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
         components, keep = min(self.components, count // clusters), min(self.keep, 6 * visible.size**2)
         limits = {"components": components, "modes": min(self.modes, keep, components * terms), "keep": keep}
-        options = job.options("clusters")
+        options = target.options("clusters")
         transport = separable.clustered.precompute(visible, factored, clusters=clusters, **limits, **options)
         system = separable.SeparableSystem(transport, factored)
         return _bright(system, lobe.bits(lobe.compress(visible)), shading, self.texels, visible.size)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.recipes import Job, harmonic_table
+from jaxprt.relit.recipes import Target, harmonic_table
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions
@@ -25,20 +25,20 @@ _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, 
 _VIEWS = 16  # over whose angles albedo is averaged
 
 
-def make(shadings: Sequence[Shading], count: int, job: Job) -> PartBounces:
+def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces:
     """Precomputes reflected light between all parts.
 
     Args:
         shadings: What the parts are to systems.
         count: How many times light is reflected, 1 or 2.
-        job: Where that is done; occluder, size and vertices are not used.
+        target: Where that is done; occluder, size and vertices are not used.
 
     Returns:
         The system of reflected light alone.
     """
     mesh = _joined(shadings)
     paths = [_factored(each) for each in shadings]
-    tensor = bounces.precompute(mesh, paths, bounces=count, least=_LEAST, **job.options("bounces"))
+    tensor = bounces.precompute(mesh, paths, bounces=count, least=_LEAST, **target.options("bounces"))
     frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
     parts = [
         ReflectingPart(each.mesh.position, axes, harmonic_table(each, degree=DEGREE))
