@@ -162,13 +162,13 @@ def line(case: tuple[str, str, str], timing: harness.Timing, judge: "Judge", dra
 class Judge:
     """Two pictures by Mitsuba, and what a picture is off from them, where the object fills pixels."""
 
-    def __init__(self, scene: Scene, light: Environment, camera: Camera, samples: int):
-        parts = traced_parts(scene)
-        path_tracing.trace(parts, light, camera, samples=1)  # compiles
+    def __init__(self, scene: Scene, light: Environment, camera: Camera, samples: int, *, bounces: int = 0):
+        parts, depth = traced_parts(scene), 2 + bounces
+        path_tracing.trace(parts, light, camera, depth=depth, samples=1)  # compiles
         self.samples, drawn, seconds = samples, [], []
         for seed in (1, 2):
             start = time.perf_counter()
-            drawn.append(path_tracing.trace(parts, light, camera, samples=samples, seed=seed, sky=True))
+            drawn.append(path_tracing.trace(parts, light, camera, depth=depth, samples=samples, seed=seed, sky=True))
             seconds.append(time.perf_counter() - start)
         self.seconds = float(np.mean(seconds))
         triangle = np.asarray(raster.rasterize(scene.mesh, finer(camera)).triangle)

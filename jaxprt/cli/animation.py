@@ -106,24 +106,9 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
     return result
 
 
-def made(ready: Ready, view: View, *, reflected: bool) -> Made:
-    """The scene as the report takes it, with reflected light or with direct light alone."""
-    system = ready.system if reflected else ready.direct
-    return Made(system, materials(ready, view), {"scene": ready.cost})
-
-
-def reflect(ready: Ready, view: View, name: str, stops: float, output: Path) -> float:
-    """Writes the picture of one light with reflected light too; returns what share of the light that is."""
-    light, mesh, eye = view.lights[name], view.scene.mesh, view.camera.eye
-    direct, color = (made(ready, view, reflected=each).color(light, eye) for each in (False, True))
-    sky = background(light, image.ray_direction(view.camera))
-    picture = image.render(mesh, color, view.camera, background=sky)
-    files.write_exr(output / f"{name}_dynamic_bounces.exr", np.asarray(picture))
-    shown = image.display(image.expose(picture, stops=jnp.asarray(stops, picture.dtype)))
-    files.write_png(output / f"{name}_dynamic_bounces.png", np.asarray(shown))
-    first, both = (image.render(mesh, each, view.camera, background=None) for each in (direct, color))
-    total = float(jnp.sum(both))
-    return float(jnp.sum(both - first)) / total if total > 0 else 0.0
+def made(ready: Ready, view: View) -> Made:
+    """The scene as the report takes it."""
+    return Made(ready.direct, ready.system, materials(ready, view), {"scene": ready.cost})
 
 
 def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bool = True) -> list[Path]:

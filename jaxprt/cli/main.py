@@ -89,7 +89,12 @@ def _parser() -> argparse.ArgumentParser:
         "--system", choices=SYSTEMS, nargs="+", help="one, or several; planned (default) finds one for each part"
     )
     parser.add_argument("--error", type=float, help="relative error that the planned system must meet (default 0.05)")
-    parser.add_argument("--bounces", type=int, choices=[0, 1, 2], help="of light, in the dynamic system (default 2)")
+    parser.add_argument(
+        "--bounces",
+        type=int,
+        choices=[0, 1, 2],
+        help="of light between parts (default: planned: what is worth it, dynamic: 2, others: 0)",
+    )
     parser.add_argument(
         "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"
     )
@@ -132,9 +137,8 @@ def _check(options: argparse.Namespace) -> None:
             )
     if options.error is not None and "planned" not in (options.system or ["planned"]):
         raise ValueError("--error needs --system planned")
-    for name in ("animate", "bounces"):
-        if getattr(options, name) is not None and "dynamic" not in (options.system or ()):
-            raise ValueError(f"--{name} needs --system dynamic")
+    if options.animate is not None and "dynamic" not in (options.system or ()):
+        raise ValueError("--animate needs --system dynamic")
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -152,8 +156,7 @@ def _run(options: argparse.Namespace) -> None:
         if system == "dynamic":
             count = 2 if options.bounces is None else options.bounces
             changing = animation.prepare(view, options.output, terms=options.terms, reflections=count)
-            # The exact pictures have direct light alone, and so has what is compared with them.
-            made[system] = animation.made(changing, view, reflected=False)
+            made[system] = animation.made(changing, view)
         else:
             made[system] = _made(system, view, options)
     found["precompute"] = {system: each.cost for system, each in made.items()}
@@ -164,13 +167,12 @@ def _run(options: argparse.Namespace) -> None:
         name: report.compare(view, name, made, [each[number] for each in exact], seen, options.output)
         for number, name in enumerate(view.lights)
     }
-    if changing is not None:
-        made["dynamic"] = animation.made(changing, view, reflected=True)
-        for name, light in found["lights"].items() if changing.reflected is not None else ():
-            stops = light["exposure_stops"]
-            light["dynamic"]["reflected_fraction"] = animation.reflect(changing, view, name, stops, options.output)
-        if options.animate:
-            animation.animate(changing, view, options.output, frames=options.animate)
+    for (name, light), (system, each) in itertools.product(found["lights"].items(), made.items()):
+        if each.system is not each.direct:
+            fraction = report.reflect(view, name, system, each, light["exposure_stops"], options.output)
+            light[system]["reflected_fraction"] = fraction
+    if changing is not None and options.animate:
+        animation.animate(changing, view, options.output, frames=options.animate)
     found["times"] = {system: report.times(view, each) for system, each in made.items()}
     if options.table:
         vertex = report.sample(view, options.table)
@@ -188,7 +190,8 @@ def _made(system: str, view: View, options: argparse.Namespace) -> Made:
     """The scene, made ready by one system."""
     output = options.output / system
     if system == "planned":
-        return report.plan(view, output, error=0.05 if options.error is None else options.error)
+        error = 0.05 if options.error is None else options.error
+        return report.plan(view, output, error=error, bounces=options.bounces)
     recipe: Recipe
     if system == "separable":
         recipe = prt.relit.Terms(options.terms, options.keep)
@@ -196,7 +199,7 @@ def _made(system: str, view: View, options: argparse.Namespace) -> Made:
         recipe = prt.relit.Harmonics(options.order - 1, _LAPLACIAN[options.window])
     else:
         recipe = prt.relit.Lobes(options.lobes)
-    return report.make(view, recipe, output)
+    return report.make(view, recipe, output, bounces=options.bounces)
 
 
 def _view(options: argparse.Namespace) -> View:

@@ -50,41 +50,43 @@ class Made(NamedTuple):
     """A scene that one system has made ready.
 
     Attributes:
-        system: The system of all vertices.
-        materials: What it is relit with.
-        cost: What it took, for the report.
+        direct: The system of all vertices under direct light alone, as exact pictures have it.
+        system: The same with bounces, or `direct` without any.
+        materials: What they are relit with.
+        cost: What they took, for the report.
     """
 
+    direct: System
     system: System
     materials: Any
     cost: dict[str, Any]
 
     def color(self, light: Environment, eye: Array) -> Array:
-        """Radiance of all vertices."""
-        return protocol.radiance(self.system, light, eye=eye, materials=self.materials)
+        """Radiance of direct light of all vertices."""
+        return protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
 
 
-def plan(view: View, output: Path, *, error: float) -> Made:
+def plan(view: View, output: Path, *, error: float, bounces: int | None) -> Made:
     """Makes a scene ready by a plan, which is kept with all else: the same command goes on with the same one.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
     """
     lights = list(view.lights.values())
-    made = _made(view, output, error=error, environments=lights)
+    made = _made(view, output, error=error, environments=lights, bounces=bounces)
     for part in objects.load(output / "plan").part:
         made.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
     return made
 
 
-def make(view: View, recipe: Recipe, output: Path) -> Made:
+def make(view: View, recipe: Recipe, output: Path, *, bounces: int | None) -> Made:
     """Makes a scene ready by one recipe; what is finished is kept in a folder.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
     """
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    made = _made(view, output, system=recipe, size=size)
+    made = _made(view, output, system=recipe, size=size, bounces=bounces)
     for part in view.scene.parts:
         made.cost[part.name] = {"recipe": type(recipe).__name__, **vars(recipe)}
     return made
@@ -96,7 +98,9 @@ def _made(view: View, output: Path, **options: Any) -> Made:
         ready = relit.precompute(view.scene, path=output, **options)
     except ValueError as error:
         raise ValueError(f"{error}; here: name another --output" if found else str(error)) from error
-    return Made(ready, None, {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)})
+    direct = relit.RelitScene(ready.scene, ready.direct, ready.shading)
+    cost = {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)}
+    return Made(direct, direct if ready.bounces is None else ready, None, cost)
 
 
 def exact(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
@@ -177,6 +181,19 @@ def compare(
     return errors
 
 
+def reflect(view: View, name: str, system: str, made: Made, stops: float, output: Path) -> float:
+    """Writes the picture of one light with reflected light too; returns what fraction of the light that is."""
+    light, mesh, eye = view.lights[name], view.scene.mesh, view.camera.eye
+    direct = made.color(light, eye)
+    color = protocol.radiance(made.system, light, eye=eye, materials=made.materials)
+    sky = background(light, image.ray_direction(view.camera))
+    picture = image.render(mesh, color, view.camera, background=sky)
+    _write(output, f"{name}_{system}_bounces", picture, jnp.asarray(stops, picture.dtype), 1.0)
+    first, both = (image.render(mesh, each, view.camera, background=None) for each in (direct, color))
+    total = float(jnp.sum(both))
+    return float(jnp.sum(both - first)) / total if total > 0 else 0.0
+
+
 def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -> None:
     files.write_exr(output / f"{name}.exr", np.asarray(picture))
     shown = image.display(image.expose(picture * gain, stops=stops))
@@ -185,7 +202,7 @@ def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -
 
 def times(view: View, made: Made) -> dict[str, float]:
     """Median seconds of what a frame needs."""
-    system, materials, _ = made
+    system, materials = made.system, made.materials
     light, eye, mesh = next(iter(view.lights.values())), view.camera.eye, view.scene.mesh
 
     def arriving():

@@ -108,11 +108,8 @@ class Plan(eqx.Module):
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
             rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
-        shares = (
-            f"{part.name} " + " and ".join(f"{100 * each:.1f} %" for each in own)
-            for part, own in zip(self.part, self.reflected.T, strict=True)
-        )
-        rows.append(f"reflected light, once and more, twice and more: {', '.join(shares)}")
+        for part, (once, twice) in zip(self.part, self.reflected.T, strict=True):
+            rows.append(f"{part.name}: {100 * once:.1f} % of its light is reflected, {100 * twice:.1f} % twice or more")
         rows.append(f"bounces: {self.bounces}")
         total = f"{100 * self.error:.1f} %, {1e3 * self.seconds:.1f} ms a frame, {self.nbytes / 1e6:.2f} MB"
         slow = "" if self.seconds * self.rate <= 1 else f"; slower than the {self.rate:g} frames per second asked for"
@@ -172,7 +169,7 @@ def plan(
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         parts.append(PartPlan(part.name, count, chosen, considered))
-    reflected = reflection.shares(shadings, environments)
+    reflected = reflection.fractions(shadings, environments)
     bounces = reflection.needed(reflected, error)
     return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key_of(scene, environments))
 

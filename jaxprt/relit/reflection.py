@@ -23,6 +23,7 @@ _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _LEAST = 1e-3  # of what arrives: functions that bring less are left out
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
 _VIEWS = 16  # over whose angles albedo is averaged
+_RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
 
 
 def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces:
@@ -47,7 +48,7 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
     return PartBounces(tensor, tuple(parts))
 
 
-def shares(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
+def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
     """How much of the light that each part sends on was reflected once at least before, and twice at least.
 
     An estimate: surfaces count as matte, with the mean albedo of their parts, and three bounces or more as none.
@@ -79,10 +80,10 @@ def shares(shadings: Sequence[Shading], environments: Sequence[Environment]) -> 
     return result
 
 
-def needed(shares: Float[np.ndarray, "b p"], error: float) -> int:
+def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int:
     """How many bounces leave no more than an error of any part's light out; all that there are if none does."""
-    enough = np.flatnonzero(np.all(shares <= error, 1))
-    return int(enough[0]) if enough.size else len(shares)
+    enough = np.flatnonzero(np.all(reflected <= error, 1))
+    return int(enough[0]) if enough.size else len(reflected)
 
 
 def _joined(shadings: Sequence[Shading]) -> Mesh:
@@ -102,8 +103,8 @@ def _albedo(shading: Shading) -> Float[np.ndarray, "3"]:
     """Mean albedo of a part, over its vertices and over views from above."""
     cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Evenly spread in projected solid angle.
     wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
-    table = harmonic.tabulate(_still(shading), degree=0)
-    channel = np.sqrt(4 * np.pi) * np.mean(table.coefficients(jnp.asarray(wo))[0], -1)
+    sent = harmonic.table.project(_still(shading), jnp.asarray(wo), degree=0, rings=_RINGS, sectors=_SECTORS)
+    channel = np.sqrt(4 * np.pi) * np.mean(sent[0], -1)
     color = channel if shading.blend is None else channel @ np.mean(shading.blend.weight, 0)
     return np.clip(np.broadcast_to(color, 3), 0, 1)
 

@@ -94,7 +94,7 @@ def test_of_what_meets_the_error_at_the_rate_the_smallest_is_chosen(planned):
 
 def test_what_is_matte_is_lit_by_transfer_vectors(planned, ready):
     assert isinstance(planned.recipes["ground"], Harmonics)
-    assert isinstance(ready.system.part[1], prt.harmonic.DiffuseSystem)
+    assert isinstance(ready.direct.part[1], prt.harmonic.DiffuseSystem)
 
 
 def test_the_table_names_every_part_and_marks_one_choice_of_each(planned):

@@ -18,6 +18,7 @@ from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, v
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.sphere import directions
 from jaxprt.systems import protocol
 
 pytestmark = pytest.mark.usefixtures("coarse")
@@ -141,6 +142,17 @@ def reflected(name: str, model: str) -> tuple[prt.System, Any]:
     return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
 
 
+def between_parts(name: str, model: str) -> tuple[prt.System, Any]:
+    options = {"components": 8, "modes": 12, "edge": 2, "size": 4, "progress": False}
+    whole = mesh(name)
+    table = harmonic.tabulate(MODELS[model], degree=3, error=0.5)
+    frame, region = directions.frame(whole.normal, whole.tangent), np.asarray(whole.region)
+    numbers = range(region.max() + 1)
+    tensor = bounces.precompute(whole, [factored(model)] * len(numbers), **options)
+    parts = [bounces.ReflectingPart(whole.position[region == n], frame[region == n], table) for n in numbers]
+    return bounces.PartBounces(tensor, parts), None
+
+
 def total(name: str, model: str) -> tuple[prt.System, Any]:
     indirect, materials = reflected(name, model)
     return prt.total(indirect.direct, indirect), materials
@@ -156,6 +168,7 @@ MADE = {
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
     "dynamic": Promise(changing, 0.02, None, linear=False),
     "bounces": Promise(reflected, None, None),
+    "bounces, of parts": Promise(between_parts, None, None),
     "dynamic and bounces": Promise(total, None, None, linear=False),
 }
 each_system = pytest.mark.parametrize("name", MADE)
@@ -286,7 +299,7 @@ def test_a_mesh_of_one_triangle_is_lit(name):
     color = shown(case, light())
     assert color.shape == (3, 3)
     assert np.isfinite(color).all()
-    assert color.any() == (name != "bounces")
+    assert color.any() == (not name.startswith("bounces"))
 
 
 @each_system
@@ -306,7 +319,7 @@ def test_what_is_of_another_kind_is_refused_by_what_makes_it(name):
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_lights_of_another_size_are_refused(name):
-    if "harmonic" in name or name == "bounces":
+    if "harmonic" in name or name.startswith("bounces"):
         pytest.skip("takes lights of any size that it can reduce")
     with pytest.raises(ValueError, match=r"light('s faces)? must"):
         made(name).system.light(Environment(jnp.ones((6, 16, 16, 3))))

@@ -1,0 +1,120 @@
+"""Light between the parts of a scene: a bowl, whose light is known in closed form, blends of channels, and bad input.
+
+Every point of a bowl that is half a sphere sees the bowl over half of its horizon, weighted by the cosine, and the sky
+over the other half. Under a sky of radiance 1 the irradiance is pi / 2, and each bounce off albedo a is a / 2 of the
+one before.
+"""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import bounces, harmonic, separable
+from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.brdf.varying import Channels
+from jaxprt.relit import reflection
+from jaxprt.relit.channels import of_part
+from jaxprt.scene import Environment, Mesh, builtin
+from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.sphere import directions
+from jaxprt.systems.bounces import PartBounces, ReflectingPart
+
+pytestmark = pytest.mark.usefixtures("coarse")
+
+ALBEDO = 0.8
+EYE = jnp.array([0.3, 3.0, 0.2])
+GLOSSY = CookTorrance(diffuse=0.3, specular=0.7, roughness=0.5, f0=0.5)
+SKY = Environment(jnp.ones((6, 8, 8, 3)))
+
+
+@functools.cache
+def bowl() -> Mesh:
+    """Half a sphere, seen from inside."""
+    ball = builtin.sphere(rings=16, sectors=20)
+    low = np.all(np.asarray(ball.position)[np.asarray(ball.face), 1] < 1e-3, 1)
+    used, face = np.unique(np.asarray(ball.face)[low][:, ::-1], return_inverse=True)
+    return make_mesh(ball.position[used], face.reshape(-1, 3), normal=-np.asarray(ball.normal)[used])
+
+
+@functools.cache
+def corner() -> Mesh:
+    """Two squares that meet at a right angle, one region each."""
+    floor = builtin.plane(cells=5)
+    wall = make_mesh(np.asarray(floor.position)[:, [0, 2, 1]] * [1, -1, 1] + [0, 1, -1], floor.face)
+    return join([floor, wall])
+
+
+def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> PartBounces:
+    """Reflected light between the regions of a mesh."""
+    factored = [separable.factor(each, terms=terms, resolution=16) for each in brdfs]
+    sizes = {"components": 40, "modes": 24, "edge": 2, "size": 16, "progress": False}
+    tensor = bounces.precompute(mesh, factored, bounces=count, **sizes)
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    own = [np.asarray(mesh.region) == number for number in range(len(brdfs))]
+    tables = [harmonic.tabulate(each, degree=3, error=0.5) for each in brdfs]
+    parts = zip(own, tables, strict=True)
+    return PartBounces(tensor, tuple(ReflectingPart(mesh.position[at], frame[at], table) for at, table in parts))
+
+
+def test_a_bowl_has_the_light_of_the_closed_form():
+    system = made(bowl(), [Lambert(ALBEDO)], count=2, terms=1)
+    color = np.asarray(prt.radiance(system, SKY, eye=EYE))
+    inside = np.asarray(bowl().position)[:, 1] < -0.1  # At the rim half of the surface around a vertex is missing.
+    once = ALBEDO / 2
+    np.testing.assert_allclose(color[inside], once * (once + once**2), rtol=0.06)
+    np.testing.assert_allclose(color[inside].mean(), once * (once + once**2), rtol=0.02)
+
+
+def test_what_bounces_bring_is_estimated_as_the_closed_form_has_it():
+    shading = of_part(prt.Part("bowl", bowl(), Lambert(ALBEDO)))
+    found = reflection.fractions([shading], [SKY])
+    once = ALBEDO / 2
+    expected = np.array([once + once**2, once**2]) / (1 + once + once**2)
+    np.testing.assert_allclose(found[:, 0], expected, rtol=0.03)
+    assert [reflection.needed(found, each) for each in (0.5, 0.2, 0.01)] == [0, 1, 2]
+
+
+def test_weighted_channels_reflect_as_the_brdf_that_they_add_up_to(close):
+    mesh, weight = corner(), np.array([[0.9, 0.2, 0.1], [0.3, 0.5, 0.8]], np.float32)
+    channels = Channels((Lambert(1.0), GLOSSY), jnp.ones(2))
+    count = len(mesh.position) // 2
+    blend = prt.Blend(jnp.broadcast_to(jnp.asarray(weight), (count, 2, 3)))
+    color = prt.radiance(made(mesh, [channels] * 2, terms=20), SKY, eye=EYE, materials=[blend] * 2)
+    for each in range(3):
+        whole = CookTorrance(
+            diffuse=weight[0, each] + 0.3 * weight[1, each], specular=0.7 * weight[1, each], roughness=0.5, f0=0.5
+        )
+        close(color[:, each], prt.radiance(made(mesh, [whole] * 2, terms=20), SKY, eye=EYE)[:, 0], tolerance=0.01)
+
+
+def test_what_a_part_sends_to_others_has_its_mean_color():
+    mesh = corner()
+    system = made(mesh, [Lambert(1.0)] * 2, terms=1)
+    count = len(mesh.position) // 2
+    white = prt.Blend(jnp.ones((count, 1, 3)))
+    half = jnp.where(jnp.arange(count)[:, None] % 2 == 0, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+    color = prt.radiance(system, SKY, eye=EYE, materials=[prt.Blend(half[:, None]), white])
+    plain = prt.radiance(system, SKY, eye=EYE, materials=[white, white])
+    area = np.asarray(system.tensor.area)[:count]
+    mean = area @ np.asarray(half) / area.sum()
+    np.testing.assert_allclose(color[count:], plain[count:] * mean, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_does_not_fit_is_refused():
+    mesh, count = corner(), len(corner().position) // 2
+    system = made(mesh, [Lambert(1.0)] * 2, terms=1)
+    with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
+        ReflectingPart(mesh.position, system.part[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
+    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2, 0 of them sets"):
+        PartBounces(system.tensor, system.part[:1])
+    longer = ReflectingPart(mesh.position, jnp.eye(3) + 0 * mesh.position[:, :, None], system.part[0].brdf)
+    with pytest.raises(ValueError, match=rf"must be of the parts' {3 * count} vertices, got {2 * count}"):
+        PartBounces(system.tensor, (system.part[0], longer))
+    with pytest.raises(TypeError, match="materials must be a list, one for each of 2 parts"):
+        system.view(EYE, [None])
+    with pytest.raises(ValueError, match=rf"must have weights \[{count} vertices, 1 channels, c\]"):
+        system.shade(system.light(SKY), [prt.Blend(jnp.ones((count, 2, 3))), None])
