@@ -110,11 +110,11 @@ def test_open_diffuse_vertices_have_the_cosine_kernel_in_closed_form(random, clo
 def test_any_visibility_gives_the_sum_over_fine_texels(random, close):
     seen, frame, fine = visible(random, 2), frames(random, 2), 16
     flux = np.maximum(directions.to_local(frame, cubemap.vector_area(size=SIZE).reshape(-1, 3))[..., 2], 0)
-    visible = np.asarray(seen) / 16
-    visible = np.where(flux > 0, visible, np.sum(visible * flux, 1, keepdims=True) / np.sum(flux, 1, keepdims=True))
-    visible = visible.reshape(-1, 6, SIZE, 1, SIZE, 1) * np.ones((fine, 1, fine))
+    fraction = np.asarray(seen) / 16
+    fraction = np.where(flux > 0, fraction, np.sum(fraction * flux, 1, keepdims=True) / np.sum(flux, 1, keepdims=True))
+    fraction = fraction.reshape(-1, 6, SIZE, 1, SIZE, 1) * np.ones((fine, 1, fine))
     wi = cubemap.direction(size=SIZE * fine).reshape(-1, 3)
-    weight = visible.reshape(2, -1) * np.asarray(cubemap.solid_angle(size=SIZE * fine)).reshape(-1)
+    weight = fraction.reshape(2, -1) * np.asarray(cubemap.solid_angle(size=SIZE * fine)).reshape(-1)
     world = np.asarray(harmonics.evaluate(wi, degree=3), float)
     local = np.asarray(harmonics.evaluate(directions.to_local(frame, wi), degree=3), float)
     expected = np.einsum("bd,bdo,di->boi", weight, local, world, optimize=True)
