@@ -15,7 +15,7 @@ from jaxtyping import Array
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.recipes import Recipe, Target
+from jaxprt.relit.recipes import Known, Recipe, Target
 from jaxprt.scene import Camera, Environment, Scene
 from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
@@ -281,7 +281,7 @@ def _lobe(shading: Shading, target: Target):
     """Systems by lobes and single texels."""
     options = {"size": target.size, **target.traced(), "progress": False}
     seen = visibility.precompute(shading.mesh, **options)
-    target = Target(target.occluder, size=target.size, vertex=target.vertex, visible=seen, progress=False)
+    target = Target(target.occluder, size=target.size, vertex=target.vertex, known=Known(seen), progress=False)
     for lobes, texels in itertools.product(TABLE_LOBES, TABLE_TEXELS):
         yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
 

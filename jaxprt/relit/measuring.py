@@ -17,7 +17,7 @@ from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.recipes import Recipe, Target
+from jaxprt.relit.recipes import Known, Recipe, Target
 from jaxprt.scene import Environment, Mesh, Scene, builtin
 from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol, reference, separable
@@ -38,7 +38,7 @@ class Candidate(eqx.Module):
         error: Relative L2 error of radiance, under the worst of the lights.
         seconds: Time of a frame with new light and new view on this machine, without drawing.
         nbytes: Size of transport and BRDF in bytes.
-        precompute_seconds: Time of precomputation on this machine.
+        precompute_seconds: Time of precomputation on this machine, without what candidates share.
     """
 
     recipe: Any
@@ -182,7 +182,7 @@ class Sample(eqx.Module):
         seconds = time.perf_counter() - start
         few = max(_FEWEST, round(_JUDGED * count / total))
         judged = np.sort(np.random.default_rng(1).permutation(len(vertex))[:few])
-        target = Target(scene, size=size, vertex=vertex, visible=visible, progress=False)
+        target = Target(scene, size=size, vertex=vertex, known=Known(visible), progress=False)
         facing = _facing(visible, judged, views)
         exact = _exact(visible, judged, _exact_brdf(shading, vertex[judged]), environments, views)
         vertex_ratio = count / len(vertex)
@@ -193,6 +193,11 @@ class Sample(eqx.Module):
         """What the sampled vertices are made of."""
         whole, vertex = self.shading.blend, self.target.vertex
         return None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
+
+    def least_bytes(self, recipe: Any) -> int:
+        """Bytes that a recipe has at least for the whole part."""
+        count = len(self.shading.mesh.position)
+        return recipe.least_bytes(self.shading, vertices=count, size=self.target.size)
 
     def measure(self, recipe: Recipe) -> Candidate:
         """What a recipe brings and costs."""

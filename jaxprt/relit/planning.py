@@ -23,7 +23,7 @@ from jaxprt.scene import Environment, Scene
 from jaxprt.visibility import blocks
 
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
-_PYRAMID, _BITS = 5900, 3072  # least bytes of a vertex of lobes, and of terms with single texels
+_SAVING = 0.1  # of the bytes: what is worth measuring another candidate for
 
 # Steps up in size, the cheapest first. Terms, resolution, components, modes, coefficients and texels are in balance.
 _DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
@@ -180,23 +180,31 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
 
 
 def _considered(sample: Sample, error: float, seconds: float):
-    """Candidates of each system: by bisection, those around the first step of its ladder that meets the error."""
+    """Candidates of each system: by bisection, those around the first step of its ladder that meets the error.
+
+    Steps that must have more bytes than what meets the error and the rate already are left out, and so is a search
+    among smaller steps that could not save a tenth.
+    """
     if isinstance(sample.shading.brdf, Lambert):
-        ladders = [(_DIFFUSE, 0)]
+        ladders: list[tuple] = [_DIFFUSE]
     else:
-        ladders = [(_HARMONIC, 0), (_LOBES, _PYRAMID)] + ([] if sample.shading.knot else [(_TERMS, _BITS)])
+        ladders = [_HARMONIC, _LOBES] + ([] if sample.shading.knot else [_TERMS])
     fewest = math.inf
-    for ladder, least in ladders:
-        if least * len(sample.shading.mesh.position) > fewest:
-            continue  # Nothing of this system is as small as what meets the error already.
+    for ladder in ladders:
+        least = [sample.least_bytes(recipe) for recipe in ladder]
         low, high = 0, len(ladder)
         while low < high:  # Errors fall along a ladder.
             middle = (low + high) // 2
+            if least[middle] > fewest:
+                high = middle
+                continue
             each = sample.measure(ladder[middle])
             yield each
-            if each.error * MARGIN <= error:
-                high = middle
-                if each.seconds <= seconds:
-                    fewest = min(fewest, each.nbytes)
-            else:
+            if each.error * MARGIN > error:
                 low = middle + 1
+                continue
+            high = middle
+            if each.seconds <= seconds:
+                fewest = min(fewest, each.nbytes)
+                if least[0] > (1 - _SAVING) * each.nbytes:
+                    break

@@ -1,5 +1,6 @@
 """How to make a part of a scene ready for a system: the sizes, and the calls that they take."""
 
+import functools
 import os
 import pathlib
 from collections.abc import Callable
@@ -15,12 +16,39 @@ from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Mesh
 from jaxprt.systems import bright_texels, harmonic, lobe, separable
+from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.protocol import System
+from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import StoredVisibility
 
 _HARMONIC_SIZE = 32  # texels along an edge of the visibility: as many as low degrees need
 _STEPS = 4  # of harmonics for one of lobes, from knot to knot
 _VARYING = 0.02  # error of tables of harmonics of which roughness varies
+
+
+class Known:
+    """What several recipes for one part share, made when one of them needs it first.
+
+    Attributes:
+        visible: What the vertices see.
+    """
+
+    def __init__(self, visible: StoredVisibility):
+        """Keeps the visibility."""
+        self.visible = visible
+        self._factored: dict[int, SeparableBrdf] = {}
+
+    @functools.cached_property
+    def pyramid(self) -> LobeTransport:
+        """The pyramids of the visibility."""
+        return lobe.compress(self.visible)
+
+    def factored(self, brdf: Callable, terms: int, resolution: int) -> SeparableBrdf:
+        """The part's BRDF in terms: the first of those that were made already, if these are enough."""
+        made = self._factored.get(resolution)
+        if made is None or made.terms < terms:
+            made = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
+        return made.truncate(terms)
 
 
 class Target(eqx.Module):
@@ -30,7 +58,7 @@ class Target(eqx.Module):
         occluder: What casts shadows: all parts.
         size: Edge of the light's cubemap faces in texels.
         vertex: Numbers of the vertices to light; all if None.
-        visible: What these see, if it is known already. `Lobes` and `Clusters` then trace no rays; others do.
+        known: What is known already. `Lobes` and `Clusters` then trace no rays; others do.
         path: What the names of folders begin with; None keeps nothing.
         executor: Where blocks are computed; this machine's cores if None.
         progress: Whether to show progress bars.
@@ -39,7 +67,7 @@ class Target(eqx.Module):
     occluder: Mesh
     size: int = 64
     vertex: np.ndarray | None = None
-    visible: StoredVisibility | None = None
+    known: "Known | None" = None
     path: str | os.PathLike | None = None
     executor: Executor | None = None
     progress: bool = True
@@ -76,15 +104,19 @@ class Lobes(eqx.Module):
 
     def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
-        if target.visible is None:
+        if target.known is None:
             transport = lobe.precompute(shading.mesh, size=target.size, **target.traced(), **target.options("lobe"))
         else:
-            transport = lobe.compress(target.visible)
+            transport = target.known.pyramid
         if isinstance(shading.brdf, Lambert):
             table = lobe.diffuse(shading.brdf.albedo)
         else:
             table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
+
+    def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
+        """Bytes of the pyramids."""
+        return vertices * lobe.pyramid.scales(size).total
 
 
 class Harmonics(eqx.Module):
@@ -109,6 +141,11 @@ class Harmonics(eqx.Module):
         table = harmonic_table(shading, degree=self.degree)
         matrices = harmonic.precompute(shading.mesh, **options, **target.options(f"matrices_{self.degree}"))
         return harmonic.HarmonicSystem(matrices, table, self.laplacian)
+
+    def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
+        """Bytes of the vectors or matrices."""
+        terms = (self.degree + 1) ** 2
+        return 4 * vertices * (terms if isinstance(shading.brdf, Lambert) else terms**2)
 
 
 class Terms(eqx.Module):
@@ -158,20 +195,32 @@ class Clusters(eqx.Module):
     def make(self, shading: Shading, target: Target) -> System:
         """The system of a part."""
         check(self, shading)
-        visible = target.visible
-        if visible is None:
+        known = target.known
+        if known is None:
             options = {**target.traced(), **target.options("visibility")}
-            visible = visibility.precompute(shading.mesh, size=target.size, **options)
-        count = len(visible.position)
-        clusters = max(1, round(count / self.members))
-        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
-        factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
-        components, keep = min(self.components, count // clusters), min(self.keep, 6 * visible.size**2)
-        limits = {"components": components, "modes": min(self.modes, keep, components * terms), "keep": keep}
-        options = target.options("clusters")
-        transport = separable.clustered.precompute(visible, factored, clusters=clusters, **limits, **options)
+            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
+        visible = known.visible
+        clusters, terms, sizes = self._sizes(shading, len(visible.position), visible.size)
+        factored = known.factored(shading.brdf, terms, self.resolution)
+        options = {**sizes, **target.options("clusters")}
+        transport = separable.clustered.precompute(visible, factored, clusters=clusters, **options)
         system = separable.SeparableSystem(transport, factored)
-        return _bright(system, lobe.bits(lobe.compress(visible)), shading, self.texels, visible.size)
+        return _bright(system, lobe.bits(known.pyramid), shading, self.texels, visible.size)
+
+    def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
+        """Bytes of the visibility of single texels, weights, cores and modes."""
+        clusters, terms, sizes = self._sizes(shading, vertices, size)
+        components, modes, keep = sizes.values()
+        bits = 6 * size**2 // 8 if self.texels else 0
+        return vertices * (bits + 4 * components) + 2 * clusters * modes * (keep + components * terms)
+
+    def _sizes(self, shading: Shading, vertices: int, size: int) -> tuple[int, int, dict[str, int]]:
+        """Clusters, terms, and options of the compression, as far as vertices and texels allow them."""
+        clusters = max(1, round(vertices / self.members))
+        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
+        components, keep = min(self.components, vertices // clusters), min(self.keep, 6 * size**2)
+        modes = min(self.modes, keep, components * terms)
+        return clusters, terms, {"components": components, "modes": modes, "keep": keep}
 
 
 SYSTEMS: dict[str, Recipe] = {
