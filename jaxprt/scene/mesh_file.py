@@ -12,6 +12,7 @@ from jaxprt.scene import gltf_file, gltf_geometry
 from jaxprt.scene.geometry import Geometry, joined
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
+_COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # Names may hold a #, as in Blender's "Material_#25".
 
 
 def read(path: pathlib.Path, *, groups: bool) -> Geometry:
@@ -85,7 +86,7 @@ def _obj_text(path: pathlib.Path) -> str:
     if b"\0" in content:
         raise ValueError(f"{path} must be an undamaged OBJ file, got one that is not text")
     text = content.decode(errors="replace").replace("\t", " ").replace("\r\n", "\n").replace("\\\n", " ")
-    lines = [line.strip() for line in text.splitlines()]
+    lines = [statement(line) for line in text.splitlines()]
     count = {"v": 0, "vt": 0, "vn": 0}
     absolute = lines.copy()
     faces = []  # Line number, number of corners, lowest and highest vertex, and texture coordinate if any.
@@ -93,6 +94,7 @@ def _obj_text(path: pathlib.Path) -> str:
         kind, _, rest = line.partition(" ")
         if kind in count:
             count[kind] += 1
+            absolute[number] = line.partition("#")[0]
         elif kind == "f":
             corners = rest.partition("#")[0].split()
             if "-" in rest or "#" in rest:
@@ -121,6 +123,11 @@ def _obj_text(path: pathlib.Path) -> str:
         corners = [corner.split("/") for corner in absolute[number].partition("#")[0].split()[1:]]
         absolute[number] = "f " + " ".join("//".join([each[0], *each[2:]]) for each in corners)
     return "\n".join(absolute)
+
+
+def statement(line: str) -> str:
+    """A line of an OBJ or MTL file without its comment, which starts with a # that stands alone, or the line."""
+    return _COMMENT.sub("", line.strip()).strip()
 
 
 def _whole(index: str) -> int:

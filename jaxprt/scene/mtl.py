@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxprt.files import images
 from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.mesh_file import statement
 
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
 _NUMBERS = {"Ns", "Ni", "Pr", "Pm", "illum"}
@@ -44,7 +45,7 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
     name, files, found = None, [], {}
     ignored: set[str] = set()
     for line in path.read_bytes().decode(errors="replace").splitlines():
-        key, _, rest = line.replace("\t", " ").strip().partition(" ")
+        key, _, rest = statement(line).replace("\t", " ").partition(" ")
         if key == "usemtl":
             name = rest.strip()
         elif key == "mtllib":
@@ -88,13 +89,13 @@ def read(path: pathlib.Path) -> tuple[dict[str, TexturedMaterial], set[str]]:
     name = None
     lines = path.read_bytes().decode(errors="replace").splitlines()
     for line in [*lines, "newmtl"]:
-        key, *rest = line.partition("#")[0].split() or [""]
+        key, *rest = statement(line).split() or [""]
         if key == "newmtl":
             if name is not None:
                 material[name] = _material(statements, path, name, ignored)
             name, statements = " ".join(rest), {}
         elif key:
-            statements[key] = rest
+            statements[key] = rest if key in _MAPS else " ".join(rest).partition("#")[0].split()
     return material, ignored
 
 

@@ -354,6 +354,25 @@ def test_odd_spellings_of_an_obj_are_read(tmp_path):
     assert mesh.face.shape == (4, 3)
 
 
+def test_comments_after_the_statements_of_an_obj_are_no_part_of_them(tmp_path):
+    lines = [
+        "v 0 0 0",
+        "v 1 0 0",
+        "v 0 1 0",
+        "vt 0 0",
+        "vt 1 0",
+        "vt 0 1",
+        "vn 0 0 1",
+        "usemtl a",
+        "f 1/1/1 2/2/1 3/3/1",
+    ]
+    plain = load_mesh(write(tmp_path, "plain.obj", "\n".join(lines)))
+    commented = load_mesh(write(tmp_path, "commented.obj", "\n".join(f"{line} # v 5 6 7" for line in ["#", *lines])))
+    for name in ("position", "face", "normal", "texture"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(commented, name))
+    np.testing.assert_array_equal(plain.position, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32))
+
+
 @pytest.mark.parametrize("groups", [False, True])
 def test_nodes_of_a_scene_are_placed_and_regions_are_materials_or_nodes(tmp_path, groups, close):
     def part(name):

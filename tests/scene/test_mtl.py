@@ -78,6 +78,19 @@ def test_maps_lie_as_the_file_has_them_and_options_move_and_clamp_them(tmp_path)
     np.testing.assert_allclose(upper_right.metallic, [0], atol=1e-6)  # Beyond the edge: green.
 
 
+def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):
+    write_png(tmp_path / "c#1.png", IMAGE)
+    materials = "newmtl M_#1 # first\nKd 1 0 0 # red\nmap_Kd c#1.png # four colors\nnewmtl M_#2 #\nKd 0 1 0#green\n"
+    path = write(tmp_path, materials, f"usemtl M_#1 # first\n{FACE}usemtl M_#2\n{FACE}usemtl M_#1\n{FACE}")
+    path.write_text(path.read_text().replace("scene.mtl", "scene.mtl # materials"))
+    first, second = load_scene(path).parts  # Without a warning of anything missing.
+    assert (first.name, second.name) == ("M_#1", "M_#2")
+    assert (len(first.mesh.face), len(second.mesh.face)) == (4, 2)
+    np.testing.assert_array_equal(first.material.base_color, [1, 0, 0])
+    np.testing.assert_array_equal(second.material.base_color, [0, 1, 0])
+    assert first.material.base_color_texture is not None
+
+
 def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
     statements = "Kd 2 1 1\nd 0.5\nbump a.png\nmap_Kd absent.png\nmap_Ke text.png\naniso 1\n"
     (tmp_path / "text.png").write_text("no picture")
