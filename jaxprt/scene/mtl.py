@@ -2,7 +2,9 @@
 
 import math
 import pathlib
+import re
 import warnings
+from collections.abc import Collection
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,6 +27,9 @@ _MAPS = {
 _ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # Numbers that options of maps may have; all others have one word.
 _SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # Ambient light is computed; the rest is of transparent things.
 _OPAQUE = {"d": 1.0, "Tr": 0.0}
+_BLENDER = re.compile(
+    r"# Blender (v?)(\d+)\.(\d+)"
+)  # How an OBJ file of Blender begins; with v that of its older exporter.
 
 
 def matte() -> TexturedMaterial:
@@ -44,7 +49,8 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
     order: dict[str | None, None] = {}
     name, files, found = None, [], {}
     ignored: set[str] = set()
-    for line in path.read_bytes().decode(errors="replace").splitlines():
+    lines = path.read_bytes().decode(errors="replace").splitlines()
+    for line in lines:
         key, _, rest = statement(line).replace("\t", " ").partition(" ")
         if key == "usemtl":
             name = rest.strip()
@@ -55,7 +61,7 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
     for file in files:
         for each in [file] if (path.parent / file).is_file() else file.split():
             if (path.parent / each).is_file():
-                material, more = read(path.parent / each)
+                material, more = read(path.parent / each, blender=_exponent(lines[0]))
                 found, ignored = material | found, ignored | more
             else:
                 ignored.add(f"mtllib ({path.parent / each}, which does not exist)")
@@ -65,7 +71,18 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
     return [each or "default" for each in order], [found.get(each or "", matte()) for each in order]
 
 
-def read(path: pathlib.Path) -> tuple[dict[str, TexturedMaterial], set[str]]:
+def _exponent(line: str) -> float | None:
+    """The exponent Ns that Blender gives to a roughness of 0, by the first line of its OBJ file; None for others.
+
+    Before 2.80 Blender's materials were Phong's.
+    """
+    found = _BLENDER.match(line)
+    if found is None or (version := (int(found[2]), int(found[3]))) < (2, 80):
+        return None
+    return 1000.0 if version >= (3, 3) and not found[1] else 900.0
+
+
+def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str, TexturedMaterial], set[str]]:
     """The materials of an MTL file.
 
     Kd is the base color; map_Kd multiplies it. Where there is Pr or Pm (roughness and metalness), these and Ni make
@@ -74,8 +91,14 @@ def read(path: pathlib.Path) -> tuple[dict[str, TexturedMaterial], set[str]]:
     alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007, "Microfacet models for refraction through
     rough surfaces", section 5.2).
 
+    Blender 2.80 and newer instead writes its principled material as Ns = `blender` (1 - roughness)^2, Ks = twelve and a
+    half times the reflectance at normal incidence, and metalness as Ka where illum is 3 or 6. Textures of it replace
+    their factors, and map_Bump is a normal map. The factors beside Pr and Pm are read this way too.
+
     Args:
         path: The file.
+        blender: The exponent that Blender gives to a roughness of 0, where it wrote the file that names this one; None
+            for other files. Files whose first line does not name Blender are read as others.
 
     Returns:
         Materials by name, and what is not honored: statements by name, and images that are missing or damaged.
@@ -88,20 +111,27 @@ def read(path: pathlib.Path) -> tuple[dict[str, TexturedMaterial], set[str]]:
     statements: dict[str, list[str]] = {}
     name = None
     lines = path.read_bytes().decode(errors="replace").splitlines()
+    if not lines or not lines[0].startswith("# Blender"):
+        blender = None
     for line in [*lines, "newmtl"]:
         key, *rest = statement(line).split() or [""]
         if key == "newmtl":
             if name is not None:
-                material[name] = _material(statements, path, name, ignored)
+                material[name] = _material(statements, path, name, ignored, blender)
             name, statements = " ".join(rest), {}
         elif key:
             statements[key] = rest if key in _MAPS else " ".join(rest).partition("#")[0].split()
     return material, ignored
 
 
-def _material(statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str]) -> TexturedMaterial:
+def _material(
+    statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str], blender: float | None
+) -> TexturedMaterial:
     """The material of the statements after one newmtl."""
-    value = {key: _number(statements, key, path, name) for key in (*_COLORS, *_NUMBERS) if key in statements}
+    if blender is not None:
+        statements = {"norm" if key == "map_Bump" else key: words for key, words in statements.items()}
+    keys = [*_COLORS, *_NUMBERS, *([] if blender is None else ["Ka"])]
+    value = {key: _number(statements, key, path, name) for key in keys if key in statements}
     for key in value.keys() & {"Kd", "Ks", "Pr", "Pm"}:
         if np.max(value[key]) > 1:
             ignored.add(f"{key} above 1")
@@ -114,6 +144,9 @@ def _material(statements: dict[str, list[str]], path: pathlib.Path, name: str, i
             continue
         elif key not in value and key not in _SILENT:
             ignored.add(key)
+    if blender is not None:
+        field |= _principled(value, field.keys(), blender)
+        return _checked(field, path, name)
     # An exponent n of Phong's lobe is about alpha = sqrt(2 / (n + 2)); roughness is the root of alpha.
     roughness = (2 / (max(0.0, value.get("Ns", 0.0)) + 2)) ** 0.25
     if (value.keys() | statements.keys()) & {"Pr", "Pm", "map_Pr", "map_Pm"}:
@@ -124,6 +157,30 @@ def _material(statements: dict[str, list[str]], path: pathlib.Path, name: str, i
         field |= {"metallic": 0.0, "roughness": roughness, "specular": 0.0}
     else:  # At the default index of refraction 4 % times the color are reflected.
         field |= {"metallic": 0.0, "roughness": roughness, "specular_color": value["Ks"] / 0.04}
+    return _checked(field, path, name)
+
+
+def _principled(value: dict[str, Any], given: Collection[str], exponent: float) -> dict[str, Any]:
+    """Factors of Blender's principled material, from what Blender's exporter makes of them.
+
+    This is the inverse that its importer uses: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
+    """
+    shine = min(max(value.get("Ns", 0.0) / exponent, 0.0), 1.0)
+    metallic = min(max(value.get("Ka", 0.0), 0.0), 1.0) if value.get("illum", 2) in (3, 6) else 0.0
+    specular = value.get("Ks", np.full(3, 0.5))
+    factor: dict[str, Any] = {
+        "roughness": value.get("Pr", 1 - math.sqrt(shine)),
+        "metallic": value.get("Pm", metallic),
+        "specular": float(np.max(specular) > 0),
+        "specular_color": 2 * specular,  # At 0.5 Blender reflects 4 %, as at 1 here.
+    }
+    return factor | {
+        key: 1.0 for key in ("base_color", "roughness", "metallic", "emissive") if f"{key}_texture" in given
+    }
+
+
+def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
+    """The material, or an error that names it."""
     try:
         return TexturedMaterial(**field)
     except ValueError as error:
@@ -159,7 +216,12 @@ def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Pa
     except ValueError as error:
         ignored.add(f"{key} ({error})")
         return
-    ignored |= {f"option {each} of maps" for each in options.keys() - {"-o", "-s", "-clamp"}}
+    honored = {"-o", "-s", "-clamp"}
+    strength = options.get("-bm", [])
+    if name == "normal_texture" and len(strength) == 1 and _is_number(strength[0]):
+        honored |= {"-bm"}
+        field["normal_scale"] = float(strength[0])
+    ignored |= {f"option {each} of maps" for each in options.keys() - honored}
     if image.shape[-1] < 3:
         channels = (0,) * len(channels)
     scale, offset = (_pair(options.get(each, []), plain) for each, plain in (("-s", 1.0), ("-o", 0.0)))

@@ -23,9 +23,10 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
     rough metal.
 
     An OBJ file has the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and of the metallic-roughness
-    statements Pr, Pm, map_Pr, map_Pm and Ni; see `mtl.read` for how Phong's become metallic-roughness ones. MTL files,
-    materials and images that are missing are named in one warning, together with what is not honored. Other files
-    have no materials: one matte gray part, named after the file, as of an OBJ file that names none.
+    statements Pr, Pm, map_Pr, map_Pm and Ni; see `mtl.read` for how Phong's, and those of Blender, become
+    metallic-roughness ones. MTL files, materials and images that are missing are named in one warning, together with
+    what is not honored. Other files have no materials: one matte gray part, named after the file, as of an OBJ file
+    that names none.
 
     A dictionary is as for `mitsuba.load_dict`, with arrays [4 4] or objects that have a `matrix` as transforms. It has
     the shapes obj, ply, rectangle, cube and sphere, the last three divided finely; the BSDFs that `mitsuba_material`

@@ -62,6 +62,51 @@ def test_metallic_roughness_statements_come_before_phongs(tmp_path):
     np.testing.assert_array_equal(material.emissive, [2, 1, 0])
 
 
+def exported(folder, header, statements):
+    """The material of a file of Blender's, whose OBJ has a header."""
+    path = write(folder, f"# Blender 0 MTL File: 'None'\nnewmtl a\n{statements}")
+    path.write_text(f"{header}\n{path.read_text()}")
+    (part,) = load_scene(path).parts
+    return part.material
+
+
+@pytest.mark.parametrize(
+    ("header", "exponent"),
+    [("# Blender 3.6.0", 1000), ("# Blender 4.2.1 LTS", 1000), ("# Blender v2.93.5 OBJ File: ''", 900)],
+)
+@pytest.mark.parametrize(("roughness", "specular", "metallic"), [(0.5, 0.5, 0), (0, 0.25, 1), (1, 1, 0.7), (0.3, 0, 0)])
+def test_materials_that_blender_exports_come_back(tmp_path, header, exponent, roughness, specular, metallic):
+    # As obj_export_mtl.cc writes them: the ambient color is the metalness, or 1 for dielectrics.
+    illum, ambient = 1 if specular == 0 else 3 if metallic else 2, metallic or 1
+    statements = f"Kd .8 .6 .4\nKe 0 0 0\nNi 1.45\nd 1\nillum {illum}\nNs {exponent * (1 - roughness) ** 2}\n"
+    statements += "".join(f"{key} {gray} {gray} {gray}\n" for key, gray in (("Ka", ambient), ("Ks", specular)))
+    material = exported(tmp_path, header, statements)
+    assert float(material.roughness) == pytest.approx(roughness, abs=1e-6)
+    assert float(material.metallic) == pytest.approx(metallic)
+    reflectance = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular_color * material.specular
+    np.testing.assert_allclose(reflectance, [0.08 * specular] * 3, rtol=1e-5)
+    assert float(material.specular) == (specular > 0)
+    np.testing.assert_allclose(material.base_color, [0.8, 0.6, 0.4], rtol=1e-6)
+
+
+def test_textures_that_blender_exports_replace_the_factors_and_its_bumps_are_normal_maps(tmp_path):
+    write_png(tmp_path / "c.png", IMAGE)
+    maps = "map_Kd c.png\nmap_Pr c.png\nmap_Ke c.png\nmap_Bump -bm 0.5 c.png\n"
+    statements = f"Kd .8 .8 .8\nKs .5 .5 .5\nKe 0 0 0\nNs 250\nPr .5\nPm .25\nillum 2\n{maps}"
+    material = exported(tmp_path, "# Blender 4.2.1 LTS", statements)
+    np.testing.assert_array_equal(material.base_color, [1] * 3)
+    np.testing.assert_array_equal(material.emissive, [1] * 3)
+    assert (float(material.roughness), float(material.metallic), float(material.normal_scale)) == (1, 0.25, 0.5)
+    assert material.normal_texture is not None
+
+
+@pytest.mark.parametrize("header", ["# Blender v2.79 (sub 0) OBJ File: ''", "# Blender3D v249 OBJ File: ", "# Maya"])
+def test_materials_of_other_exporters_and_of_blender_before_principled_ones_are_phongs(tmp_path, header):
+    material = exported(tmp_path, header, "Kd .5 .5 .5\nKs .5 .5 .5\nKa x\nNs 250\nillum 2\n")
+    assert 2 / float(material.roughness) ** 4 - 2 == pytest.approx(250, rel=1e-4)
+    np.testing.assert_allclose(material.specular_color, [12.5] * 3, rtol=1e-6)
+
+
 def test_maps_lie_as_the_file_has_them_and_options_move_and_clamp_them(tmp_path):
     (tmp_path / "a folder").mkdir()
     write_png(tmp_path / "a folder" / "four colors.png", IMAGE)
