@@ -3,6 +3,7 @@
 import argparse
 import itertools
 import json
+import os
 import platform
 import resource
 import sys
@@ -32,7 +33,8 @@ _UPRIGHT = {
 }
 # What the numbers of some options must be.
 _RANGES = (
-    (("size", "terms", "keep", "table"), "at least 1", lambda x: x >= 1),
+    (("size",), "from 1 to 8192", lambda x: 1 <= x <= 8192),
+    (("terms", "keep", "table"), "at least 1", lambda x: x >= 1),
     (("order",), "from 1 to 15", lambda x: 1 <= x <= 15),
     (("lobes",), "from 1 to 64", lambda x: 1 <= x <= 64),
     (("animate",), "at least 2", lambda x: x >= 2),
@@ -51,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = lambda message, *_, **__: print(f"jaxprt: {message}", file=sys.stderr)
     try:
         _run(options)
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"jaxprt: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -144,7 +146,7 @@ def _check(options: argparse.Namespace) -> None:
 def _run(options: argparse.Namespace) -> None:
     _check(options)
     view = _view(options)
-    options.output.mkdir(parents=True, exist_ok=True)
+    _make_folder(options.output)
     found = _describe(view, options)
     print(
         f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in view.scene.parts)} vertices"
@@ -184,6 +186,16 @@ def _run(options: argparse.Namespace) -> None:
     path = options.output / "report.json"
     path.write_text(json.dumps(found, indent=2) + "\n")
     _tell(found, path)
+
+
+def _make_folder(path: Path) -> None:
+    """Makes the folder of the output, or says what is wrong with it before anything is computed."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--output must be a folder that can be made, got {path}: {error.strerror}") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ValueError(f"--output must be a folder that can be written to, got {path}")
 
 
 def _made(system: str, view: View, options: argparse.Namespace) -> Made:

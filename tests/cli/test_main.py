@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -231,7 +232,8 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--size", "0"], "--size must be at least 1, got 0"),
+        (["--size", "0"], "--size must be from 1 to 8192, got 0"),
+        (["--size", "1000000"], r"--size must be from 1 to 8192, got 1e\+06"),
         (["--keep", "0"], "--keep must be at least 1, got 0"),
         (["--keep", "30000"], "--keep must be at most 384, got 30000"),
         (["--terms", "0"], "--terms must be at least 1, got 0"),
@@ -274,8 +276,28 @@ def test_options_that_cannot_be_read_end_with_status_2_and_usage(capsys, options
 def test_an_output_that_is_a_file_is_refused(place, tmp_path, capsys):
     (tmp_path / "file").write_text("precious")
     assert run(place, output=tmp_path / "file") == 2
-    assert_told(capsys, "file")
+    assert_told(capsys, "--output must be a folder that can be made, got .*file: File exists")
+    assert run(place, output=tmp_path / "file" / "within") == 2
+    assert_told(capsys, "--output must be a folder that can be made, got .*within: Not a directory")
     assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_an_output_that_cannot_be_written_to_is_refused_before_anything_is_computed(
+    place, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(prt.separable, "factor", stop)
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # Root may write everywhere.
+    assert run(place, output=tmp_path) == 2
+    assert_told(capsys, f"--output must be a folder that can be written to, got {tmp_path}")
+
+
+def test_too_little_memory_ends_in_one_line(place, tmp_path, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise MemoryError("Unable to allocate 9 TiB")
+
+    monkeypatch.setattr(prt.separable, "factor", fail)
+    assert run(place, output=tmp_path) == 2
+    assert_told(capsys, "error: Unable to allocate 9 TiB")
 
 
 def test_another_meshs_store_in_the_output_is_refused(place, output, capsys):
