@@ -114,7 +114,7 @@ class Document:
         Raises:
             ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type.
         """
-        item, name = self.item("accessors", index, owner), f"accessor {index}, {owner},"
+        item, name = self.item("accessors", index, owner), f"accessor {index} ({owner})"
         width, count, kind = _WIDTH.get(item["type"], 0), item["count"], item["componentType"]
         if width not in widths or kind not in _COMPONENT or (whole and kind == 5126):
             must = f"must have {' or '.join(map(str, widths))} {'whole ' if whole else ''}numbers per element"
@@ -223,6 +223,10 @@ def damage_named(path: pathlib.Path) -> Iterator[None]:
     """Turns errors that damaged headers lead to into one that names the file."""
     try:
         yield
-    except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
+    except KeyError as error:
+        raise ValueError(
+            f"{path} must be an undamaged glTF file, got one that lacks {error} where it is needed"
+        ) from error
+    except (IndexError, TypeError, AttributeError, OverflowError) as error:
         detail = f"{type(error).__name__}: {error}"
         raise ValueError(f"{path} must be an undamaged glTF file, got one that cannot be read: {detail}") from error
