@@ -162,6 +162,9 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
     try:
         group = zarr.open_group(path, mode="r+")
         found = dict(group.attrs)
+        for each in path.iterdir():  # Arrays have headers of their own, which may be damaged too.
+            if each.is_dir():
+                group[each.name]
     except Exception as error:
         raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
     if found.get("format") != _FORMAT:
