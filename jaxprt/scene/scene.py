@@ -1,6 +1,7 @@
 """Scenes: meshes with their materials, cameras, and lights."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -78,6 +79,13 @@ class Part(eqx.Module):
         return self.material.at(place, self.second, color=self.color, handedness=self.handedness)
 
 
+def _tuple(items: Any) -> tuple:
+    """A sequence as a tuple."""
+    if isinstance(items, eqx.Module):
+        raise TypeError(f"a scene takes lists of parts, cameras and environments, got one {type(items).__name__}")
+    return tuple(items)
+
+
 class Scene(eqx.Module):
     """What is looked at: parts with their materials, from where, and in which light.
 
@@ -91,9 +99,9 @@ class Scene(eqx.Module):
         ValueError: There are no parts, or two parts have one name.
     """
 
-    parts: tuple[Part, ...] = eqx.field(converter=tuple)
-    cameras: tuple[Camera, ...] = eqx.field(converter=tuple, default=())
-    environments: tuple[Environment, ...] = eqx.field(converter=tuple, default=())
+    parts: tuple[Part, ...] = eqx.field(converter=_tuple)
+    cameras: tuple[Camera, ...] = eqx.field(converter=_tuple, default=())
+    environments: tuple[Environment, ...] = eqx.field(converter=_tuple, default=())
 
     def __check_init__(self):
         """Refuses scenes without parts, equal names, and objects of other classes."""

@@ -82,6 +82,11 @@ def test_the_parameters_of_a_part_are_those_at_its_vertices(close):
             ValueError,
             r"each part of a scene must have a name of its own, got several called \['a'\]",
         ),
+        (
+            lambda: Scene(scene()["ball"]),
+            TypeError,
+            "a scene takes lists of parts, cameras and environments, got one Part",
+        ),
         (lambda: Scene([BALL]), TypeError, "each of the scene's parts must be of class Part"),
         (lambda: Scene(scene().parts, [BALL]), TypeError, "each of the scene's cameras must be of class Camera"),
         (lambda: Scene(scene().parts, (), [1]), TypeError, "the scene's environments must be of class Environment"),
