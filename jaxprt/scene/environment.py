@@ -42,7 +42,7 @@ def _floating(radiance):
 class Environment(eqx.Module):
     """Distant light: mean linear radiance of each cubemap texel.
 
-    Radiance must be finite; a light with NaN or infinity in it raises ValueError. Inside `jax.jit` values are not
+    Radiance must be finite, on six square faces; another light raises ValueError. Inside `jax.jit` values are not
     known: there a NaN reaches every vertex that the texel lights.
 
     Attributes:
@@ -52,7 +52,10 @@ class Environment(eqx.Module):
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=_floating)
 
     def __check_init__(self):
-        """Refuses radiance that is not finite."""
+        """Refuses radiance that is not on six square faces, or not finite."""
+        shape = jnp.shape(self.radiance)
+        if len(shape) < 4 or shape[-4] != 6 or shape[-3] != shape[-2] or 0 in shape[-3:]:
+            raise ValueError(f"the light's radiance must be [..., 6, n, n, c], got {list(shape)}")
         require.finite("the light's radiance", self.radiance)
 
 

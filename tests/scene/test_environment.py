@@ -1,3 +1,4 @@
+import re
 import warnings
 
 import jax
@@ -268,6 +269,16 @@ def test_lights_made_by_hand_are_refused_where_they_are_not_finite_and_known(wro
         Environment(radiance)
     assert jax.eval_shape(Environment, radiance).radiance.shape == (6, 2, 2, 3)
     assert jax.jit(Environment)(radiance).radiance[3, 1, 0, 2] != 1
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(6, 4, 4), (5, 4, 4, 3), (6, 4, 8, 3), (6, 0, 0, 3), (2, 4, 4, 6, 3)])
+def test_lights_made_by_hand_are_refused_where_they_are_not_on_six_square_faces(shape):
+    with pytest.raises(
+        ValueError, match=rf"radiance must be \[\.\.\., 6, n, n, c\], got {re.escape(str(list(shape)))}"
+    ):
+        Environment(np.ones(shape, np.float32))
+    assert Environment(np.ones((2, 6, 4, 4, 1), np.float32)).radiance.shape == (2, 6, 4, 4, 1)
 
 
 def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible(tmp_path):
