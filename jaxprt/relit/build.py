@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 
+import numpy as np
 import tqdm
 
 from jaxprt import require
@@ -58,13 +59,16 @@ def precompute(
         TypeError: No scene, a system of another kind, or a material that no system can have.
         ValueError: There is no such system or part, the size is no power of two, there are more than 2 bounces, a
             part's material is not one that its system can have, or the store at `path` was made from something else.
+        NotADirectoryError: There is a file at `path`.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    if size is not None and (size < 1 or size & (size - 1)):
-        raise ValueError(f"size must be a power of two, got {size}")
+    if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
+        raise ValueError(f"size must be a power of two, got {size!r}")
     require.between("bounces", bounces, 0, reflection.MOST)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
+        if folder.exists() and not folder.is_dir():
+            raise NotADirectoryError(f"path must name a folder, got the file {folder}")
         folder.mkdir(parents=True, exist_ok=True)
     if system is None:
         wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
@@ -109,7 +113,7 @@ def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
             f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
             f"got {options['error']:g} at {options['rate']:g}: name another path"
         )
-    made = plan(scene, **options)
+    made = plan(scene, path=folder and folder / "candidates", **options)
     if options["progress"]:
         tqdm.tqdm.write(str(made))
     if kept is not None:

@@ -225,6 +225,8 @@ class Sample(eqx.Module):
 
 def checked(environments: Sequence[Environment], error: float, rate: float) -> int:
     """The size of the lights' faces, if a plan can be made for them."""
+    if not isinstance(environments, Sequence):
+        raise TypeError(f"environments must be a list of lights, got one {type(environments).__name__}")
     if not environments:
         raise ValueError("environments must be at least one, got none")
     for number, light in enumerate(environments):
@@ -235,8 +237,8 @@ def checked(environments: Sequence[Environment], error: float, rate: float) -> i
     for number, light in enumerate(environments):
         require.finite(f"the radiance of environment {number}", light.radiance)
     for name, value in (("error", error), ("rate", rate)):
-        if not 0 < value < math.inf:
-            raise ValueError(f"{name} must be positive and finite, got {value}")
+        if not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
+            raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return environments[0].radiance.shape[1]
 
 

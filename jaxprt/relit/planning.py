@@ -5,6 +5,9 @@ views, under every light. Bytes and times are those of the sample, scaled to the
 """
 
 import math
+import os
+import pathlib
+import re
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -15,6 +18,7 @@ from jaxtyping import Float
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
+from jaxprt.files import objects
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import MEMBERS, Candidate, Sample, checked, lights_of, views_around
@@ -122,6 +126,7 @@ def plan(
     environments: Sequence[Environment] | None = None,
     error: float = 0.05,
     rate: float = 30.0,
+    path: str | os.PathLike | None = None,
     progress: bool = True,
 ) -> Plan:
     """Chooses for each part of a scene the system that meets an error at a rate with the fewest bytes.
@@ -138,6 +143,7 @@ def plan(
         environments: Lights that the error must hold for, of one size; the scene's own, or else the two embedded ones.
         error: Relative L2 error of the radiance of the vertices of each part.
         rate: Frames per second with new light and new view, for the scene as a whole, without drawing.
+        path: Folder that keeps what was measured; a call that was stopped, or killed, goes on from there.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -153,12 +159,15 @@ def plan(
     size = checked(environments, error, rate)
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, parts = len(mesh.position), []
-    shadings = [of_part(part) for part in scene.parts]
-    pairs = zip(scene.parts, shadings, strict=True)
-    for part, shading in tqdm.tqdm(pairs, desc="plan", unit="part", total=len(shadings), disable=not progress):
+    shadings, key = [of_part(part) for part in scene.parts], key_of(scene, environments)
+    pairs = enumerate(zip(scene.parts, shadings, strict=True))
+    for number, (part, shading) in tqdm.tqdm(
+        pairs, desc="plan", unit="part", total=len(shadings), disable=not progress
+    ):
         sample = Sample.make(shading, mesh, total, size, environments, views)
         count = len(part.mesh.position)
-        considered = tuple(_considered(sample, error, count / total / rate))
+        kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
+        considered = tuple(_considered(sample, kept, error, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= error]
         if not good:
             best = min(considered, key=lambda each: each.error)
@@ -171,7 +180,7 @@ def plan(
         parts.append(PartPlan(part.name, count, chosen, considered))
     reflected = reflection.fractions(shadings, environments)
     bounces = reflection.needed(reflected, error)
-    return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key_of(scene, environments))
+    return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key)
 
 
 def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
@@ -179,7 +188,7 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
     return blocks.fingerprint(*jax.tree.leaves((scene, tuple(environments))))
 
 
-def _considered(sample: Sample, error: float, seconds: float):
+def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):
     """Candidates of each system: by bisection, those around the first step of its ladder that meets the error.
 
     Steps that must have more bytes than what meets the error and the rate already are left out, and so is a search
@@ -198,7 +207,7 @@ def _considered(sample: Sample, error: float, seconds: float):
             if least[middle] > fewest:
                 high = middle
                 continue
-            each = sample.measure(ladder[middle])
+            each = _measured(sample, ladder[middle], folder)
             yield each
             if each.error * MARGIN > error:
                 low = middle + 1
@@ -208,3 +217,13 @@ def _considered(sample: Sample, error: float, seconds: float):
                 fewest = min(fewest, each.nbytes)
                 if least[0] > (1 - _SAVING) * each.nbytes:
                     break
+
+
+def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Candidate:
+    """What a recipe brings and costs, kept in a folder."""
+    if folder is None:
+        return sample.measure(recipe)
+    path = folder / re.sub(r"\W+", "_", str(recipe))
+    if not path.exists():
+        objects.save(path, sample.measure(recipe))
+    return objects.load(path)

@@ -11,7 +11,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe, reference
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.relit import Clusters, Harmonics, Lobes
+from jaxprt.relit import Clusters, Harmonics, Lobes, reflection
 from jaxprt.scene import Environment, TexturedMaterial, builtin
 from jaxprt.scene.mesh import ground_plane
 
@@ -132,6 +132,43 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
     for other, lights in ((part, [darker]), (painted, [sky])):
         with pytest.raises(ValueError, match="made for another scene, other materials or other lights"):
             prt.precompute(other, error=ASKED, **options | {"environments": lights})
+
+
+def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_path, monkeypatch):
+    ground = prt.Scene([scene["ground"]])
+    options = {"environments": [sky], "error": 0.02, "path": tmp_path / "plan", "progress": False}
+    measure, measured = measuring.Sample.measure, []
+
+    def stopped(sample, recipe):
+        if measured:
+            raise InterruptedError
+        measured.append(recipe)
+        return measure(sample, recipe)
+
+    def counted(sample, recipe):
+        measured.append(recipe)
+        return measure(sample, recipe)
+
+    monkeypatch.setattr(measuring.Sample, "measure", stopped)
+    with pytest.raises(InterruptedError):
+        prt.plan(ground, **options)
+    monkeypatch.setattr(measuring.Sample, "measure", counted)
+    found = prt.plan(ground, **options)
+    assert [each.recipe for each in found.part[0].considered] == measured
+    assert len(measured) > 1
+    assert str(prt.plan(ground, **options)) == str(found)
+    assert len(measured) == len(found.part[0].considered)
+    prt.plan(ground, **options | {"environments": [Environment(2 * sky.radiance)]})
+    assert len(measured) == 2 * len(found.part[0].considered)
+
+
+def test_bounces_are_planned_by_what_they_bring(planned):
+    assert planned.reflected.shape == (2, 3)
+    assert np.all(planned.reflected[1] < planned.reflected[0])
+    assert planned.bounces == 0
+    more = planned.reflected.max() - 1e-3
+    assert reflection.needed(planned.reflected, more) == 1
+    assert f"ground: {100 * planned.reflected[0, 1]:.1f} % of its light is reflected" in str(planned)
 
 
 def test_a_scenes_own_lights_are_planned_for(scene, sky):

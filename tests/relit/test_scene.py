@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import bright_texels, harmonic, lobe, separable, visibility
+from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import raster
-from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms
+from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -247,6 +247,48 @@ def test_gradients_in_materials_are_differences():
         np.testing.assert_allclose(np.vdot(place(slope), step), (ends[0] - ends[1]) / 2, rtol=2e-3, err_msg=name)
 
 
+@pytest.fixture(scope="module")
+def reflecting():
+    """The scene with one bounce, of few directions."""
+    coarser = functools.partial(bounces.precompute, edge=2, size=8, components=8, modes=8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bounces, "precompute", coarser)
+        patch.setattr(reflection, "_TERMS", 6)
+        patch.setattr(reflection, "_RESOLUTION", 12)
+        yield prt.precompute(scene(), system=RECIPES["harmonic"], bounces=1, size=SIZE, progress=False)
+
+
+def test_bounces_are_added_to_direct_light(reflecting):
+    blends = [each.blend for each in reflecting.shading]
+    direct, reflected = (
+        prt.radiance(each, light(), eye=EYE, materials=blends) for each in (reflecting.direct, reflecting.bounces)
+    )
+    whole = reflecting.radiance(light(), eye=EYE)
+    np.testing.assert_allclose(whole, direct + reflected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(direct, relit("harmonic").radiance(light(), eye=EYE), rtol=1e-4, atol=1e-5)
+    assert 0.02 < np.linalg.norm(reflected) / np.linalg.norm(direct) < 0.5
+    assert prt.memory(reflecting) > prt.memory(reflecting.direct)
+
+
+def test_a_part_sends_the_color_of_its_material_at_present(reflecting):
+    def on_the_wall(color):
+        materials = {"floor": wood(base_color=color)}
+        options = {"eye": EYE, "materials": reflecting.appearances(materials)}
+        both = reflecting.radiance(light(), **options) - relit("harmonic").radiance(light(), **options)
+        return np.asarray(both)[BOUNDS[1] :].sum(0)
+
+    red, white = on_the_wall((1.0, 0.0, 0.0)), on_the_wall((1.0, 1.0, 1.0))
+    assert red[0] == pytest.approx(white[0], rel=1e-3)
+    assert np.all(red[1:] < 0.9 * white[1:])
+
+
+def test_a_report_of_bounces_has_the_errors_of_direct_light(reflecting):
+    found, direct = (each.report([light()]) for each in (reflecting, relit("harmonic")))
+    for mine, other in zip(found.part, direct.part, strict=True):
+        np.testing.assert_allclose(mine.errors, other.errors, rtol=1e-3)
+    assert found.nbytes > direct.nbytes
+
+
 def test_a_saved_scene_relights_bit_for_bit(tmp_path):
     ready = relit("lobe")
     prt.files.save(tmp_path / "scene", ready)
@@ -275,7 +317,7 @@ def test_pictures_show_the_radiance_before_the_light():
 
 
 def test_the_camera_is_the_scenes_first_or_one_that_sees_all():
-    system = relit("harmonic").system, relit("harmonic").shading
+    system = relit("harmonic").direct, relit("harmonic").shading
     with_camera = RelitScene(scene(cameras=[CAMERA, orbit(mesh("ball"))]), *system)
     np.testing.assert_array_equal(with_camera.picture(light()), relit("harmonic").picture(light(), CAMERA))
     around = relit("harmonic").camera

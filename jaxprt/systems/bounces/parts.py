@@ -76,7 +76,7 @@ class PartBounces(protocol.System):
 
     def shade(
         self, light: LitTransfer, materials: Sequence[Blend | None] | None = None
-    ) -> tuple[Float[Array, "lm c _"], ...]:
+    ) -> tuple[Float[Array, "lm _ _"], ...]:
         """Harmonics of the light that arrives at the vertices of each part, in their frames, with all materials."""
         require.kind("the light", light, LitTransfer, source="PartBounces.light")
         blends = zip(self.part, self._given(materials), strict=True)
@@ -88,14 +88,14 @@ class PartBounces(protocol.System):
 
     def view(
         self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
-    ) -> tuple[Float[Array, "lm d _"], ...]:
+    ) -> tuple[Float[Array, "lm _ _"], ...]:
         """Harmonics of each vertex's BRDF for its view."""
         require.position("the eye", eye)
         pairs = zip(self.part, self._given(materials), strict=True)
         return tuple(harmonic.blended_view(part.brdf, part.position, part.frame, own, eye=eye) for part, own in pairs)
 
     def combine(
-        self, light: tuple[Float[Array, "lm c _"], ...], view: tuple[Float[Array, "lm d _"], ...]
+        self, light: tuple[Float[Array, "lm _ _"], ...], view: tuple[Float[Array, "lm _ _"], ...]
     ) -> Float[Array, "_ e"]:
         """Radiance of reflected light."""
         require.kind("the light", light, tuple, source="PartBounces.shade")

@@ -165,7 +165,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
     return gathered(tensor, rows)
 
 
-def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "p _"]]) -> Float[Array, "q c"]:
+def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "q c"]:
     """Weights of the functions that the tensor keeps, given those of all functions of each region."""
     colors = max(each.shape[1] for each in rows)
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
