@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
 
 import jaxprt as prt
 from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
@@ -300,6 +301,24 @@ def test_a_mesh_of_one_triangle_is_lit(name):
     assert color.shape == (3, 3)
     assert np.isfinite(color).all()
     assert color.any() == (not name.startswith("bounces"))
+
+
+@each_system
+def test_a_system_laid_over_devices_by_vertices_has_the_same_radiance(name, close):
+    case, devices = made(name, "triangle"), jax.devices()
+    if len(devices) < 3:
+        pytest.skip("XLA_FLAGS asks for three devices, one for each vertex")
+    across = jax.sharding.Mesh(np.array(devices[:3]), ("vertex",))
+
+    def lay(leaf):
+        spot = next((axis for axis, size in enumerate(jnp.shape(leaf)) if size == case.system.vertices), None)
+        axes = PartitionSpec() if spot is None else PartitionSpec(*[None] * spot, "vertex")
+        return jax.device_put(leaf, NamedSharding(across, axes))
+
+    system = jax.tree.map(lay, case.system)
+    laid = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))(system, light(), case.materials)
+    assert len(laid.sharding.device_set) == 3
+    close(laid, shown(case, light()), tolerance=2e-5)
 
 
 @each_system
