@@ -350,9 +350,11 @@ def test_the_module_runs_as_a_program():
 def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys):
     output = place / "moving"
     glossy = ["--brdf", "cook-torrance", "--roughness", "0.4", "--specular", "0.6", "0.5", "0.3"]
-    assert run(place, "--ground", "--system", "dynamic", "--animate", "2", *glossy, output=output) == 0
+    several = ["--system", "dynamic", "lobe", "--bounces", "2"]
+    assert run(place, "--ground", *several, "--animate", "2", *glossy, output=output) == 0
     told = report(output)
-    assert 0 < told["lights"]["sky"]["dynamic"]["reflected_fraction"] < 0.5
+    for system in ("dynamic", "lobe"):
+        assert 0.03 < told["lights"]["sky"][system]["reflected_fraction"] < 0.2
     assert told["lights"]["sky"]["dynamic"]["image_error"] < 0.3
     assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
     frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
@@ -366,7 +368,7 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     ("options", "message"),
     [
         (["--animate", "4"], "--animate needs --system dynamic"),
-        (["--bounces", "1"], "--bounces needs --system dynamic"),
+        (["--animate", "2"], "--animate needs --system dynamic"),
         (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
         (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
         (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of parts 0 to 0, got 7"),
