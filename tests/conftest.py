@@ -1,10 +1,12 @@
-"""Fixtures that every test may ask for: ``data``, ``coarse``, ``x64``, ``unchecked`` and ``close``."""
+"""Fixtures that every test may ask for: ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked`` and ``close``."""
 
+import functools
 import gc
 import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any
 
 # Both workers, and programs and notebooks that tests start, share compiled programs, and a later run finds them;
 # `make clean` removes them. Keeping a program takes an eighth of the time of compiling it, finding it much less.
@@ -113,6 +115,35 @@ def coarse() -> Iterator[None]:
         yield
     jax.clear_caches()
     dynamic.reflected._dual.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def bound() -> Callable[..., None]:
+    """The function ``bound_options``: ``bound(patch, function, resolution=8)``."""
+    return bound_options
+
+
+def bound_options(patch: pytest.MonkeyPatch, function: Callable, **limits: float) -> None:
+    """Bounds options of a function wherever the package calls it, whether callers give them or not.
+
+    Args:
+        patch: Takes it back.
+        function: A function of jaxprt, replaced under every name that a module of jaxprt has for it.
+        limits: The largest value of each option; of ``error``, the smallest.
+    """
+
+    @functools.wraps(function)
+    def bounded(*arguments: Any, **options: Any) -> Any:
+        for name, limit in limits.items():
+            given = options.get(name)
+            options[name] = limit if given is None else (max if name == "error" else min)(given, limit)
+        return function(*arguments, **options)
+
+    modules = [module for name, module in sys.modules.items() if name.partition(".")[0] == "jaxprt"]
+    names = [(module, name) for module in modules for name, value in vars(module).items() if value is function]
+    assert names, f"no module of jaxprt has {function}"
+    for module, name in names:
+        patch.setattr(module, name, bounded)
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Every benchmark runs to its end on its small case, and says what a measurement must say."""
 
-import functools
 import importlib
 import json
 import pathlib
@@ -40,16 +39,16 @@ MOST_ERROR = {
 
 
 @pytest.fixture(scope="module")
-def small(coarse):
-    """Coarse tables where a benchmark leaves their size open, and blocks so short that quick cases have several."""
+def small(coarse, bound):
+    """Coarse tables, and blocks so short that quick cases have several."""
     with pytest.MonkeyPatch.context() as patch:
-        for room, name, options in (
-            (prt.separable.factorization, "factor", {"resolution": 12}),
-            (prt.harmonic.table, "tabulate", {"resolution": 8, "error": 1e-2}),
-            (prt.lobe.table, "tabulate", {"resolution": 12}),
-            (prt.bounces.functions, "factor", {"resolution": 12}),
+        for function, limits in (
+            (prt.separable.factor, {"resolution": 12}),
+            (prt.harmonic.tabulate, {"error": 1e-2}),
+            (prt.lobe.tabulate, {"resolution": 16}),
+            (prt.bounces.factor, {"resolution": 12}),
         ):
-            patch.setattr(room, name, functools.partial(getattr(room, name), **options))
+            bound(patch, function, **limits)
         for room, name, value in (
             (prt.separable.factorization, "_BLOCK", 64),
             (lobe.pyramid, "_BLOCK", 64),

@@ -1,6 +1,5 @@
 """The command `python -m jaxprt`, on a mesh and a sky of a few triangles and pixels."""
 
-import functools
 import json
 import math
 import os
@@ -33,22 +32,22 @@ WHOLE = ("--ground", "--azimuth", "-30", "--system", *SYSTEMS)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small(coarse):
+def small(coarse, bound):
     """Coarse maps, skies and ground: what the command does with them is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        for room, name, options in (
-            (prt.separable, "factor", {"resolution": 8}),
-            (prt.scene, "load_environment", {"size": 8}),
-            (prt.harmonic, "precompute", {"size": 8}),
-            (prt.harmonic, "precompute_diffuse", {"size": 8}),
-            (prt.harmonic, "tabulate", {"resolution": 8, "error": 1.0}),
-            (prt.lobe, "tabulate", {"resolution": 8}),
-            (prt.bounces, "factor", {"functions": 2, "terms": 4}),
-            (prt.scene.mesh, "ground_plane", {"vertices": 49}),
-            (prt.dynamic, "precompute", {"size": 8}),
-            (prt.bounces, "precompute", {"edge": 2, "size": 8, "components": 8, "modes": 8}),
+        for function, limits in (
+            (prt.separable.factor, {"resolution": 8}),
+            (prt.scene.load_environment, {"size": 8}),
+            (prt.harmonic.precompute, {"size": 8}),
+            (prt.harmonic.precompute_diffuse, {"size": 8}),
+            (prt.harmonic.tabulate, {"resolution": 8, "error": 1.0}),
+            (prt.lobe.tabulate, {"resolution": 8}),
+            (prt.bounces.factor, {"functions": 2, "terms": 4, "resolution": 8}),
+            (prt.scene.mesh.ground_plane, {"vertices": 49}),
+            (prt.dynamic.precompute, {"size": 8}),
+            (prt.bounces.precompute, {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
-            patch.setattr(room, name, functools.partial(getattr(room, name), **options))
+            bound(patch, function, **limits)
         for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
             patch.setattr(animation, name, value)
         yield
