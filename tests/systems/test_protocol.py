@@ -63,12 +63,12 @@ def seen(name: str) -> visibility.StoredVisibility:
 
 @functools.cache
 def mesh(name: str) -> Mesh:
-    """Scenes: a sphere on a ground (two regions), an open sphere, and one triangle."""
-    ball = builtin.sphere(rings=6, sectors=10)
+    """Scenes: a sphere on a ground (two regions), an open sphere of as many vertices, and one triangle."""
     if name == "triangle":
         return make_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]]))
     if name == "ball":
-        return ball
+        return builtin.sphere(rings=10, sectors=11)
+    ball = builtin.sphere(rings=6, sectors=10)
     floor = builtin.plane(cells=6)
     floor = eqx.tree_at(lambda m: m.position, floor, floor.position * 2 - jnp.array([0.0, 1.01, 0.0]))
     return join([ball, floor])
@@ -88,6 +88,26 @@ def members() -> dynamic.DynamicBrdf:
     return dynamic.factor(each, dynamic.separate(each, separator=free))
 
 
+@functools.cache
+def lobe_table(model: str) -> lobe.LobeBrdf:
+    """Lobes of a BRDF."""
+    return lobe.tabulate(MODELS[model], lobes=6, resolution=8)
+
+
+@functools.cache
+def harmonic_table(model: str) -> harmonic.HarmonicBrdf:
+    """A BRDF in harmonics."""
+    return harmonic.tabulate(MODELS[model], degree=4, error=0.5)
+
+
+@functools.cache
+def members_along() -> dynamic.DynamicBrdf:
+    """What the members reflect on to other surfaces."""
+    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
+    return bounces.factor(each, terms=6, resolution=16)
+
+
+@functools.cache
 def sparse(name: str, model: str) -> tuple[prt.System, Any]:
     brdf = factored(model)
     transport = separable.precompute(mesh(name), brdf, keep=6 * SIZE**2, size=SIZE, progress=False)
@@ -110,7 +130,7 @@ def clustered(name: str, model: str) -> tuple[prt.System, Any]:
 
 def matrices(name: str, model: str) -> tuple[prt.System, Any]:
     transport = harmonic.precompute(mesh(name), degree=4, size=SIZE, progress=False)
-    return harmonic.HarmonicSystem(transport, harmonic.tabulate(MODELS[model], degree=4, error=0.5)), None
+    return harmonic.HarmonicSystem(transport, harmonic_table(model)), None
 
 
 def vectors(name: str, model: str) -> tuple[prt.System, Any]:
@@ -118,8 +138,9 @@ def vectors(name: str, model: str) -> tuple[prt.System, Any]:
     return harmonic.DiffuseSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
 
 
+@functools.cache
 def lobes(name: str, model: str) -> tuple[prt.System, Any]:
-    return lobe.LobeSystem(lobe.compress(seen(name)), lobe.tabulate(MODELS[model], lobes=6, resolution=8)), None
+    return lobe.LobeSystem(lobe.compress(seen(name)), lobe_table(model)), None
 
 
 def bright(name: str, model: str) -> tuple[prt.System, Any]:
@@ -127,6 +148,7 @@ def bright(name: str, model: str) -> tuple[prt.System, Any]:
     return bright_texels.BrightTexels(system, system.transport, MODELS[model], count=8), None
 
 
+@functools.cache
 def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
     brdfs = [members()] * (1 + (name == "scene"))
     transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
@@ -135,10 +157,10 @@ def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
     return dynamic.DynamicSystem(transport, brdfs), [material] * len(brdfs)
 
 
+@functools.cache
 def reflected(name: str, model: str) -> tuple[prt.System, Any]:
     direct, materials = changing(name, model)
-    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
-    basis = [bounces.factor(each, terms=6)] * len(materials)
+    basis = [members_along()] * len(materials)
     options = {"components": 8, "modes": 12, "edge": 2, "size": 4, "progress": False}
     return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
 

@@ -28,7 +28,8 @@ def mesh():
 @pytest.fixture(scope="module")
 def brdfs():
     """Colors that need two functions, and one."""
-    glossy = separable.factor(AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.5, nu=6, nv=6), terms=4)
+    shiny = AshikhminShirley(diffuse=[0.5, 0.2, 0.4], specular=0.5, nu=6, nv=6)
+    glossy = separable.factor(shiny, terms=4, resolution=16)
     return [glossy, separable.factor(Lambert([0.9, 0.3, 0.1]), terms=1, resolution=8)]
 
 
