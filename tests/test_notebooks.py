@@ -11,6 +11,8 @@ import matplotlib
 import matplotlib.pyplot as plt
 import pytest
 
+from jaxprt import bounces
+
 FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 300_000  # bytes
@@ -38,12 +40,13 @@ def _texts(value: object) -> list[str]:
 
 
 @pytest.fixture
-def small(coarse, unchecked, monkeypatch):
+def small(coarse, bound, unchecked, monkeypatch):
     """The small size, the folder and the drawing of a notebook that runs in this process."""
     monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
     monkeypatch.chdir(FOLDER)
     monkeypatch.setattr("sys.path", [*sys.path])
     monkeypatch.setattr(plt, "show", lambda: None)
+    bound(monkeypatch, bounces.precompute, edge=2, components=8, modes=8)
     with matplotlib.rc_context({"backend": "agg"}):
         yield
     gc.collect()  # Its temporary folders warn when they go, here rather than in another test.

@@ -367,7 +367,6 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     ("options", "message"),
     [
         (["--animate", "4"], "--animate needs --system dynamic"),
-        (["--animate", "2"], "--animate needs --system dynamic"),
         (["--system", "dynamic"], "needs a part that can change: give --brdf cook-torrance or --material"),
         (["--system", "dynamic", "--animate", "1"], "--animate must be at least 2, got 1"),
         (["--material", "7", "0.1", "0.1", "0.2", "0.1"], "--material must name one of parts 0 to 0, got 7"),

@@ -1,6 +1,5 @@
 """Plans against the error that carrying them out has, under lights and from views that they did not see."""
 
-import functools
 import importlib
 
 import jax
@@ -22,7 +21,7 @@ VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small(coarse):
+def small(coarse, bound):
     """Few steps and small maps."""
     with pytest.MonkeyPatch.context() as patch:
         terms = tuple(Clusters(step.terms, 12, *list(vars(step).values())[2:]) for step in planning._TERMS[:3])
@@ -30,7 +29,7 @@ def small(coarse):
         patch.setattr(planning, "_LOBES", planning._LOBES[:2])
         patch.setattr(planning, "_HARMONIC", (Harmonics(degree=2),))
         patch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)  # No plan reads it.
-        patch.setattr(lobe, "tabulate", functools.partial(lobe.tabulate, resolution=8))
+        bound(patch, lobe.tabulate, resolution=8)
         yield
 
 

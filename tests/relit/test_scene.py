@@ -16,7 +16,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import raster
-from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, reflection
+from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -26,14 +26,22 @@ from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import cubemap
 
-pytestmark = pytest.mark.usefixtures("coarse")
-
 SIZE = 8
 EYE = jnp.array([1.0, 2.5, 2.0])
 GLOSSY = CookTorrance(diffuse=0.5, specular=0.5, roughness=0.5, f0=0.4)
 CAMERA = Camera(EYE, [0.0, 0.5, 0.0], [0.0, 1.0, 0.0], 1.0, 24, 16)
 NAMES = ["floor", "ball", "wall"]
 BOUNDS = np.cumsum([36, 34])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse, bound):
+    """Small maps, and bounces of few directions."""
+    with pytest.MonkeyPatch.context() as patch:
+        bound(patch, lobe.tabulate, resolution=12)
+        bound(patch, separable.factor, terms=6, resolution=16)
+        bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
+        yield
 
 
 @functools.cache
@@ -249,13 +257,8 @@ def test_gradients_in_materials_are_differences():
 
 @pytest.fixture(scope="module")
 def reflecting():
-    """The scene with one bounce, of few directions."""
-    coarser = functools.partial(bounces.precompute, edge=2, size=8, components=8, modes=8)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bounces, "precompute", coarser)
-        patch.setattr(reflection, "_TERMS", 6)
-        patch.setattr(reflection, "_RESOLUTION", 12)
-        yield prt.precompute(scene(), system=RECIPES["harmonic"], bounces=1, size=SIZE, progress=False)
+    """The scene with one bounce."""
+    return prt.precompute(scene(), system=RECIPES["harmonic"], bounces=1, size=SIZE, progress=False)
 
 
 def test_bounces_are_added_to_direct_light(reflecting):
