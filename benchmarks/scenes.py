@@ -11,6 +11,9 @@ vertices; direct light alone. `peer_error` is the noise of one of its pictures, 
 part. `bias` is the error of the sums over all pixels, with its sign. The pixels are those that the object fills.
 Pixels are means over their squares on both sides: ours of 3 x 3 points.
 
+Lines of `lobe, 2 bounces` are held to Mitsuba's pictures of as many bounces, and so are those of `lobe, no bounces`,
+which tell what bounces bring.
+
 Lines of `vertices` are of the exact sum over all texels at the vertices: what interpolating radiance between them
 leaves. Without LLVM of version 17 or newer Mitsuba is very slow.
 """
@@ -54,6 +57,8 @@ LIGHTS = {
 }
 AZIMUTH = {"duck": 0.5, "truck": 0.9, "truck, divided": 0.9, "spheres": 0.25}
 LONGEST = 0.03  # edge of divided triangles, over the diagonal of the scene
+REFLECTING = ("duck", "spheres")  # scenes that are relit with bounces too
+BOUNCES = 2
 RAMP = "ramp"  # the part whose roughness varies, which the separable system does not take
 
 
@@ -117,6 +122,27 @@ def measure(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, pi
         judge = Judge(scene, light, camera, 16 if quick else SAMPLES)
         for system, timing, drawn, held in frames(scene, relit, light, camera, quick):
             yield line((name, light_name, system), timing, judge, drawn, held)
+            if pictures is not None:
+                write(pictures / f"{file_name(name, light_name, system)}.png", drawn, judge)
+    if name in REFLECTING:
+        yield from reflected(name, scene, quick, store, pictures)
+
+
+def reflected(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None):
+    """Lines of one scene that lights itself."""
+    camera, given = camera_of(name, scene, 16 if quick else EDGE), lights(quick)
+    size, lobes = next(iter(given.values())).radiance.shape[-2], Lobes(lobes=3, texels=4) if quick else Lobes()
+    path = store and store / file_name(name, "lobe")
+    whole = precompute(scene, system=lobes, bounces=BOUNCES, size=size, path=path, progress=False)
+    direct = RelitScene(whole.scene, whole.direct, whole.shading)
+    for light_name, light in given.items():
+        judge = Judge(scene, light, camera, 16 if quick else SAMPLES, bounces=BOUNCES)
+        for system, each in {"lobe, 2 bounces": whole, "lobe, no bounces": direct}.items():
+            timing = harness.measure(
+                lambda each=each, light=light: each.picture(light, camera), repeats=3 if quick else 9
+            )
+            drawn = averaged(each.picture(light, finer(camera)))
+            yield line((name, light_name, system), timing, judge, drawn, memory(each))
             if pictures is not None:
                 write(pictures / f"{file_name(name, light_name, system)}.png", drawn, judge)
 
