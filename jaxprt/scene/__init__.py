@@ -3,10 +3,10 @@
 from jaxprt.scene import builtin, camera, environment, interiors, material, mesh, occluder, texture
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
+from jaxprt.scene.formats.scene_file import load_scene
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
 from jaxprt.scene.scene import Part, Scene
-from jaxprt.scene.scene_file import load_scene
 
 __all__ = [
     "Camera",

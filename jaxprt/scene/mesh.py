@@ -10,8 +10,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
-from jaxprt.scene import mesh_file
-from jaxprt.scene.geometry import Geometry
+from jaxprt.scene.formats import mesh_file
+from jaxprt.scene.formats.geometry import Geometry
 from jaxprt.sphere import directions
 
 _CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alone is as near to it as this.

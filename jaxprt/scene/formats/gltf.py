@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxprt.scene import gltf_geometry
 from jaxprt.scene.camera import Camera
-from jaxprt.scene.file_parts import split_parts
-from jaxprt.scene.gltf_file import Document, damage_named
-from jaxprt.scene.gltf_material import MaterialReader
+from jaxprt.scene.formats import gltf_geometry
+from jaxprt.scene.formats.file_parts import split_parts
+from jaxprt.scene.formats.gltf_file import Document, damage_named
+from jaxprt.scene.formats.gltf_material import MaterialReader
 from jaxprt.scene.scene import Scene
 
 _HONORED = {

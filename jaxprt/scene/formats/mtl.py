@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt.files import images
+from jaxprt.scene.formats.mesh_file import statement
 from jaxprt.scene.material import Texture, TexturedMaterial
-from jaxprt.scene.mesh_file import statement
 
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
 _NUMBERS = {"Ns", "Ni", "Pr", "Pm", "illum"}

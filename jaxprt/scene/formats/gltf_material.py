@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxprt.files import images
-from jaxprt.scene.gltf_file import Document
+from jaxprt.scene.formats.gltf_file import Document
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxprt.scene import gltf_file, gltf_geometry
-from jaxprt.scene.geometry import Geometry, joined
+from jaxprt.scene.formats import gltf_file, gltf_geometry
+from jaxprt.scene.formats.geometry import Geometry, joined
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # Names may hold a #, as in Blender's "Material_#25".

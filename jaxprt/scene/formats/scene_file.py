@@ -4,8 +4,8 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from jaxprt.scene import gltf, mesh_file, mitsuba_dict, mtl
-from jaxprt.scene.file_parts import split_parts
+from jaxprt.scene.formats import gltf, mesh_file, mitsuba_dict, mtl
+from jaxprt.scene.formats.file_parts import split_parts
 from jaxprt.scene.scene import Scene
 
 

@@ -13,13 +13,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.scene import environment, mesh_file
+from jaxprt.scene import environment
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.file_parts import split_parts
-from jaxprt.scene.geometry import Geometry, placed
+from jaxprt.scene.formats import mesh_file
+from jaxprt.scene.formats.file_parts import split_parts
+from jaxprt.scene.formats.geometry import Geometry, placed
+from jaxprt.scene.formats.mitsuba_material import MaterialMaker, rgb
 from jaxprt.scene.mesh import grid_face
-from jaxprt.scene.mitsuba_material import MaterialMaker, rgb
 from jaxprt.scene.scene import Part, Scene
 
 _CELLS, _RINGS = 32, 64  # How finely rectangles and sides of cubes, and spheres, are divided: light is at vertices.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxprt.scene import texture
-from jaxprt.scene.geometry import Geometry
+from jaxprt.scene.formats.geometry import Geometry
 from jaxprt.scene.material import TexturedMaterial
 from jaxprt.scene.mesh import Mesh, brush, from_file, split
 from jaxprt.scene.scene import Part, numbered

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxprt.scene.geometry import Geometry, joined, placed
-from jaxprt.scene.gltf_file import Document
+from jaxprt.scene.formats.geometry import Geometry, joined, placed
+from jaxprt.scene.formats.gltf_file import Document
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
