@@ -142,6 +142,7 @@ HOST = {
     "systems.bounces.relight.collect": "takes half precision; the same",
     "systems.bounces.relight.weights": "takes half precision; the same",
     "systems.bounces.relight.combine": "takes indices; the same",
+    "systems.bounces.relight.gathered": "takes half precision; the same",
     "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
     "systems.separable.published": "checks values",
     "systems.lobe.published": "checks values",
@@ -765,6 +766,16 @@ EXAMPLES = {
     "systems.harmonic.relight.view_coefficients": example(
         lambda draw: call(draw.harmonic(5), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
         gradient=("brdf", "position", "eye"),
+    ),
+    "systems.harmonic.system.blended_view": example(
+        lambda draw: call(
+            draw.harmonic(5),
+            (m := draw.matrix()).position,
+            m.frame,
+            jaxprt.Blend(draw.normal(3, 3, 2)),
+            eye=draw.above(m),
+        ),
+        gradient=("brdf", "position", "materials", "eye"),
     ),
     "systems.harmonic.relight.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
     "systems.separable.relight.project": example(lambda draw: call(draw.light())),
