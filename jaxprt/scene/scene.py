@@ -31,7 +31,7 @@ class Part(eqx.Module):
             for 1 everywhere.
 
     Raises:
-        TypeError: The mesh is no mesh, or the material is neither a `TexturedMaterial` nor callable.
+        TypeError: The name is no text, the mesh no mesh, or the material is neither a `TexturedMaterial` nor callable.
         ValueError: The mesh has no vertices or faces, an array does not have one row per vertex or is not finite, or
             the material has textures and the mesh does not have the coordinates that they take.
     """
@@ -44,7 +44,9 @@ class Part(eqx.Module):
     handedness: Float[Array, " v"] | None = None
 
     def __check_init__(self):
-        """Refuses parts without vertices, and what does not belong to their vertices."""
+        """Refuses names that are no text, parts without vertices, and what does not belong to their vertices."""
+        if not isinstance(self.name, str):
+            raise TypeError(f"the name of a part must be text, got {self.name!r}")
         require.kind(f"the mesh of part {self.name!r}", self.mesh, Mesh, source="scene.make_mesh or load_mesh")
         count = len(self.mesh.position)
         if not count or not len(self.mesh.face):

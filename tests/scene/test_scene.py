@@ -90,6 +90,7 @@ def test_the_parameters_of_a_part_are_those_at_its_vertices(close):
         (lambda: Scene([BALL]), TypeError, "each of the scene's parts must be of class Part"),
         (lambda: Scene(scene().parts, [BALL]), TypeError, "each of the scene's cameras must be of class Camera"),
         (lambda: Scene(scene().parts, (), [1]), TypeError, "the scene's environments must be of class Environment"),
+        (lambda: Part(3, BALL, brdf.Lambert()), TypeError, "the name of a part must be text, got 3"),
         (lambda: Part("a", [1], brdf.Lambert()), TypeError, "the mesh of part 'a' must be of class Mesh"),
         (
             lambda: Part("a", BALL, "wood"),
