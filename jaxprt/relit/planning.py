@@ -191,8 +191,8 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
 def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):
     """Candidates of each system: by bisection, those around the first step of its ladder that meets the error.
 
-    Steps that must have more bytes than what meets the error and the rate already are left out, and so is a search
-    among smaller steps that could not save a tenth.
+    Steps that must have more bytes than what meets the error and the rate already are left out, and so are those that
+    are too near to one that misses the error by far, and a search among smaller steps that could not save a tenth.
     """
     if isinstance(sample.shading.brdf, Lambert):
         ladders: list[tuple] = [_DIFFUSE]
@@ -201,16 +201,14 @@ def _considered(sample: Sample, folder: pathlib.Path | None, error: float, secon
     fewest = math.inf
     for ladder in ladders:
         least = [sample.least_bytes(recipe) for recipe in ladder]
-        low, high = 0, len(ladder)
-        while low < high:  # Errors fall along a ladder.
+        low, high = 0, sum(each <= fewest for each in least)
+        while low < high:  # Errors fall along a ladder, at most by half from step to step.
             middle = (low + high) // 2
-            if least[middle] > fewest:
-                high = middle
-                continue
             each = _measured(sample, ladder[middle], folder)
             yield each
             if each.error * MARGIN > error:
-                low = middle + 1
+                halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
+                low = min(middle + max(1, int(halvings)), max(middle + 1, len(ladder) - 1))
                 continue
             high = middle
             if each.seconds <= seconds:

@@ -208,11 +208,12 @@ class Clusters(eqx.Module):
         return _bright(system, lobe.bits(known.pyramid), shading, self.texels, visible.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Bytes of the visibility of single texels, weights, cores and modes."""
+        """Bytes of the visibility of single texels, weights, cores, modes, and gray maps."""
         clusters, terms, sizes = self._sizes(shading, vertices, size)
         components, modes, keep = sizes.values()
         bits = 6 * size**2 // 8 if self.texels else 0
-        return vertices * (bits + 4 * components) + 2 * clusters * modes * (keep + components * terms)
+        maps = 2 * 4 * terms * self.resolution**2
+        return vertices * (bits + 4 * components) + 2 * clusters * modes * (keep + components * terms) + maps
 
     def _sizes(self, shading: Shading, vertices: int, size: int) -> tuple[int, int, dict[str, int]]:
         """Clusters, terms, and options of the compression, as far as vertices and texels allow them."""
