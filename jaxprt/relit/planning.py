@@ -28,6 +28,7 @@ from jaxprt.visibility import blocks
 
 MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
 _SAVING = 0.1  # of the bytes: what is worth measuring another candidate for
+_SLOW = 2.0  # times the bytes of what is too slow may be measured for what is faster
 
 # Steps up in size, the cheapest first. Terms, resolution, components, modes, coefficients and texels are in balance.
 _DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
@@ -191,30 +192,31 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
 def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):
     """Candidates of each system: by bisection, those around the first step of its ladder that meets the error.
 
-    Steps that must have more bytes than what meets the error and the rate already are left out, and so are those that
-    are too near to one that misses the error by far, and a search among smaller steps that could not save a tenth.
+    Left out are steps that must have more bytes than what meets the error already, twice as many if that is too slow;
+    those that are too near to one that misses the error by far; and smaller ones that could not save a tenth.
     """
     if isinstance(sample.shading.brdf, Lambert):
         ladders: list[tuple] = [_DIFFUSE]
     else:
         ladders = [_HARMONIC, _LOBES] + ([] if sample.shading.knot else [_TERMS])
-    fewest = math.inf
+    most = math.inf  # bytes of what is worth measuring
     for ladder in ladders:
         least = [sample.least_bytes(recipe) for recipe in ladder]
-        low, high = 0, sum(each <= fewest for each in least)
+        low, high = 0, sum(each <= most for each in least)
         while low < high:  # Errors fall along a ladder, at most by half from step to step.
             middle = (low + high) // 2
             each = _measured(sample, ladder[middle], folder)
             yield each
             if each.error * MARGIN > error:
                 halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
-                low = min(middle + max(1, int(halvings)), max(middle + 1, len(ladder) - 1))
+                low = middle + max(1, int(halvings))
+                if most == math.inf:  # Nothing meets the error yet: the best must be known.
+                    low = min(low, max(middle + 1, len(ladder) - 1))
                 continue
-            high = middle
-            if each.seconds <= seconds:
-                fewest = min(fewest, each.nbytes)
-                if least[0] > (1 - _SAVING) * each.nbytes:
-                    break
+            high, fast = middle, each.seconds <= seconds
+            most = min(most, each.nbytes if fast else _SLOW * each.nbytes)
+            if fast and least[0] > (1 - _SAVING) * each.nbytes:
+                break
 
 
 def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Candidate:
