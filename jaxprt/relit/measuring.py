@@ -1,5 +1,6 @@
 """Scenes and recipes measured on samples of their vertices: errors by the exact sum, times and bytes."""
 
+import dataclasses
 import math
 import statistics
 import time
@@ -143,7 +144,8 @@ def lights_of(scene: Scene) -> tuple[Environment, ...]:
     return scene.environments or (builtin.daylight(), builtin.studio())
 
 
-class Sample(eqx.Module):
+@dataclasses.dataclass(frozen=True)
+class Sample:
     """Some vertices of a part, and what is known of them.
 
     Attributes:

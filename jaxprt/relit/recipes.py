@@ -1,5 +1,6 @@
 """How to make a part of a scene ready for a system: the sizes, and the calls that they take."""
 
+import dataclasses
 import functools
 import os
 import pathlib
@@ -51,7 +52,8 @@ class Known:
         return made.truncate(terms)
 
 
-class Target(eqx.Module):
+@dataclasses.dataclass(frozen=True)
+class Target:
     """What a part is made ready for, and where that is done.
 
     Attributes:
