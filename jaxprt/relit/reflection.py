@@ -20,7 +20,6 @@ from jaxprt.systems.harmonic import TransferVector
 
 MOST = 2  # bounces
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
-_LEAST = 1e-3  # of what arrives: functions that bring less are left out
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
 _VIEWS = 16  # over whose angles albedo is averaged
 _RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
@@ -39,7 +38,8 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
     """
     mesh = _joined(shadings)
     paths = [_factored(each) for each in shadings]
-    tensor = bounces.precompute(mesh, paths, bounces=count, least=_LEAST, **target.options("bounces"))
+    # Nothing is left out: how many bounces there are is decided, and materials may change to what brings more.
+    tensor = bounces.precompute(mesh, paths, bounces=count, **target.options("bounces"))
     frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
     parts = [
         ReflectingPart(each.mesh.position, axes, harmonic_table(each, degree=DEGREE))

@@ -285,6 +285,19 @@ def test_a_part_sends_the_color_of_its_material_at_present(reflecting):
     assert np.all(red[1:] < 0.9 * white[1:])
 
 
+def test_a_second_bounce_off_a_material_of_channels_is_kept():
+    red = TexturedMaterial(base_color=(0.8, 0.1, 0.1), metallic=0.0, roughness=0.8)
+    parts = [Part("floor", mesh("floor"), Lambert(0.7)), Part("wall", mesh("wall"), red)]
+    once, twice = (
+        prt.precompute(Scene(parts), system=RECIPES["harmonic"], bounces=count, size=SIZE, progress=False)
+        for count in (1, 2)
+    )
+    assert twice.bounces.tensor.second is not None
+    blends = [each.blend for each in once.shading]
+    first, both = (prt.radiance(each.bounces, light(), eye=EYE, materials=blends)[:, 0].sum() for each in (once, twice))
+    assert 1.03 < both / first < 1.5
+
+
 def test_a_report_of_bounces_has_the_errors_of_direct_light(reflecting):
     found, direct = (each.report([light()]) for each in (reflecting, relit("harmonic")))
     for mine, other in zip(found.part, direct.part, strict=True):
