@@ -56,14 +56,17 @@ def precompute(
         The scene, ready for `radiance` and `picture`.
 
     Raises:
-        TypeError: No scene, a system of another kind, or a material that no system can have.
-        ValueError: There is no such system or part, the size is no power of two, there are more than 2 bounces, a
+        TypeError: No scene, a system of another kind, bounces that are no whole number, or a material that no system
+            can have.
+        ValueError: There is no such system or part, the size is no power of two, bounces are not from 0 to 2, a
             part's material is not one that its system can have, or the store at `path` was made from something else.
         NotADirectoryError: There is a file at `path`.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
         raise ValueError(f"size must be a power of two, got {size!r}")
+    if bounces is not None and not (type(bounces) is int or isinstance(bounces, np.integer)):
+        raise TypeError(f"bounces must be a whole number, got {bounces!r}")
     require.between("bounces", bounces, 0, reflection.MOST)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:

@@ -401,10 +401,16 @@ def test_systems_that_a_scene_cannot_have_are_refused_before_rays_are_traced(nam
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_sizes_and_scenes_of_another_kind_are_refused():
+def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for size in (0, 12, -8):
         with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
             prt.precompute(scene(), system="harmonic", size=size)
+    for count in (-1, 3):
+        with pytest.raises(ValueError, match=f"bounces must be between 0 and 2, got {count}"):
+            prt.precompute(scene(), system="harmonic", bounces=count)
+    for count in (1.5, "2", True):
+        with pytest.raises(TypeError, match=f"bounces must be a whole number, got {count!r}"):
+            prt.precompute(scene(), system="harmonic", bounces=count)
     with pytest.raises(
         TypeError, match=r"the scene must be of class Scene, which jaxprt\.load_scene makes, got one of"
     ):
