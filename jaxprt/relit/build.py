@@ -88,7 +88,8 @@ def precompute(
         systems.append(recipes[part.name].make(shading, target))
     reflected = None
     if bounces:
-        target = Target(mesh, path=folder and folder / f"{bounces}", executor=executor, progress=progress)
+        # One store for one bounce and two: the second goes on from the first.
+        target = Target(mesh, path=folder and folder / "scene", executor=executor, progress=progress)
         reflected = reflection.make(shadings, bounces, target)
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
 

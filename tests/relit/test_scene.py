@@ -4,6 +4,7 @@ The scene is a floor of a textured material, a ball of a plain BRDF above it, an
 """
 
 import functools
+import pathlib
 import re
 
 import equinox as eqx
@@ -296,6 +297,28 @@ def test_a_second_bounce_off_a_material_of_channels_is_kept():
     blends = [each.blend for each in once.shading]
     first, both = (prt.radiance(each.bounces, light(), eye=EYE, materials=blends)[:, 0].sum() for each in (once, twice))
     assert 1.03 < both / first < 1.5
+
+
+def test_two_bounces_go_on_from_the_store_of_one(tmp_path, monkeypatch):
+    def reflected(count):
+        options = {"system": RECIPES["harmonic"], "size": SIZE, "path": tmp_path / "store", "progress": False}
+        ready = prt.precompute(scene(), bounces=count, **options)
+        return prt.radiance(ready.bounces, light(), eye=EYE, materials=[each.blend for each in ready.shading])
+
+    once = reflected(1)
+    stage, done = visibility.blocks.compute, []
+
+    def counted(job, **options):
+        name = pathlib.Path(options["path"]).name
+        if not pathlib.Path(options["path"]).exists():
+            done.append(name)
+        return stage(job, **options)
+
+    monkeypatch.setattr(visibility.blocks, "compute", counted)
+    twice = reflected(2)
+    assert done == ["clusters_2"]
+    assert np.linalg.norm(twice) > 1.01 * np.linalg.norm(once)
+    np.testing.assert_array_equal(reflected(1), once)
 
 
 def test_a_report_of_bounces_has_the_errors_of_direct_light(reflecting):
