@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         "--bounces",
         type=int,
         choices=[0, 1, 2],
-        help="of light between parts (default: planned: what is worth it, dynamic: 2, others: 0)",
+        help="how often parts reflect light onto each other (default 2 for dynamic, 0 for others; planned decides)",
     )
     parser.add_argument(
         "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"

@@ -70,8 +70,8 @@ class Plan(eqx.Module):
 
     Attributes:
         part: One plan for each part of the scene.
-        reflected: How much of each part's light was reflected once at least before, and twice at least: relative L2,
-            estimated for matte surfaces.
+        reflected: Fraction of each part's radiance that other surfaces reflected at least once (row 0) and at least
+            twice (row 1): relative L2, estimated for matte surfaces.
         bounces: As many as leave no more than the error of any part's light out.
         asked: The error that was asked for.
         rate: Frames per second that were asked for.

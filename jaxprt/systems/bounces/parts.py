@@ -20,7 +20,7 @@ from jaxprt.systems.protocol import Blend
 
 
 class ReflectingPart(eqx.Module):
-    """The vertices of a part, and what they make of light that arrives as harmonics.
+    """The vertices of a part, and the BRDF with which they reflect arriving light, given in harmonics.
 
     Attributes:
         position: Positions of the vertices.
