@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 from benchmarks import harness, path_tracing, prb
 from jaxprt import bright_texels, harmonic, inverse, lobe, reference, scene
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.image import raster
+from jaxprt.image import interpolate, raster
 from jaxprt.scene import Camera, Environment, Mesh, builtin, camera, load_environment, load_mesh
 from jaxprt.sphere import cubemap, harmonics
 from jaxprt.systems.lobe import LobeBrdf
@@ -287,7 +287,7 @@ def drawn(mesh: Mesh, models: Sequence[Any], light: Environment, view: Camera, e
     for number, model in enumerate(models):
         own = shown[region == number]
         color[own] = reference.radiance(mesh, model, light, eye=view.eye, vertex=own)
-    return np.asarray(raster.interpolate(fragments, mesh.face, jnp.asarray(color)))
+    return np.asarray(interpolate(fragments, mesh.face, jnp.asarray(color)))
 
 
 def wrong(determined, found, true) -> float:

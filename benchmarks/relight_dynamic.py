@@ -31,7 +31,7 @@ import numpy as np
 from benchmarks import compression, harness
 from jaxprt import bright_texels, dynamic, lobe, reference, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, navigation
-from jaxprt.image import raster
+from jaxprt.image import interpolate, raster
 from jaxprt.scene import Environment, Mesh, builtin, camera, environment, load_mesh
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import hemisphere
@@ -236,7 +236,7 @@ def gradient(
     def loss(light, diffuse, specular, coordinate):
         first = dynamic.Material(plane.weight(coordinate), diffuse, specular)
         color = dynamic.radiance(transport, brdfs, [first, fixed[1]], Environment(light), eye=view.eye, texels=TEXELS)
-        return jnp.mean(raster.interpolate(fragments, mesh.face, color) ** 2)
+        return jnp.mean(interpolate(fragments, mesh.face, color) ** 2)
 
     each = (triple.light.radiance, *map(jnp.asarray, (triple.diffuse, triple.specular, triple.coordinate)))
     slope, alone = harness.compare(lambda: jax.grad(loss, (0, 1, 2, 3))(*each), lambda: loss(*each), repeats=repeats)

@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks import harness, path_tracing
 from jaxprt import RelitScene, files, image, memory, precompute, reference
-from jaxprt.image import raster
+from jaxprt.image import raster, render
 from jaxprt.relit import Harmonics, Lobes, Terms
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import (
@@ -156,7 +156,7 @@ def frames(scene: Scene, relit: Mapping[str, RelitScene], light: Environment, ca
     color = exact_radiance(scene, light, camera)
     timing = harness.Timing(time.perf_counter() - start, 0.0, 1)  # with compiling, since it is slow
     sky = background(light, raster.ray_direction(finer(camera)))
-    drawn = raster.render(scene.mesh, jnp.asarray(color), finer(camera), background=sky)
+    drawn = render(scene.mesh, jnp.asarray(color), finer(camera), background=sky)
     yield "vertices", timing, averaged(drawn), color.nbytes
 
 
@@ -222,7 +222,7 @@ def traced_parts(scene: Scene) -> list[tuple[Mesh, Any]]:
 
 def exact_radiance(scene: Scene, light: Environment, camera: Camera) -> np.ndarray:
     """Radiance of the vertices of what is seen, by summing all texels; zero for others."""
-    triangle = np.asarray(raster.rasterize(scene.mesh, finer(camera)).triangle)
+    triangle = np.asarray(raster.rasterize(scene.mesh, finer(camera), samples=4).triangle)
     seen = np.unique(np.asarray(scene.mesh.face)[np.unique(triangle[triangle >= 0])])
     color = np.zeros((len(scene.mesh.position), 3), np.float32)
     first = 0

@@ -35,7 +35,7 @@ from jaxprt import lobe as lobe_system
 from jaxprt import separable as separable_system
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
-from jaxprt.image import raster
+from jaxprt.image import Pixels, raster
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -51,6 +51,8 @@ HOST = {
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
     "image.raster.front": "gives truth values",
+    "image.raster.front_faces": "the same",
+    "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
     "visibility.rays": "traces rays",
     "visibility.blocks": "runs workers and writes files",
     "systems.separable.wavelets.precompute": "traces rays",
@@ -242,6 +244,17 @@ class Draw:
         weight, depth = np.asarray(self.uniform(height, width, 3)), self.uniform(height, width)
         weight = self.array(weight / weight.sum(-1, keepdims=True))
         return raster.Fragments(self.integer(2, height, width), weight, depth)
+
+    def pixels(self, height=5, width=6):
+        """Points of ``mesh``, two in each pixel but the last two, which show more of the background."""
+        count = 2 * height * width
+        weight, slope = np.asarray(self.uniform(count, 3)), self.normal(count, 2, 3)
+        weight = self.array(weight / weight.sum(-1, keepdims=True))
+        coverage = self.array(np.where(np.arange(count) < count - 4, 0.25, 0))
+        background = self.array(np.where(np.arange(count // 2) < count // 2 - 2, 0.5, 1).reshape(height, width))
+        triangle = jnp.where(coverage > 0, self.integer(2, count), -1)
+        pixel = jax.device_put(np.minimum(np.arange(count, dtype=np.int32) // 2, count // 2 - 1))
+        return Pixels(triangle, weight, slope, pixel, coverage, background)
 
     def light(self, size=4):
         """An environment."""
@@ -609,11 +622,16 @@ EXAMPLES = {
     "image.raster.view_axes": example(lambda draw: call(draw.camera())),
     # What is seen is constant for derivatives.
     "image.raster.rasterize": example(lambda draw: call(draw.mesh(), draw.camera()), gradient=()),
-    "image.raster.interpolate": example(
+    "image.raster.project": example(lambda draw: call(draw.mesh().position, draw.camera())),
+    "image.pixels.interpolate": example(
         lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)),
         gradient=("attribute",),
     ),
-    "image.raster.render": example(
+    "image.pixels.resolve": example(
+        lambda draw: call(draw.pixels(), draw.normal(60, 3), background=draw.uniform(5, 6, 3)),
+        gradient=("color", "background"),
+    ),
+    "image.pixels.render": example(
         lambda draw: call(draw.mesh(), draw.normal(6, 3), draw.camera(), background=draw.uniform(5, 6, 3)),
         gradient=("color",),  # The background is hidden here.
     ),

@@ -7,7 +7,7 @@ import pytest
 from benchmarks import path_tracing, plugins
 from jaxprt import reference
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
-from jaxprt.image import raster
+from jaxprt.image import pixels, raster
 from jaxprt.scene import Camera, Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap
@@ -129,7 +129,7 @@ def test_silhouette_is_that_of_the_rasterizer(camera):
     white = Environment(jnp.ones((6, 4, 4, 3)))
     ball = builtin.sphere()
     covered = path_tracing.picture(ball, [Lambert(1.0)], white, camera, depth=2, samples=256)[..., 0]
-    expected = np.asarray(raster.render(ball, jnp.ones((len(ball.position), 1)), camera))[..., 0]
+    expected = np.asarray(pixels.render(ball, jnp.ones((len(ball.position), 1)), camera))[..., 0]
     # A convex white body in white light has its light's radiance, so that pixels show which part of them it covers.
     np.testing.assert_allclose(covered.sum(), expected.sum(), rtol=0.02)
     assert np.sum((covered > 0.5) != (expected > 0.5)) <= 3
@@ -152,7 +152,7 @@ def test_direct_light_is_that_of_the_reference(scene, camera, light):
     for number, material in enumerate(MATERIALS):
         vertex = asked[region[asked] == number]
         color[vertex] = reference.radiance(scene, material, light, eye=camera.eye, vertex=vertex)
-    expected = np.asarray(raster.interpolate(fragments, scene.face, jnp.asarray(color)))[inner]
+    expected = np.asarray(pixels.interpolate(fragments, scene.face, jnp.asarray(color)))[inner]
 
     def error(materials, samples):
         image = path_tracing.picture(scene, materials, light, camera, depth=2, samples=samples)[inner]

@@ -55,9 +55,9 @@ def test_a_diffuse_ball_in_white_light_has_no_dark_rim(scene, system):
     mesh, camera, visible = scene
     color = system(mesh, visible, camera.eye)
     picture = np.asarray(prt.image.render(mesh, color, camera))[..., 0]
-    inside = np.asarray(prt.image.rasterize(mesh, camera).triangle) >= 0
-    np.testing.assert_allclose(picture[inside], ALBEDO, rtol=QUADRATURE)
-    assert not picture[~inside].any()
+    coverage = np.mean(np.asarray(prt.image.rasterize(mesh, camera, samples=4).triangle) >= 0, -1)
+    np.testing.assert_allclose(picture, ALBEDO * coverage, rtol=QUADRATURE)
+    assert (coverage > 0).mean() > 0.5
 
 
 def test_the_back_of_a_surface_is_black(scene):

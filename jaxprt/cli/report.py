@@ -118,7 +118,7 @@ def exact(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
 
 def visible(view: View) -> np.ndarray:
     """Numbers of the triangles in the picture."""
-    triangle = np.unique(np.asarray(image.rasterize(view.scene.mesh, view.camera).triangle))
+    triangle = np.unique(np.asarray(image.rasterize(view.scene.mesh, view.camera, samples=4).triangle))
     return triangle[triangle >= 0]
 
 

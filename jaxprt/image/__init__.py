@@ -1,11 +1,13 @@
 """Images: drawing a mesh, showing radiance, comparing pictures."""
 
 from jaxprt.image.metrics import flip, psnr, relative_l2
-from jaxprt.image.raster import Fragments, front, interpolate, rasterize, ray_direction, render
+from jaxprt.image.pixels import Pixels, interpolate, render, resolve, shading_points
+from jaxprt.image.raster import Fragments, front, rasterize, ray_direction
 from jaxprt.image.tonemap import automatic_exposure, decode_srgb, display, encode_srgb, expose
 
 __all__ = [
     "Fragments",
+    "Pixels",
     "automatic_exposure",
     "decode_srgb",
     "display",
@@ -19,4 +21,6 @@ __all__ = [
     "ray_direction",
     "relative_l2",
     "render",
+    "resolve",
+    "shading_points",
 ]

@@ -1,13 +1,17 @@
-"""Rasterization: which triangle every pixel sees, and attributes carried from vertices to pixels.
+"""Rasterization: which triangle every pixel, or each of its samples, sees.
 
 Triangles are drawn in homogeneous coordinates (Olano and Greer 1997): nothing is clipped, a pixel is inside where the
 three determinants of the pixel and two vertices have one sign. With every vertex scaled to w = +1 or -1 a determinant's
 sign is the comparison of two products that a shared edge computes alike from both sides, in any precision.
 """
 
+import functools
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxprt.scene.camera import Camera
@@ -16,102 +20,93 @@ from jaxprt.scene.mesh import Mesh
 FACES = (1 << 24) - 1  # Triangles whose numbers a float32 holds exactly.
 PATCH = 3  # Pixels along the edge of the square patches that triangles are cut into.
 CHUNK = 1 << 13  # Patches drawn at once; CHUNK * (CHUNK + 1) must fit in an int32.
+EDGE_ON = 1e-3  # Sine of the angle between a triangle and the view within which the triangle counts as front.
 TILE = 8  # Pixels along the edge of the tiles whose farthest depth hides what lies behind.
 
 
+# Where the samples of a pixel lie, in pixels to the right and down from its center. The four lie on a rotated grid:
+# each has a column and a row of its own. They are the cells of a grid twice as fine, with centers moved by SHIFT cells:
+# to the right in its even rows and to the left in odd ones, up in even columns and down in odd ones.
+SHIFT = 0.25
+SAMPLES = {1: np.zeros((1, 2)), 4: np.array([[-1, -3], [3, -1], [-3, 1], [1, 3]]) / 8}
+
+
 class Fragments(eqx.Module):
-    """What every pixel sees.
+    """What every pixel sees, or each of its samples: fields of pictures with several samples have them as an axis.
 
     Attributes:
-        triangle: Number of the nearest triangle at the pixel's center, -1 where there is none.
+        triangle: Number of the nearest triangle, -1 where there is none.
         barycentric: Perspective-correct weights of its three vertices; they sum to 1, or are 0 where nothing is seen.
+            None where pixels have several samples: `shading_points` gives the weights at the points that are shaded.
         depth: Distance along the view axis in world units, infinite where nothing is seen.
     """
 
-    triangle: Int[Array, "h w"]
-    barycentric: Float[Array, "h w 3"]
-    depth: Float[Array, "h w"]
+    triangle: Int[Array, "h w *s"]
+    barycentric: Float[Array, "h w 3"] | None
+    depth: Float[Array, "h w *s"]
 
 
-@jax.jit
-def rasterize(mesh: Mesh, camera: Camera) -> Fragments:
-    """Finds the nearest triangle at every pixel's center.
+@functools.partial(jax.jit, static_argnames="samples")
+def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
+    """Finds the nearest triangle at every pixel's center, or at four samples in every pixel.
 
-    Both sides of a triangle are drawn, and triangles may reach behind the camera. A center on a shared edge or vertex
+    Both sides of a triangle are drawn, and triangles may reach behind the camera. A sample on a shared edge or vertex
     belongs to exactly one of the triangles around it: as if it lay a hair's breadth to the right, and a hair's of that
     further down. Among equal depths the triangle with the lowest number wins. Triangles without area or with vertices
     that are not finite draw nothing. The result is constant for derivatives. In
     float32 depths of triangles a thousand times larger than their distance are good to four digits.
 
+    Args:
+        mesh: What is drawn.
+        camera: From where.
+        samples: 1 for pixels' centers, with fields [h, w], or 4 for a rotated grid, with fields [h, w, 4].
+
     Raises:
-        ValueError: The mesh has no triangle or more than 2^24 - 1, or the picture has no pixel.
+        ValueError: The mesh has no triangle or more than 2^24 - 1, the picture has no pixel, or `samples` is neither
+            1 nor 4.
 
     Reference: Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates".
     """
+    if samples not in SAMPLES:
+        raise ValueError(f"samples must be 1 or 4, got {samples}")
     if not 0 < mesh.face.shape[0] <= FACES or camera.width < 1 or camera.height < 1:
         raise ValueError(
             f"rasterize needs 1 to {FACES} triangles and at least one pixel, got "
             f"{mesh.face.shape[0]} triangles and {camera.height} x {camera.width} pixels"
         )
     mesh, camera = jax.lax.stop_gradient((mesh, camera))
-    x, y, q = (axis[mesh.face.T] for axis in _project(mesh.position, camera))
-    depth, triangle = _nearest(x, y, q, camera.height, camera.width)
+    x, y, q = (axis[mesh.face.T] for axis in project(mesh.position, camera))
+    depth, triangle = _nearest(x, y, q, camera.height, camera.width, samples)
+    if samples > 1:
+        return Fragments(triangle, None, depth)
+    depth, triangle = depth[..., 0], triangle[..., 0]
     return Fragments(triangle, _barycentric(triangle, x, y, q, camera), depth)
 
 
 @jax.jit
-def interpolate(
-    fragments: Fragments, face: Int[Array, "f 3"], attribute: Float[Array, "v *c"]
-) -> Float[Array, "h w *c"]:
-    """Carries an attribute of the vertices to the pixels.
+def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w *s"]:
+    """Whether each pixel or sample shows the front of a surface, whose back is black.
 
-    Zero where nothing is seen. Linear, hence differentiable, in the attribute; the derivative with respect to a
-    vertex is the weight that the pixels give it.
+    See `front_faces`.
     """
-    seen = fragments.triangle >= 0
-    vertex = face[jnp.maximum(fragments.triangle, 0)]
-    wide = (*seen.shape, *(1,) * (attribute.ndim - 1))
-    floating = jnp.issubdtype(attribute.dtype, jnp.floating)
-    weight = fragments.barycentric.astype(attribute.dtype) if floating else fragments.barycentric
-    total = sum(weight[..., i].reshape(wide) * attribute[vertex[..., i]] for i in range(3))
-    return jnp.where(seen.reshape(wide), total, 0)
+    return front_faces(mesh, camera)[fragments.triangle] & (fragments.triangle >= 0)
 
 
 @jax.jit
-def render(
-    mesh: Mesh, color: Float[Array, "v c"], camera: Camera, *, background: Float[Array, "h w c"] | None = None
-) -> Float[Array, "h w c"]:
-    """Draws a mesh whose vertices have colors.
+def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
+    """Whether the camera is on the front of each triangle: on the side that its shading normals point to.
 
-    Differentiable in the colors and the background, constant in the geometry and the camera. Callers that draw one
-    view many times keep the result of `rasterize` and call `interpolate`.
-
-    Args:
-        mesh: What is drawn. Its back, see `front`, is black.
-        color: Linear radiance of each vertex towards the camera.
-        camera: From where.
-        background: What is seen past the mesh; black if not given.
-
-    Raises:
-        ValueError: There is not one color per vertex, or as in `rasterize`.
+    The triangle's plane decides. Shading normals of a coarse mesh may look away from the eye where the triangle does
+    not; they only tell its two sides apart. A triangle whose mean shading normal is zero has two fronts.
     """
-    if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
-        raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
-    fragments = rasterize(mesh, camera)
-    image = jnp.where(front(fragments, mesh, camera)[..., None], interpolate(fragments, mesh.face, color), 0)
-    if background is None:
-        return image
-    return jnp.where((fragments.triangle >= 0)[..., None], image, background)
-
-
-@jax.jit
-def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w"]:
-    """Whether each pixel shows the front of a surface: not all three vertices of its triangle look away from the eye.
-
-    At silhouettes normals of a triangle point to both sides, and it counts as front. The back of a surface is black.
-    """
-    away = jnp.sum(mesh.normal * (camera.eye - mesh.position), -1) < 0
-    return ~jnp.all(away[mesh.face], -1)[fragments.triangle] & (fragments.triangle >= 0)
+    corner = [mesh.position[mesh.face[:, i]] - camera.eye for i in range(3)]
+    plane = jnp.cross(corner[1] - corner[0], corner[2] - corner[0])
+    side = jnp.sum(plane * sum(mesh.normal[mesh.face[:, i]] for i in range(3)), -1)
+    middle = sum(corner)
+    distance = -jnp.sum(plane * middle, -1)
+    # Rounding may turn triangles that are seen edge-on.
+    edge = EDGE_ON * jnp.sqrt(jnp.sum(plane**2, -1) * jnp.sum(middle**2, -1))
+    return (jnp.sign(side) * distance >= -edge) | (side == 0)
 
 
 @jax.jit
@@ -154,7 +149,7 @@ def _centers(camera: Camera) -> tuple[Float[Array, "1 w"], Float[Array, "h 1"]]:
     return column, row
 
 
-def _project(position: Float[Array, "v 3"], camera: Camera) -> tuple[Float[Array, " v"], ...]:
+def project(position: Float[Array, "v 3"], camera: Camera) -> tuple[Float[Array, " v"], ...]:
     """Vertices as (x, y, q): homogeneous pixel coordinates scaled to w = +1 or -1, and q = 1 / (w before that).
 
     Pixels are counted to the right and down from the picture's middle, so that vertices near it keep their digits.
@@ -166,8 +161,8 @@ def _project(position: Float[Array, "v 3"], camera: Camera) -> tuple[Float[Array
     least = 1e-6 * jnp.sqrt(right**2 + up**2 + w**2) + jnp.finfo(w.dtype).tiny
     w = jnp.where(w < 0, jnp.minimum(w, -least), jnp.maximum(w, least))
     q = 1 / w
-    focal = _focal(camera) * jnp.abs(q)
-    return right * focal, -up * focal, q
+    scale = _focal(camera) * jnp.abs(q)
+    return right * scale, -up * scale, q
 
 
 def _determinants(x, y, q, column, row):
@@ -212,8 +207,11 @@ def _cover(x, y, q, column, row):
     return jnp.where(inside, above / below, jnp.inf)
 
 
-def _bounds(x, y, q, height: int, width: int):
-    """First column, first row, and numbers of columns and rows of the pixels that triangles may cover."""
+def _bounds(x, y, q, height: int, width: int, shift: float):
+    """First column, first row, and numbers of columns and rows of the pixels that triangles may cover.
+
+    Points lie up to `shift` off the middle of their pixel.
+    """
     s = jnp.sign(q)
     ahead = (q[0] > 0) & (q[1] > 0) & (q[2] > 0)
     drawn = (q[0] > 0) | (q[1] > 0) | (q[2] > 0)
@@ -225,8 +223,8 @@ def _bounds(x, y, q, height: int, width: int):
         outside = jnp.maximum(jnp.maximum(left[0], left[1]), left[2]) < 0
         outside |= jnp.minimum(jnp.minimum(right[0], right[1]), right[2]) > 0
         middle = (size - 1) / 2
-        first = jnp.where(ahead, jnp.clip(jnp.ceil(low + middle), 0, size), 0).astype(jnp.int32)
-        last = jnp.where(ahead, jnp.clip(jnp.floor(high + middle), -1, size - 1), size - 1).astype(jnp.int32)
+        first = jnp.where(ahead, jnp.clip(jnp.ceil(low + (middle - shift)), 0, size), 0).astype(jnp.int32)
+        last = jnp.where(ahead, jnp.clip(jnp.floor(high + (middle + shift)), -1, size - 1), size - 1).astype(jnp.int32)
         finite = jnp.isfinite(low) & jnp.isfinite(high)
         return first, jnp.where(drawn & finite & ~outside, jnp.maximum(last - first + 1, 0), 0)
 
@@ -235,30 +233,37 @@ def _bounds(x, y, q, height: int, width: int):
     return column, row, columns, rows
 
 
-def _nearest(x, y, q, height: int, width: int) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
-    """Depth and number of the nearest triangle at every pixel.
+def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Array, "h w s"], Int[Array, "h w s"]]:
+    """Depth and number of the nearest triangle at every sample.
 
-    Draws the triangles that face the camera, then those of the others that are not plainly behind what is drawn.
+    The samples are drawn as the pixels of a picture that is finer by their number: a cell has one sample. Draws the
+    triangles that face the camera, then those of the others that are not plainly behind what is drawn.
     """
-    bounds = _bounds(x, y, q, height, width)
+    fine = math.isqrt(samples)
+    x, y = fine * x, fine * y
+    bounds = _bounds(x, y, q, fine * height, fine * width, SHIFT if fine > 1 else 0.0)
     some = (bounds[2] > 0) & (bounds[3] > 0)
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     front = area < 0  # Rows go down, so that counter-clockwise is negative. Where w < 0 the guess does not matter.
     nothing = jax.lax.complex(jnp.array(jnp.inf, x.dtype), jnp.array(-1, x.dtype))
-    nearest = _draw(jnp.full(height * width, nothing), some & front, x, y, q, bounds, width)
-    hidden = _hidden(nearest.real.reshape(height, width), q, bounds)
-    nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, width)
-    nearest = nearest.reshape(height, width)
+    nearest = jnp.full(height * width * samples, nothing)
+    nearest = _draw(nearest, some & front, x, y, q, bounds, fine * width, fine)
+    hidden = _hidden(jnp.max(nearest.real.reshape(height, width, samples), -1), q, bounds, TILE // fine)
+    nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
+    nearest = nearest.reshape(height, width, samples)
     return nearest.real, nearest.imag.astype(jnp.int32)
 
 
-def _hidden(depth: Float[Array, "h w"], q, bounds) -> Bool[Array, " f"]:
-    """Triangles that lie behind all that is drawn on the tiles they touch; large ones are not asked."""
+def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
+    """Triangles that lie behind all that is drawn on the tiles they touch; large ones are not asked.
+
+    Tiles have TILE cells along their edge, `tile` pixels.
+    """
     column, row, columns, rows = bounds
     height, width = depth.shape
-    padded = jnp.pad(depth, ((0, -height % TILE), (0, -width % TILE)))
-    high, wide = padded.shape[0] // TILE, padded.shape[1] // TILE
-    far = padded.reshape(high, TILE, wide, TILE).max((1, 3)).ravel()
+    padded = jnp.pad(depth, ((0, -height % tile), (0, -width % tile)))
+    high, wide = padded.shape[0] // tile, padded.shape[1] // tile
+    far = padded.reshape(high, tile, wide, tile).max((1, 3)).ravel()
     left, right = column // TILE, jnp.maximum(column + columns - 1, 0) // TILE
     top, bottom = row // TILE, jnp.maximum(row + rows - 1, 0) // TILE
     farthest = [far[i * wide + j] for i in (top, bottom) for j in (left, right)]
@@ -269,7 +274,7 @@ def _hidden(depth: Float[Array, "h w"], q, bounds) -> Bool[Array, " f"]:
     return ahead & small & (farthest < nearest * (1 - 1e-4))
 
 
-def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, bounds, width: int):
+def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
     """Draws some of the triangles over what is nearest so far: the complex numbers depth + i number.
 
     The minimum of complex numbers goes by the real part, then by the imaginary one, so that one scatter finds both.
@@ -306,9 +311,14 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         def pixel(nearest, k):
             i, j = top + jax.lax.div(k, jnp.int32(PATCH)), left + jax.lax.rem(k, jnp.int32(PATCH))
             at = j.astype(x.dtype) + (1 - width) / 2, i.astype(x.dtype) + (1 - height) / 2
-            d = _cover(corner[0], corner[1], corner[2], *at)
-            d = jnp.where((i < bottom) & (j < right), d, jnp.inf)
-            place = jnp.minimum(i, height - 1) * width + jnp.minimum(j, width - 1)
+            inside = (i < bottom) & (j < right)
+            i, j = jnp.minimum(i, height - 1), jnp.minimum(j, width - 1)
+            place = i * width + j
+            if fine > 1:
+                lower, later = i & 1, j & 1
+                at = at[0] + SHIFT * (1 - 2 * lower), at[1] + SHIFT * (2 * later - 1)
+                place = (i >> 1) * (2 * width) + (j >> 1) * 4 + 2 * lower + later
+            d = jnp.where(inside, _cover(corner[0], corner[1], corner[2], *at), jnp.inf)
             return nearest.at[place].min(jax.lax.complex(d, identity), mode="promise_in_bounds"), None
 
         # A scan, since XLA would else compute what belongs to a patch anew for each of its pixels.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import grid
-from jaxprt.image import raster
+from jaxprt.image import pixels, raster
 from jaxprt.relit import measuring
 from jaxprt.relit.channels import Appearance, Shading, appearance
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
@@ -148,7 +148,7 @@ class RelitScene(System):
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         color = self.radiance(environment, eye=camera.eye, materials=materials)
         sky = background(environment, raster.ray_direction(camera))
-        return raster.render(self.mesh, color, camera, background=sky)
+        return pixels.render(self.mesh, color, camera, background=sky)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of the parts against the exact sum, times and bytes, measured on this machine.

@@ -22,7 +22,7 @@ def lookup(
     and (1, 1) the upper right one. Centers of texels lie half a texel inside.
 
     A vertex takes the texture at one place: details finer than the mesh's edges are not averaged but missed. Pictures
-    show them by `lookup(image, interpolate(fragments, mesh.face, mesh.texture))` of `image.raster`, for each pixel.
+    show them by `lookup(image, interpolate(fragments, mesh.face, mesh.texture))` of `image`, for each pixel.
     Opposite edges of an image that repeats are blended: at u = 0 and at u = 1 is the mean of the two.
     Linear in the image; in the coordinates differentiable except where they pass the center of a row or column.
 
