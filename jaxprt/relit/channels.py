@@ -21,6 +21,7 @@ from jaxprt.brdf import Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.scene import Mesh, Part
 from jaxprt.scene.material import Surface, TexturedMaterial
+from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
 
@@ -146,6 +147,25 @@ def appearance(part: Part, shading: Shading, material: TexturedMaterial) -> Appe
     fits = _fits(part.name, shading, new)
     weight = jnp.where(fits[:, None, None], blend.weight, jnp.nan) if isinstance(fits, Tracer) else blend.weight
     return Appearance(Blend(weight, blend.parameter), _emitted(surface))
+
+
+def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
+    """A material at points of a part, its textures averaged over the points' pixels.
+
+    Args:
+        part: The part.
+        shading: From `of_part`.
+        material: A `TexturedMaterial` that `appearance` takes, an `Appearance` at the vertices, or None for the part's.
+        points: On the part's triangles.
+    """
+    if isinstance(material, Appearance):
+        return jax.tree.map(points.carry, material)
+    if material is None and not isinstance(part.material, TexturedMaterial):
+        return Appearance(None)
+    surface = (part if material is None else dataclasses.replace(part, material=material)).surface(points)
+    assert shading.scale is not None
+    blend = _blend(_material(surface), shading.term, shading.scale, varies=bool(shading.knot))
+    return Appearance(blend, surface.emissive)
 
 
 def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import grid
-from jaxprt.image import pixels, raster
-from jaxprt.relit import measuring
-from jaxprt.relit.channels import Appearance, Shading, appearance
+from jaxprt.relit import interpolation, measuring, pictures
+from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
+from jaxprt.relit.pictures import PictureView, Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
-from jaxprt.scene.environment import background
+from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import PartBounces
 from jaxprt.systems.protocol import Blend, Joined, System, Total
@@ -47,6 +47,8 @@ class RelitScene(System):
         bounces: Light that the parts reflect onto each other; None without.
         mesh: The mesh of all parts, with the scene's own normals.
         camera: The scene's first camera; one around it, a little from above, where it has none.
+        curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
+        points: Where on each part radiance is asked for; None for the vertices.
     """
 
     scene: Scene
@@ -55,6 +57,8 @@ class RelitScene(System):
     bounces: PartBounces | None
     mesh: Mesh
     camera: Camera
+    curvature: Float[Array, " n"]
+    points: tuple[Points, ...] | None
 
     def __init__(self, scene: Scene, direct: Joined, shading: Sequence[Shading], bounces: PartBounces | None = None):
         """Joins the parts' meshes.
@@ -67,13 +71,16 @@ class RelitScene(System):
         """
         # What is no array cannot be an argument of a jitted function.
         parts = [
-            part
+            dataclasses.replace(part, material=part.material.mipmapped())
             if isinstance(part.material, TexturedMaterial)
             else dataclasses.replace(part, material=grid.as_argument(part.material))
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
         self.direct, self.shading, self.bounces, self.mesh = direct, tuple(shading), bounces, scene.mesh
+        self.points = None
+        pairs = zip(shading, direct.part, strict=True)
+        self.curvature = jnp.asarray([interpolation.curvature(*each) for each in pairs], self.mesh.position.dtype)
         self.camera = scene.cameras[0] if scene.cameras else orbit(self.mesh, azimuth=0.5, elevation=0.3)
 
     @property
@@ -99,19 +106,24 @@ class RelitScene(System):
                 `jaxprt.relit.channels.appearance`.
         """
         every = self._all(materials)
-        view = self.system.view(eye, [each.blend for each in every])
+        counts = [len(part.mesh.position) for part in self.scene.parts]
+        if self.points is not None:
+            counts = list(map(len, self.points))
+            rows = zip(self.scene.parts, self.shading, every, self.points, strict=True)
+            every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
+        view = self._placed.view(eye, [each.blend for each in every])
         if all(each.emitted is None for each in every):
             return SceneView(view, None)
         emitted = [
-            jnp.zeros((len(part.mesh.position), 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
-            for part, each in zip(self.scene.parts, every, strict=True)
+            jnp.zeros((count, 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
+            for count, each in zip(counts, every, strict=True)
         ]
         return SceneView(view, jnp.concatenate(emitted))
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, with what they emit."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
-        color = self.system.combine(light, view.part)
+        color = self._placed.combine(light, view.part)
         return color if view.emitted is None else color + view.emitted
 
     def radiance(
@@ -126,13 +138,18 @@ class RelitScene(System):
         camera: Camera | None = None,
         *,
         materials: Mapping[str, Any] | None = None,
+        samples: int = 4,
     ) -> Float[Array, "h w c"]:
         """The picture of the scene in a light, in linear radiance.
+
+        Radiance is made at the pixels where interpolating it between the vertices would be off by more than 1 %, by the
+        sharpness of the material and the size of the triangles in the picture; textures are read at the pixels.
 
         Args:
             environment: One light, which is seen behind the scene too.
             camera: From where; `self.camera` if None.
             materials: Other materials of some parts.
+            samples: Of the coverage of each pixel: 4, or 1 for no anti-aliasing.
 
         Returns:
             The picture. `jaxprt.image.display` makes it fit for the screen.
@@ -141,14 +158,32 @@ class RelitScene(System):
             TypeError: The light is no Environment, or the camera no Camera.
             ValueError: The light is a batch, or as in `view`.
         """
-        require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
-        if environment.radiance.ndim != 4:
-            raise ValueError(f"a picture has one light [6, n, n, c], got {list(environment.radiance.shape)}")
+        return self._picture_view(camera, materials, samples=samples, keep=False).picture(environment)
+
+    def picture_view(
+        self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
+    ) -> PictureView:
+        """All of a picture but the light, for many lights: `picture_view(camera).picture(environment)`.
+
+        It holds about a kilobyte for each pixel that is shaded. Arguments and errors are those of `picture`.
+        """
+        return self._picture_view(camera, materials, samples=samples, keep=True)
+
+    def _picture_view(self, camera: Camera | None, materials, *, samples: int, keep: bool) -> PictureView:
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
-        color = self.radiance(environment, eye=camera.eye, materials=materials)
-        sky = background(environment, raster.ray_direction(camera))
-        return pixels.render(self.mesh, color, camera, background=sky)
+        given = self.appearances(materials)
+        surfaces, first = [], 0
+        for number, (part, shading, system) in enumerate(
+            zip(self.scene.parts, self.shading, self.direct.part, strict=True)
+        ):
+            own = given.get(part.name, Appearance(shading.blend, shading.emitted))
+            material = None if materials is None else materials.get(part.name)
+            material = own if isinstance(material, Blend) else material
+            reflecting = None if self.bounces is None else self.bounces.part[number]
+            surfaces.append(Surface(part, first, shading, system, reflecting, own, material, self.curvature[number]))
+            first += len(part.mesh.position)
+        return pictures.make(self.mesh, self.system, surfaces, camera, samples=samples, keep=keep)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of the parts against the exact sum, times and bytes, measured on this machine.
@@ -206,10 +241,23 @@ class RelitScene(System):
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
         return result
 
+    def at(self, points: Sequence[Points]) -> "RelitScene":
+        """The scene at points on its parts, one list for each part: `System.at`. Materials stay those of the vertices.
+
+        Raises:
+            TypeError: They are no list of points for each part.
+        """
+        given = tuple(protocol.check_points(points, self.scene.parts))
+        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return self.system.vertices
+        """Number of vertices, or of points."""
+        return self._placed.vertices
+
+    @property
+    def _placed(self) -> System:
+        return self.system if self.points is None else self.system.at(self.points)
 
     @property
     def shared_light(self) -> tuple | None:

@@ -8,7 +8,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.scene import texture
+from jaxprt.scene import mipmap, texture
+from jaxprt.scene.mipmap import Mipmap
 
 
 def _scalar(value) -> Array:
@@ -29,6 +30,7 @@ class Texture(eqx.Module):
         transform: Affine transform from texture coordinates (u, v, 1), v up, to places in the image.
         set: Which of the mesh's two sets of texture coordinates it takes, 0 or 1.
         wrap: What lies beyond the image's edges along u and along v: see ``texture.WRAPS``.
+        mipmap: The image's mip map, from `mipmapped`; None where it is made anew for each picture.
 
     Raises:
         ValueError: The image or the transform is not finite, or there is no such set or wrap mode.
@@ -40,6 +42,7 @@ class Texture(eqx.Module):
     )
     set: int = eqx.field(static=True, default=0)
     wrap: tuple[str, str] = eqx.field(static=True, default=("repeat", "repeat"))
+    mipmap: Mipmap | None = None
 
     def __check_init__(self):
         """Refuses values that are not finite, and unknown sets and wrap modes."""
@@ -49,11 +52,28 @@ class Texture(eqx.Module):
         if not set(self.wrap) <= set(texture.WRAPS):
             raise ValueError(f"wrap must be two of {', '.join(texture.WRAPS)}, got {self.wrap}")
 
-    def at(self, *coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b c"]:
-        """Values of the image, given all sets of texture coordinates."""
-        place = coordinates[self.set]
-        moved = jnp.einsum("ij,...j->...i", self.transform[:, :2], place, precision="highest") + self.transform[:, 2]
-        return texture.lookup(self.image, moved, wrap=self.wrap)
+    def at(
+        self, *coordinates: Float[Array, "*b 2"], slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None
+    ) -> Float[Array, "*b c"]:
+        """Values of the image, given all sets of texture coordinates.
+
+        Args:
+            coordinates: Places in each set.
+            slopes: Change of each from one pixel to the next, to the right and down: the image is then averaged over
+                the pixels.
+        """
+        turn = self.transform[:, :2]
+        moved = jnp.einsum("ij,...j->...i", turn, coordinates[self.set], precision="highest") + self.transform[:, 2]
+        if slopes is None:
+            return texture.lookup(self.image, moved, wrap=self.wrap)
+        slope = jnp.einsum("ij,...j->...i", turn, slopes[self.set], precision="highest")
+        return mipmap.lookup(self.mipmapped().mipmap, moved, slope, wrap=self.wrap)
+
+    def mipmapped(self) -> "Texture":
+        """The same with its mip map."""
+        if self.mipmap is not None:
+            return self
+        return eqx.tree_at(lambda each: each.mipmap, self, mipmap.make(self.image), is_leaf=lambda each: each is None)
 
 
 class Surface(eqx.Module):
@@ -147,6 +167,11 @@ class TexturedMaterial(eqx.Module):
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 
+    def mipmapped(self) -> "TexturedMaterial":
+        """The same with mip maps of all its textures: what pictures would else make anew each time."""
+        is_texture = lambda each: isinstance(each, Texture)  # noqa: E731
+        return jax.tree.map(lambda each: each.mipmapped() if is_texture(each) else each, self, is_leaf=is_texture)
+
     @property
     def textures(self) -> tuple[Texture, ...]:
         """The textures that it has."""
@@ -160,6 +185,7 @@ class TexturedMaterial(eqx.Module):
         *,
         color: Float[Array, "*b 3"] | None = None,
         handedness: Float[Array, "*b"] | None = None,
+        slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None,
     ) -> Surface:
         """Parameters at points: vertices of a mesh, or points of a picture.
 
@@ -173,6 +199,8 @@ class TexturedMaterial(eqx.Module):
             color: Colors that multiply the base color.
             handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite;
                 1 everywhere where it is None. Results are in the right-handed frame.
+            slopes: Change of both coordinates from one pixel to the next, over which textures are then averaged: see
+                `Texture.at`.
 
         Returns:
             The parameters.
@@ -182,11 +210,11 @@ class TexturedMaterial(eqx.Module):
 
         def value(factor: Array, each: Texture | None) -> Array:
             wide = jnp.broadcast_to(factor, (*batch, *(factor.shape or (1,))))
-            return wide if each is None else wide * each.at(*places)
+            return wide if each is None else wide * each.at(*places, slopes=slopes)
 
         base = value(self.base_color, self.base_color_texture)
-        anisotropy, direction = self._anisotropy(places)
-        normal = self._normal(places)
+        anisotropy, direction = self._anisotropy(places, slopes)
+        normal = self._normal(places, slopes)
         if handedness is not None:
             direction = direction * jnp.stack([jnp.ones_like(handedness), handedness], -1)
             normal = normal * jnp.stack([jnp.ones_like(handedness), handedness, jnp.ones_like(handedness)], -1)
@@ -203,24 +231,24 @@ class TexturedMaterial(eqx.Module):
             normal,
         )
 
-    def _anisotropy(self, places: tuple[Array, ...]) -> tuple[Array, Array]:
+    def _anisotropy(self, places: tuple[Array, ...], slopes: tuple[Array, ...] | None) -> tuple[Array, Array]:
         """Strength and direction of the anisotropy."""
         batch = places[0].shape[:-1]
         cosine, sine = jnp.cos(self.rotation), jnp.sin(self.rotation)
         if self.anisotropy_texture is None:
             direction = jnp.stack([cosine, sine])
             return jnp.broadcast_to(self.anisotropy, batch), jnp.broadcast_to(direction, (*batch, 2))
-        texel = self.anisotropy_texture.at(*places)
+        texel = self.anisotropy_texture.at(*places, slopes=slopes)
         x, y = jnp.moveaxis(_unit(2 * texel[..., :2] - 1), -1, 0)
         direction = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
         return self.anisotropy * texel[..., 2], direction
 
-    def _normal(self, places: tuple[Array, ...]) -> Array:
+    def _normal(self, places: tuple[Array, ...], slopes: tuple[Array, ...] | None) -> Array:
         """Unit normals of the normal map."""
         if self.normal_texture is None:
             up = jnp.asarray([0, 0, 1], self.normal_scale.dtype)
             return jnp.broadcast_to(up, (*places[0].shape[:-1], 3))
-        slope = 2 * self.normal_texture.at(*places) - 1
+        slope = 2 * self.normal_texture.at(*places, slopes=slopes) - 1
         # Last axis first, since the normal is what takes the place of zero.
         scaled = jnp.stack([slope[..., 2], slope[..., 0] * self.normal_scale, slope[..., 1] * self.normal_scale], -1)
         return jnp.roll(_unit(scaled), -1, -1)

@@ -42,20 +42,28 @@ def lookup(
         raise ValueError(f"image must be [h, w, c] and coordinates [..., 2], got {got}")
     if not set(wrap) <= set(WRAPS):
         raise ValueError(f"wrap must be two of {', '.join(WRAPS)}, got {wrap}")
-    height, width = image.shape[:2]
+    parts = [image[place] * weight[..., None] for place, weight in bilinear(coordinate, image.shape[:2], wrap)]
+    return sum(parts[1:], start=parts[0])
+
+
+def bilinear(
+    coordinate: Float[Array, "*b 2"],
+    shape: tuple[int | Int[Array, "*b"], int | Int[Array, "*b"]],
+    wrap: tuple[str, str],
+) -> list[tuple[tuple[Int[Array, "*b"], Int[Array, "*b"]], Float[Array, "*b"]]]:
+    """Row, column and weight of the four texels around each place in an image of a height and width."""
+    height, width = shape
     # Reduced to one period first: multiplied by the width, far coordinates would lose digits.
     x = _reduced(coordinate[..., 0], wrap[0]) * width - 0.5
     y = (1 - _reduced(coordinate[..., 1], wrap[1])) * height - 0.5
     column, row = jnp.floor(x), jnp.floor(y)
-    right, down = (x - column)[..., None], (y - row)[..., None]
-
-    def texel(below: int, beside: int) -> Array:
+    right, down = x - column, y - row
+    result = []
+    for below, v in ((0, 1 - down), (1, down)):
         line = _inside(row.astype(jnp.int32) + below, height, wrap[1])
-        return image[line, _inside(column.astype(jnp.int32) + beside, width, wrap[0])]
-
-    upper = (1 - right) * texel(0, 0) + right * texel(0, 1)
-    lower = (1 - right) * texel(1, 0) + right * texel(1, 1)
-    return (1 - down) * upper + down * lower
+        for beside, u in ((0, 1 - right), (1, right)):
+            result.append(((line, _inside(column.astype(jnp.int32) + beside, width, wrap[0])), v * u))
+    return result
 
 
 def _reduced(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
@@ -65,7 +73,7 @@ def _reduced(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
     return place - jnp.floor(place) if wrap == "repeat" else place - 2 * jnp.floor(place / 2)
 
 
-def _inside(index: Int[Array, "*b"], size: int, wrap: str) -> Int[Array, "*b"]:
+def _inside(index: Int[Array, "*b"], size: int | Int[Array, "*b"], wrap: str) -> Int[Array, "*b"]:
     """Numbers of the texels that stand for those beyond the edges."""
     if wrap == "clamp":
         return jnp.clip(index, 0, size - 1)

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems.protocol import Blend, System
+from jaxprt.systems.protocol import Blend, System, VertexSystem
 
 _ROW = 32  # texels of which the brightest is looked at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
@@ -73,7 +74,38 @@ class BrightView(eqx.Module):
     blend: Blend | None
 
 
-class BrightTexels(System):
+class PointVisibility(eqx.Module):
+    """Visibility of single texels at points: the mean of what the corners of their triangles see.
+
+    Attributes:
+        vertices: Visibility of the vertices.
+        points: The points.
+    """
+
+    vertices: Any
+    points: Points
+
+    @property
+    def position(self) -> Float[Array, "p 3"]:
+        """Positions in world units."""
+        return self.points.carry(self.vertices.position)
+
+    @property
+    def frame(self) -> Float[Array, "p 3 3"]:
+        """Rows are tangent, bitangent, normal."""
+        return self.points.frame(self.vertices.frame)
+
+    @property
+    def size(self) -> int:
+        """Edge of the cubemap's faces in texels."""
+        return self.vertices.size
+
+    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t p"]:
+        """Share of some texels that is seen."""
+        return self.points.carry(self.vertices.visible(texel), axis=1)
+
+
+class BrightTexels(VertexSystem):
     """Any system with the brightest texels of the light summed one by one, exactly.
 
     Attributes:
@@ -95,7 +127,8 @@ class BrightTexels(System):
         source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, Visibility, source=source)
-        require.length("the vertices of the visibility", self.visibility.position, self.system.vertices)
+        if self.points is None:
+            require.length("the vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
         """The light, split; the rest as the system has it."""
@@ -116,11 +149,16 @@ class BrightTexels(System):
         require.kind("the view", view, BrightView, source="BrightTexels.view")
         rest = self.system.combine(light.rest, view.rest)
         options = {"eye": view.eye, "samples": self.samples, "blend": view.blend}
-        return rest + radiance(self.visibility, self.brdf, light.texel, light.excess, **options)
+        visible = self.visibility if self.points is None else PointVisibility(self.visibility, self.points)
+        return rest + radiance(visible, self.brdf, light.texel, light.excess, **options)
+
+    def at(self, points: Points) -> "BrightTexels":
+        """The same at points: `System.at`."""
+        return eqx.tree_at(lambda each: each.system, super().at(points), self.system.at(points))
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
+        """Number of vertices, or of points."""
         return self.system.vertices
 
     @property

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
 
 
 class System(eqx.Module):
@@ -65,15 +66,52 @@ class System(eqx.Module):
             TypeError: Light or view were not made by this kind of system.
         """
 
+    @abc.abstractmethod
+    def at(self, points: Any) -> "System":
+        """The same system at points between the vertices instead of the vertices: light is that of the system itself.
+
+        `radiance(system.at(points), ...)` is at the points, in their order, and so are materials. What belongs to the
+        transport of vertices is interpolated; position, frame, view and BRDF are the point's own.
+
+        Args:
+            points: `Points` on the triangles of the mesh, of a system of several parts a list of one for each.
+
+        Raises:
+            TypeError: They are no points.
+        """
+
     @property
     @abc.abstractmethod
     def vertices(self) -> int:
-        """Number of vertices."""
+        """Number of vertices, or of points."""
 
     @property
     def shared_light(self) -> tuple | None:
         """What `light` depends on besides the environment: systems of equal values have equal lights. None: on more."""
         return None
+
+
+class VertexSystem(System):
+    """A system of the vertices of one mesh, and of points between them.
+
+    Attributes:
+        points: Where radiance is asked for; None for the vertices.
+    """
+
+    points: Points | None = eqx.field(default=None, kw_only=True)
+
+    def at(self, points: Points) -> "VertexSystem":
+        """The same system at points: `System.at`."""
+        require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
+        return eqx.tree_at(lambda each: each.points, self, points, is_leaf=lambda each: each is None)
+
+    def carried(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
+        """What is linear in an attribute of the vertices, where radiance is asked for."""
+        return attribute if self.points is None else self.points.carry(attribute, axis=axis)
+
+    def place(self, transport: Any) -> tuple[Float[Array, "v 3"], Float[Array, "v 3 3"]]:
+        """Positions and frames of where radiance is asked for; `transport` has those of the vertices."""
+        return placed(transport.position, transport.frame, self.points)
 
 
 class Blend(eqx.Module):
@@ -151,9 +189,13 @@ class Total(System):
         parts = (each.combine(*sides) for each, *sides in zip(self.part, light, view, strict=True))
         return sum(parts, start=jnp.zeros((), jnp.result_type(float)))
 
+    def at(self, points: Any) -> "Total":
+        """The sum at points: `System.at`."""
+        return Total(tuple(each.at(points) for each in self.part))
+
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
+        """Number of vertices, or of points."""
         return self.part[0].vertices
 
 
@@ -198,6 +240,10 @@ class Joined(System):
         colors = max(each.shape[1] for each in parts)
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in parts])
 
+    def at(self, points: Sequence) -> "Joined":
+        """Points of each system, one list after the other: `System.at`."""
+        return Joined(tuple(each.at(own) for each, own in zip(self.part, check_points(points, self.part), strict=True)))
+
     def _given(self, materials: Sequence | None) -> Sequence:
         if materials is None:
             return [None] * len(self.part)
@@ -215,6 +261,17 @@ class Joined(System):
         """Those of the systems, if all have one."""
         keys = tuple(each.shared_light for each in self.part)
         return None if None in keys else (Joined, *keys)
+
+
+def check_points(points: Any, part: Sequence) -> Sequence:
+    """Refuses what is no list of points for each part.
+
+    Raises:
+        TypeError: It is none.
+    """
+    if not isinstance(points, Sequence) or len(points) != len(part):
+        raise TypeError(f"the points must be a list, one for each of {len(part)} parts, got {type(points).__name__}")
+    return points
 
 
 def total(*systems: System) -> Total:

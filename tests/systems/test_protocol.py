@@ -19,6 +19,7 @@ from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, v
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.scene.points import Points, on_triangles
 from jaxprt.sphere import directions
 from jaxprt.systems import protocol
 
@@ -341,6 +342,73 @@ def test_a_system_laid_over_devices_by_vertices_has_the_same_radiance(name, clos
     laid = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))(system, light(), case.materials)
     assert len(laid.sharding.device_set) == 3
     close(laid, shown(case, light()), tolerance=2e-5)
+
+
+def placed(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
+    """A system at points of some triangles, and their order there: systems of regions take one list for each."""
+    face, region = np.asarray(case.mesh.face)[triangle], np.asarray(case.mesh.region)
+    if not isinstance(
+        case.system, dynamic.DynamicSystem | bounces.BouncesSystem | bounces.PartBounces | protocol.Total
+    ):
+        return case.system.at(on_triangles(case.mesh.face, triangle, weight)), np.arange(len(triangle))
+    lists, order = [], []
+    for number in range(region.max() + 1):
+        own = np.flatnonzero(region[face[:, 0]] == number)
+        place = np.cumsum(region == number) - 1
+        lists.append(Points(jnp.asarray(place[face[own]].T), jnp.asarray(weight[own].T)))
+        order.append(own)
+    return case.system.at(lists), np.concatenate(order)
+
+
+@each_system
+def test_radiance_at_the_corners_of_triangles_is_that_of_the_vertices(name, close):
+    case = made(name)
+    triangle = np.arange(len(case.mesh.face))
+    for corner in (0, 2):
+        weight = np.tile(np.eye(3, dtype=np.float32)[corner], (len(triangle), 1))
+        system, order = placed(case, triangle, weight)
+        color = shown(case._replace(system=system), light())
+        assert system.vertices == len(color) == len(triangle)
+        close(color, shown(case, light())[np.asarray(case.mesh.face)[order, corner]], tolerance=2e-5)
+
+
+@each_system
+def test_radiance_at_points_is_the_exact_sum_there(name, close):
+    if MADE[name].error is None:
+        pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
+    case, random = made(name), np.random.default_rng(0)
+    triangle = random.integers(len(case.mesh.face), size=60)
+    weight = random.dirichlet(np.ones(3), 60).astype(np.float32)
+    points = on_triangles(case.mesh.face, triangle, weight)
+    visible = seen("scene")
+    level = np.round(points.carry(jnp.asarray(visible.seen(np.arange(case.system.vertices)), jnp.float32)))
+    position, frame = points.carry(visible.position), points.frame(visible.frame)
+    exact = np.asarray(prt.reference.integrate(level.astype(np.uint8), position, frame, GLOSSY, light(), EYE))
+    facing = np.sum(np.asarray(frame)[:, 2] * (np.asarray(EYE) - np.asarray(position)), 1) > 0.2
+    color = shown(case._replace(system=case.system.at(points)), light())
+    # What arrives in the frames of three vertices is interpolated there: this mesh is coarse.
+    close(color[facing], exact[facing], tolerance=MADE[name].error + 0.05)
+
+
+@each_system
+def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
+    case, random = made(name), np.random.default_rng(1)
+    triangle = random.integers(len(case.mesh.face), size=12)
+    system, _ = placed(case, triangle, random.dirichlet(np.ones(3), 12).astype(np.float32))
+
+    def total(system, eye):
+        return jnp.sum(prt.radiance(system, light(), eye=eye, materials=case.materials))
+
+    slope = jax.jit(jax.vmap(jax.grad(total, argnums=1), (None, 0)))(system, jnp.stack([EYE, 2 * EYE]))
+    assert np.isfinite(slope).all()
+    close(jax.jit(total)(system, EYE), total(system, EYE), tolerance=2e-5)
+
+
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_what_are_no_points_are_refused(name):
+    with pytest.raises(TypeError, match="points must be"):
+        made(name).system.at(np.zeros(3))
 
 
 @each_system

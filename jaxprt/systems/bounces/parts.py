@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
 from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.relight import LitTransfer, collect, gathered, light_side
@@ -38,6 +39,16 @@ class ReflectingPart(eqx.Module):
         if self.brdf.degree != DEGREE:
             raise ValueError(f"the BRDF must have degree {DEGREE}, that of reflected light, got {self.brdf.degree}")
 
+    def view(self, eye: Float[Array, "3"], blend: Blend | None, points: Points | None = None) -> Float[Array, "lm _ _"]:
+        """Harmonics of the BRDF of each vertex or point for its view; the blend is of these."""
+        return harmonic.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
+
+    def combine(
+        self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points | None = None
+    ) -> Float[Array, "_ e"]:
+        """Radiance of reflected light; light is what arrives at the vertices."""
+        return harmonic.combine(light if points is None else points.carry(light, axis=2), view)
+
 
 class PartBounces(protocol.System):
     """Light that the parts of a scene reflect onto each other and themselves, without the direct light.
@@ -48,10 +59,12 @@ class PartBounces(protocol.System):
     Attributes:
         tensor: From `jaxprt.bounces.precompute` with one factored BRDF for each part, of the same channels.
         part: The parts, whose vertices follow each other.
+        points: Where radiance is asked for on each part; None for the vertices.
     """
 
     tensor: TransferTensor
     part: tuple[ReflectingPart, ...] = eqx.field(converter=tuple)
+    points: tuple[Points, ...] | None = None
 
     def __check_init__(self):
         """Refuses tensors of sets, of other vertices and of parts in another order."""
@@ -89,10 +102,10 @@ class PartBounces(protocol.System):
     def view(
         self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
-        """Harmonics of each vertex's BRDF for its view."""
+        """Harmonics of the BRDF of each vertex or point for its view."""
         require.position("the eye", eye)
-        pairs = zip(self.part, self._given(materials), strict=True)
-        return tuple(harmonic.blended_view(part.brdf, part.position, part.frame, own, eye=eye) for part, own in pairs)
+        rows = zip(self.part, self._given(materials), self._points(), strict=True)
+        return tuple(part.view(eye, *own) for part, *own in rows)
 
     def combine(
         self, light: tuple[Float[Array, "lm _ _"], ...], view: tuple[Float[Array, "lm _ _"], ...]
@@ -100,14 +113,22 @@ class PartBounces(protocol.System):
         """Radiance of reflected light."""
         require.kind("the light", light, tuple, source="PartBounces.shade")
         require.kind("the view", view, tuple, source="PartBounces.view")
-        rows = [harmonic.combine(*sides) for sides in zip(light, view, strict=True)]
+        rows = [part.combine(*own) for part, *own in zip(self.part, light, view, self._points(), strict=True)]
         colors = max(each.shape[1] for each in rows)
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
+    def at(self, points: Sequence[Points]) -> "PartBounces":
+        """Points on each part, one list after the other: `System.at`. What arrives is shaded at the vertices."""
+        given = tuple(protocol.check_points(points, self.part))
+        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.tensor.place)
+        """Number of vertices, or of points."""
+        return len(self.tensor.place) if self.points is None else sum(map(len, self.points))
+
+    def _points(self) -> Sequence[Points | None]:
+        return [None] * len(self.part) if self.points is None else self.points
 
     def _mean(self, number: int, part: ReflectingPart, blend: Blend | None) -> Float[Array, "k c"] | None:
         """Mean weights of a part's channels over its area; None without any."""

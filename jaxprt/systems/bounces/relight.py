@@ -21,6 +21,7 @@ from jaxprt import require
 from jaxprt.compile import isolated
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.systems import dynamic
 from jaxprt.systems.bounces import functions
@@ -193,7 +194,11 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
 
 
 def view_side(
-    transport: DynamicTransport, surfaces: Sequence[RegionBrdf], *, eye: Float[Array, "3"]
+    transport: DynamicTransport,
+    surfaces: Sequence[RegionBrdf],
+    *,
+    eye: Float[Array, "3"],
+    points: Sequence[Points] | None = None,
 ) -> tuple[ReflectedView, ...]:
     """What changes with the view and the materials.
 
@@ -201,11 +206,12 @@ def view_side(
         transport: As in `radiance`.
         surfaces: What each region reflects with, from `jaxprt.dynamic.mix`.
         eye: Position of the viewer in world units.
+        points: Of each region; None for the vertices.
     """
     require.position("the eye", eye)
     result = []
-    for own, each in zip(transport.region, surfaces, strict=True):
-        position, frame = own.seen.position, own.seen.frame
+    for own, each, at in zip(transport.region, surfaces, points or [None] * len(surfaces), strict=True):
+        position, frame = placed(own.seen.position, own.seen.frame, at)
         if isinstance(each.brdf, SeparableBrdf):
             one = jnp.ones((1, 1), position.dtype)
             result.append(ReflectedView(_by_terms(each.brdf, position, frame, eye), one, 0 * position[:, :1].T))
@@ -222,7 +228,10 @@ def view_side(
 
 @isolated
 def combine(
-    transport: DynamicTransport, arriving: tuple[Arriving, ...], view: tuple[ReflectedView, ...]
+    transport: DynamicTransport,
+    arriving: tuple[Arriving, ...],
+    view: tuple[ReflectedView, ...],
+    points: Sequence[Points] | None = None,
 ) -> Float[Array, "v c"]:
     """Radiance of reflected light alone.
 
@@ -230,14 +239,16 @@ def combine(
         transport: The transport of both.
         arriving: From `arriving`.
         view: From `view_side`.
+        points: As in `view_side`.
     """
     rows = []
-    for light, seen in zip(arriving, view, strict=True):
+    for light, seen, at in zip(arriving, view, points or [None] * len(view), strict=True):
+        light = light if at is None else jax.tree.map(partial(at.carry, axis=-1), light)
         glossy = reduce(jnp.add, (a * b for a, b in zip(light.local, seen.coefficient, strict=True)))
         rows.append(glossy * seen.specular + light.irradiance * seen.diffuse)
     colors = max(len(each) for each in rows)
     whole = jnp.concatenate([jnp.broadcast_to(each, (colors, each.shape[1])) for each in rows], 1)
-    return whole[:, transport.place].T
+    return (whole if points is not None else whole[:, transport.place]).T
 
 
 @partial(jax.jit, static_argnames=("edge",))

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points
 from jaxprt.systems import dynamic, protocol
 from jaxprt.systems.bounces.relight import (
     Arriving,
@@ -35,10 +36,9 @@ class BouncesSystem(protocol.System):
         """Refuses other tensors, systems of other kinds, and unlike numbers of vertices."""
         require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
         require.kind("the direct system", self.direct, dynamic.DynamicSystem, source="jaxprt.dynamic.DynamicSystem")
-        if len(self.tensor.place) != self.direct.vertices:
-            raise ValueError(
-                f"the tensor must be of the transport's {self.direct.vertices} vertices, got {len(self.tensor.place)}"
-            )
+        count = len(self.direct.transport.place)
+        if len(self.tensor.place) != count:
+            raise ValueError(f"the tensor must be of the transport's {count} vertices, got {len(self.tensor.place)}")
 
     def light(self, environment: Environment) -> LitTransfer:
         """What bounces make of a light, for all materials: `jaxprt.bounces.light_side`."""
@@ -53,8 +53,9 @@ class BouncesSystem(protocol.System):
         self, eye: Float[Array, "3"], materials: Sequence[Material | None] | None = None
     ) -> tuple[ReflectedView, ...]:
         """What each region sends to the eye of what arrives: `jaxprt.bounces.view_side`."""
-        surfaces = dynamic.mix(self.direct.transport, self.direct.brdf, self.direct.given(materials))
-        return view_side(self.direct.transport, surfaces, eye=eye)
+        points = self.direct.points
+        surfaces = dynamic.mix(self.direct.transport, self.direct.brdf, self.direct.given(materials), points)
+        return view_side(self.direct.transport, surfaces, eye=eye, points=points)
 
     def combine(self, light: tuple[Arriving, ...], view: tuple[ReflectedView, ...]) -> Float[Array, "v c"]:
         """Radiance of reflected light."""
@@ -62,9 +63,13 @@ class BouncesSystem(protocol.System):
             require.kind("the light", each, Arriving, source="BouncesSystem.shade")
         for each in view if isinstance(view, tuple) else (view,):
             require.kind("the view", each, ReflectedView, source="BouncesSystem.view")
-        return combine(self.direct.transport, light, view)
+        return combine(self.direct.transport, light, view, points=self.direct.points)
+
+    def at(self, points: Sequence[Points]) -> "BouncesSystem":
+        """Points of each region, as of the direct system: `System.at`."""
+        return BouncesSystem(self.tensor, self.direct.at(points))
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
+        """Number of vertices, or of points."""
         return self.direct.vertices

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxprt import require
 from jaxprt.compile import isolated
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
 from jaxprt.systems import bright_texels, lobe, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
@@ -89,11 +90,13 @@ class RegionView(eqx.Module):
         surface: What the region reflects with.
         factor: Of each row and term without the diffuse one, if there are others.
         looked: Where rows read the light for their lobes, if there are any.
+        points: Whose rows these are, numbered as the region's vertices are; None for these.
     """
 
     surface: RegionBrdf
     factor: Float[Array, "q r c"] | None
     looked: LobeView | None
+    points: Points | None = None
 
 
 class DynamicView(eqx.Module):
@@ -174,22 +177,26 @@ def view_side(
     materials: Sequence[Material | None],
     *,
     eye: Float[Array, "3"],
+    points: Sequence[Points] | None = None,
 ) -> DynamicView:
-    """What changes with the view and the materials.
+    """What changes with the view and the materials, at the vertices or at points of each region.
 
     Arguments and errors are those of `radiance`.
     """
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
     require.position("the eye", eye)
     region = []
-    for own, surface in zip(transport.region, mix(transport, brdfs, materials), strict=True):
+    several = [None] * len(transport.region) if points is None else points
+    for own, surface, at in zip(transport.region, mix(transport, brdfs, materials, points), several, strict=True):
         brdf = surface.brdf
+        place = placed(own.seen.position, own.seen.frame, at)
         if isinstance(brdf, SeparableBrdf):
-            region.append(RegionView(surface, separable.view_tuple(own.terms, brdf, eye), None))
+            check_mark(own.terms.mark, brdf.light_map)
+            region.append(RegionView(surface, separable.view_factors(brdf, *place, eye), None, at))
             continue
-        looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye)
-        factor = separable.view_tuple(own.terms, brdf.terms, eye) if brdf.terms.terms else None
-        region.append(RegionView(surface, factor, looked))
+        looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye, points=at)
+        factor = separable.view_factors(brdf.terms, *place, eye) if brdf.terms.terms else None
+        region.append(RegionView(surface, factor, looked, at))
     return DynamicView(eye, tuple(region))
 
 
@@ -197,8 +204,9 @@ def mix(
     transport: DynamicTransport,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     materials: Sequence[Material | None],
+    points: Sequence[Points] | None = None,
 ) -> tuple[RegionBrdf, ...]:
-    """What each region reflects with: what changes with the materials alone.
+    """What each region reflects with, at its vertices or at points: what changes with the materials alone.
 
     Arguments and errors are those of `radiance`.
     """
@@ -214,7 +222,8 @@ def mix(
             result.append(RegionBrdf(brdf, None, None))
             continue
         assert material is not None
-        diffuse, specular = (_by_row(each, own.vertex) for each in (material.diffuse, material.specular))
+        at = None if points is None else points[number]
+        diffuse, specular = (_by_row(each, own.vertex, at) for each in (material.diffuse, material.specular))
         result.append(RegionBrdf(_mixed(brdf, material.weight), diffuse, specular))
     return tuple(result)
 
@@ -234,7 +243,11 @@ def combine(
     for own, met, matte, each in zip(transport.region, light.met, light.matte, view.region, strict=True):
         brdf, diffuse, specular = each.surface.brdf, each.surface.diffuse, each.surface.specular
         model = brdf.brdf if isinstance(brdf, Mixed) and brdf.brdf is not None else brdf
-        single = bright_texels.radiance(own.seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
+        seen: bright_texels.Visibility = own.seen
+        if each.points is not None:
+            seen = bright_texels.PointVisibility(own.seen, each.points)
+            met, matte = (each.points.carry(light) for light in (met, matte))
+        single = bright_texels.radiance(seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
         if isinstance(brdf, SeparableBrdf):
             result.append(separable.combine(met, each.factor) + single)
             continue
@@ -242,7 +255,7 @@ def combine(
         if each.looked is not None:
             glossy = lobe.combine(light.blurred, _glossy(each.looked)), each.looked.diffuse.T
         result.append(_sum(met, each.factor, glossy, single, matte, diffuse, specular))
-    return _gathered(tuple(result), transport.place)
+    return _gathered(tuple(result), None if view.region[0].points is not None else transport.place)
 
 
 @isolated
@@ -252,7 +265,7 @@ def _mixed(brdf: DynamicBrdf, weight: Array) -> Mixed:
 
 def _glossy(view: LobeView) -> LobeView:
     """Lobes alone: their diffuse part is lit by the diffuse term."""
-    return LobeView(view.place, view.visible, view.weight, jnp.zeros_like(view.diffuse), view.vector, view.size)
+    return eqx.tree_at(lambda each: each.diffuse, view, jnp.zeros_like(view.diffuse))
 
 
 @isolated
@@ -267,13 +280,17 @@ def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
 
 
 @jax.jit
-def _gathered(rows: tuple[Array, ...], place: Array) -> Array:
+def _gathered(rows: tuple[Array, ...], place: Array | None) -> Array:
+    """Rows of all regions in the mesh's order of vertices; those of points one region after the other."""
     colors = max(each.shape[1] for each in rows)
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[place]
+    whole = jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
+    return whole if place is None else whole[place]
 
 
-def _by_row(value: Array, vertex: Array) -> Array:
-    return value[None] if value.ndim == 1 else value[vertex]
+def _by_row(value: Array, vertex: Array, points: Points | None) -> Array:
+    if value.ndim == 1:
+        return value[None]
+    return value[vertex] if points is None else points.carry(value[vertex])
 
 
 def _has_pyramid(region: RegionTransport) -> bool:

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
 from jaxprt.systems.dynamic.relight import DynamicLight, DynamicView, Material, combine, light_side, view_side
@@ -24,12 +25,14 @@ class DynamicSystem(protocol.System):
         brdf: One for each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
         texels: How many of the brightest texels light the vertices one by one.
         samples: Points along the edge of each at which the BRDF is taken, see `jaxprt.bright_texels.samples_for`.
+        points: Where in each region radiance is asked for; None for the vertices.
     """
 
     transport: DynamicTransport
     brdf: tuple[DynamicBrdf | SeparableBrdf, ...] = eqx.field(converter=tuple)
     texels: int = eqx.field(static=True, default=16)
     samples: int = eqx.field(static=True, default=1)
+    points: tuple[Points, ...] | None = None
 
     def __check_init__(self):
         """Refuses transport and BRDFs of other systems."""
@@ -48,7 +51,7 @@ class DynamicSystem(protocol.System):
 
     def view(self, eye: Float[Array, "3"], materials: Sequence[Material | None] | None = None) -> DynamicView:
         """What a view and all materials are: `jaxprt.dynamic.view_side`."""
-        return view_side(self.transport, self.brdf, self.given(materials), eye=eye)
+        return view_side(self.transport, self.brdf, self.given(materials), eye=eye, points=self.points)
 
     def combine(self, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
         """Radiance of direct light."""
@@ -68,7 +71,12 @@ class DynamicSystem(protocol.System):
             raise TypeError(f"the materials must be a list, one for each region, got {type(materials).__name__}")
         return materials
 
+    def at(self, points: Sequence[Points]) -> "DynamicSystem":
+        """Points of each region, numbered as its vertices are, one list after the other: `System.at`."""
+        given = tuple(protocol.check_points(points, self.transport.region))
+        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.transport.place)
+        """Number of vertices, or of points."""
+        return len(self.transport.place) if self.points is None else sum(map(len, self.points))

@@ -15,7 +15,7 @@ from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
 from jaxprt.systems.protocol import Blend
 
 
-class HarmonicSystem(protocol.System):
+class HarmonicSystem(protocol.VertexSystem):
     """Transfer matrices and the harmonics of a BRDF, under low-frequency light.
 
     A `Blend` weights the channels of the table, and has the parameters of each vertex for a table over some.
@@ -51,21 +51,21 @@ class HarmonicSystem(protocol.System):
 
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
         """The BRDF's harmonics for each vertex's view: `jaxprt.harmonic.view_coefficients`."""
-        return blended_view(self.brdf, self.transport.position, self.transport.frame, materials, eye=eye)
+        return blended_view(self.brdf, *self.place(self.transport), materials, eye=eye)
 
-    def combine(self, light: Float[Array, "lm c v"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
+    def combine(self, light: Float[Array, "lm c _"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
         """Radiance: the dot product of light and BRDF."""
         require.array("the light", light, "lm c v", source="HarmonicSystem.light")
         require.array("the view", view, "lm c v", source="HarmonicSystem.view")
-        return combine(light, view)
+        return combine(self.carried(light, axis=2), view)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.transport.position)
+        """Number of vertices, or of points."""
+        return len(self.transport.position if self.points is None else self.points)
 
 
-class DiffuseSystem(protocol.System):
+class DiffuseSystem(protocol.VertexSystem):
     """Transfer vectors: ideal diffuse vertices, which look the same from everywhere.
 
     A `Blend` has one channel, the albedo of each vertex; it takes the place of `albedo`.
@@ -89,25 +89,25 @@ class DiffuseSystem(protocol.System):
         """Harmonics of the light: `jaxprt.harmonic.project`."""
         return _projected(environment, harmonics.degree_of(self.transport.vector.shape[0]))
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
-        """The vectors times the albedo; the eye changes nothing."""
+    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
+        """The albedo, of all or of each; the eye changes nothing."""
         protocol.check_blend(materials)
         require.position("the eye", eye)
         if materials is None:
-            return self.transport.vector * self.albedo[:, None]
+            return self.albedo[None]
         materials.check(self.vertices, 1)
-        return self.transport.vector * materials.weight[:, 0].T
+        return materials.weight[:, 0]
 
-    def combine(self, light: Float[Array, "lm c"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
-        """Radiance: the dot product of light and transfer."""
+    def combine(self, light: Float[Array, "lm c"], view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
+        """Radiance: the dot product of light and transfer, times the albedo."""
         require.array("the light", light, "lm c", source="DiffuseSystem.light")
-        require.array("the view", view, "lm c v", source="DiffuseSystem.view")
-        return combine(light, view)
+        require.array("the view", view, "v c", source="DiffuseSystem.view")
+        return self.carried(combine(light, self.transport.vector)) * view
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.transport.position)
+        """Number of vertices, or of points."""
+        return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:

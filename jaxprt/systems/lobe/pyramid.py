@@ -21,6 +21,7 @@ from jaxprt import visibility
 from jaxprt.compile import isolated
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems import harmonic
 from jaxprt.visibility import StoredVisibility
@@ -62,25 +63,37 @@ class LobeTransport(eqx.Module):
         return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
 
     def lobe_visibility(
-        self, face: Int[Array, "l v"], s: Float[Array, "l v"], t: Float[Array, "l v"], spread: Float[Array, "l v"]
+        self,
+        face: Int[Array, "l v"],
+        s: Float[Array, "l v"],
+        t: Float[Array, "l v"],
+        spread: Float[Array, "l v"],
+        points: Points | None = None,
     ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
         """What each vertex sees of its lobes: the mean visibility over each, its horizon included, and the slopes.
 
-        Bilinear in the two scales next to the lobe's, linear in the spread between them.
+        Bilinear in the two scales next to the lobe's, linear in the spread between them. At points it is the mean of
+        what the corners see of the point's own lobes.
 
         Args:
             face: Face of the cube that each lobe's direction meets.
             s: First coordinate on it, from `jaxprt.sphere.cubemap.project`.
             t: Second coordinate.
             spread: Mean of 1 - cos of the angle to the lobe's direction, as from `jaxprt.decompose.mixture.drop`.
+            points: Whose lobes they are; None for the vertices.
 
         Returns:
             Visible parts of the lobes, from 0 to 1, and their derivatives by s and t.
         """
         # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
         address, bit = _addresses(face, s, t, spread, size=self.size)
-        read = _by_tap(_bytes(self.pyramid, _by_vertex(address)))
-        return _decoded(read, bit, s, t, spread, size=self.size)
+        rows = _by_vertex(address)
+        if points is None:
+            read, weight = (_by_tap(_bytes(self.pyramid, rows)),), None
+        else:
+            read = tuple(_by_tap(_bytes_of(self.pyramid, corner, rows)) for corner in points.corner)
+            weight = points.weight.astype(spread.dtype)
+        return _decoded(read, weight, bit, s, t, spread, size=self.size)
 
 
 @partial(isolated, static=("size",))
@@ -114,13 +127,22 @@ def _bytes(pyramid: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[A
 
 
 @isolated
+def _bytes_of(
+    pyramid: UInt8[Array, "v n"], corner: Int[Array, " p"], address: Int[Array, "p tl"]
+) -> UInt8[Array, "p tl"]:
+    return pyramid.at[corner[:, None], address].get(mode="promise_in_bounds")
+
+
+@isolated
 def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
     return tuple(read.T.reshape(8, -1, len(read)))
 
 
 @partial(isolated, static=("size",))
-def _decoded(read: tuple, bit: tuple, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, Array]:
-    """Value and slopes, from the eight bytes."""
+def _decoded(
+    read: tuple, corner_weight: Array | None, bit: tuple, s: Array, t: Array, spread: Array, *, size: int
+) -> tuple[Array, Array, Array]:
+    """Value and slopes, from the eight bytes of each corner."""
     scale = scales(size)
     number, upper = between(scale, spread)
     result = [jnp.zeros_like(spread)] * 3
@@ -128,14 +150,20 @@ def _decoded(read: tuple, bit: tuple, s: Array, t: Array, spread: Array, *, size
     for step, part in ((0, 1 - upper), (1, upper)):
         _, _, weights = corners(jnp.asarray(scale.edge)[number + step], s, t)
         for _, each in weights:
-            value = read[count].astype(jnp.int32)
-            four = value >> (bit[count] & 4)
-            four = (four & 1) + (four >> 1 & 1) + (four >> 2 & 1) + (four >> 3 & 1)
-            coarse = jnp.where(number + step < _BITS, four / 4, value / 255)
-            seen = jnp.where(number + step == 0, value >> bit[count] & 1, coarse).astype(spread.dtype)
+            own = [_seen(corner[count], bit[count], number + step).astype(spread.dtype) for corner in read]
+            seen = own[0] if corner_weight is None else sum(x * w for x, w in zip(own, corner_weight, strict=True))
             result = [total + seen * (weight * part) for total, weight in zip(result, each, strict=True)]
             count += 1
     return result[0], result[1], result[2]
+
+
+def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array) -> Array:
+    """What a byte says at a scale: one bit, the mean of four, or a mean."""
+    value = byte.astype(jnp.int32)
+    four = value >> (bit & 4)
+    four = (four & 1) + (four >> 1 & 1) + (four >> 2 & 1) + (four >> 3 & 1)
+    coarse = jnp.where(number < _BITS, four / 4, value / 255)
+    return jnp.where(number == 0, value >> bit & 1, coarse)
 
 
 class Scales(NamedTuple):

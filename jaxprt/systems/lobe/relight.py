@@ -24,6 +24,7 @@ from jaxprt import require
 from jaxprt.compile import isolated
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, harmonics
 from jaxprt.systems.lobe.pyramid import DEGREE, LobeTransport, Scales, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes
@@ -58,7 +59,8 @@ class LobeView(eqx.Module):
         visible: Weight of each texel, visibility included; may be negative.
         weight: Of each lobe, gray or per color.
         diffuse: Albedo of the diffuse part.
-        vector: Its transfer vectors.
+        vector: Its transfer vectors, of the vertices.
+        points: Whose view it is; None for the vertices.
         size: Edge of the environment's faces in texels.
     """
 
@@ -66,7 +68,8 @@ class LobeView(eqx.Module):
     visible: tuple[Float[Array, "l v"], ...]
     weight: Float[Array, "c l v"]
     diffuse: Float[Array, "c v"]
-    vector: Float[Array, "lm v"]
+    vector: Float[Array, "lm _"]
+    points: Points | None
     size: int = eqx.field(static=True)
 
 
@@ -127,26 +130,30 @@ def prefilter(light: Environment) -> LobeLight:
 
 @require.arguments(brdf=_brdf)
 def view_lobes(
-    transport: LobeTransport, brdf: LobeBrdf, *parameter: Float[Array, " v"], eye: Float[Array, "3"]
+    transport: LobeTransport,
+    brdf: LobeBrdf,
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "3"],
+    points: Points | None = None,
 ) -> LobeView:
-    """Where each vertex reads the light for a view, and what it sees there.
+    """Where each vertex, or point, reads the light for a view, and what it sees there.
 
     Args:
         transport: Visibility pyramids.
         brdf: A table of lobes.
-        parameter: Those of each vertex, for a table over some.
+        parameter: Those of each vertex or point, for a table over some.
         eye: Position of the viewer in world units.
+        points: Where; None for the vertices.
 
     Raises:
         TypeError: The BRDF is no table of lobes.
         ValueError: The number of parameters is not that of the table, or the eye is not one finite position.
     """
     require.position("the eye", eye)
-    lobe, (face, s, t, spread) = _places(transport.position, transport.frame, brdf, eye, *parameter)
-    place, visible = _taps(
-        face, s, t, spread, lobe.concentration, transport.lobe_visibility(face, s, t, spread), size=transport.size
-    )
-    return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, transport.size)
+    lobe, (face, s, t, spread) = _places(*placed(transport.position, transport.frame, points), brdf, eye, *parameter)
+    seen = transport.lobe_visibility(face, s, t, spread, points)
+    place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
+    return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
 
 
 @isolated
@@ -189,6 +196,8 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     if light.size != view.size:
         raise ValueError(f"the light's faces must have the transport's {view.size} texels, got {light.size}")
     irradiance = light.coefficient.T @ view.vector
+    if view.points is not None:
+        irradiance = view.points.carry(irradiance, axis=1)
     colors = max(len(view.weight), len(light.pyramid))
 
     def one(color):

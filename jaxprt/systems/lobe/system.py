@@ -13,7 +13,7 @@ from jaxprt.systems.lobe.table import LobeBrdf
 from jaxprt.systems.protocol import Blend
 
 
-class LobeSystem(protocol.System):
+class LobeSystem(protocol.VertexSystem):
     """Visibility pyramids, and a BRDF as a table of lobes. Light, view and BRDF are free.
 
     A `Blend` weights the channels of the table, and chooses the parameters of each vertex in a table over some.
@@ -44,9 +44,9 @@ class LobeSystem(protocol.System):
         """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.view_lobes`."""
         protocol.check_blend(materials)
         if materials is None:
-            return view_lobes(self.transport, self.brdf, eye=eye)
+            return view_lobes(self.transport, self.brdf, eye=eye, points=self.points)
         materials.check(self.vertices, len(self.brdf.weight))
-        seen = view_lobes(self.transport, self.brdf, *materials.parameter, eye=eye)
+        seen = view_lobes(self.transport, self.brdf, *materials.parameter, eye=eye, points=self.points)
         weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight)
         diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight)
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
@@ -59,8 +59,8 @@ class LobeSystem(protocol.System):
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.transport.position)
+        """Number of vertices, or of points."""
+        return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:

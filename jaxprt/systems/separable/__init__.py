@@ -26,6 +26,7 @@ from jaxprt.systems.separable.relight import (
     project,
     quantize,
     radiance,
+    view_factors,
     view_tuple,
 )
 from jaxprt.systems.separable.sparse import SparseTransport
@@ -61,6 +62,7 @@ __all__ = [
     "sample_error",
     "sparse",
     "system",
+    "view_factors",
     "view_tuple",
     "wavelets",
 ]

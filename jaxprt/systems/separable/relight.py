@@ -229,14 +229,25 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
-    require.position("the eye", eye)
     check_mark(transport.mark, brdf.light_map)
-    return _view_tuple(transport, brdf, eye)
+    return view_factors(brdf, transport.position, transport.frame, eye)
+
+
+def view_factors(
+    brdf: SeparableBrdf, position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], eye: Float[Array, "3"]
+) -> Float[Array, "v r c"]:
+    """View maps looked up for any positions and frames: `view_tuple` without a transport.
+
+    Raises:
+        ValueError: The eye is not one position, or not finite.
+    """
+    require.position("the eye", eye)
+    return _view_factors(brdf, position, frame, eye)
 
 
 @jax.jit
-def _view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Array) -> Array:
-    return brdf.view(directions.view(transport.frame, transport.position, eye))
+def _view_factors(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
+    return brdf.view(directions.view(frame, position, eye))
 
 
 def modulate(

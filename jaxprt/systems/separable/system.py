@@ -10,10 +10,10 @@ from jaxprt.scene.environment import Environment
 from jaxprt.systems import protocol
 from jaxprt.systems.protocol import Blend
 from jaxprt.systems.separable.factorization import SeparableBrdf, check_mark
-from jaxprt.systems.separable.relight import Transport, combine, light_tuple, view_tuple
+from jaxprt.systems.separable.relight import Transport, combine, light_tuple, view_factors
 
 
-class SeparableSystem(protocol.System):
+class SeparableSystem(protocol.VertexSystem):
     """Transport of the terms of a factored BRDF, however it is stored: sparse, quantized or clustered.
 
     A `Blend` weights the channels of the view maps.
@@ -41,19 +41,19 @@ class SeparableSystem(protocol.System):
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "v r d"]:
         """The view-modulated tuple of every vertex: `jaxprt.separable.view_tuple`."""
         protocol.check_blend(materials)
-        factor = view_tuple(self.transport, self.brdf, eye)
+        factor = view_factors(self.brdf, *self.place(self.transport), eye)
         if materials is None:
             return factor
         materials.check(self.vertices, self.brdf.view_map.shape[-1])
         return jnp.einsum("vrk,vkc->vrc", factor, materials.weight)
 
-    def combine(self, light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
+    def combine(self, light: Float[Array, "_ r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
         """Radiance: the dot product of the two tuples."""
         require.array("the light", light, "v r c", source="SeparableSystem.light")
         require.array("the view", view, "v r c", source="SeparableSystem.view")
-        return combine(light, view)
+        return combine(self.carried(light), view)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices."""
-        return len(self.transport.position)
+        """Number of vertices, or of points."""
+        return len(self.transport.position if self.points is None else self.points)

@@ -1,0 +1,83 @@
+"""What interpolating radiance between vertices errs by: where pictures need radiance at pixels.
+
+Radiance of a glossy surface varies with the direction in which it mirrors the eye. Interpolated over a step of angle d
+it errs by d^2 / 12 of its second derivative, in the root of the mean square over a triangle.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxprt.brdf import grid
+from jaxprt.relit.channels import Shading
+from jaxprt.sphere import directions, hemisphere
+from jaxprt.systems.bright_texels import BrightTexels
+from jaxprt.systems.harmonic import HarmonicSystem
+from jaxprt.systems.protocol import System
+
+_DEGREE = 128  # of the harmonics that BRDFs are looked at by
+_RINGS, _SECTORS = 96, 64
+_VIEW = np.array([0.6, 0.0, 0.8], np.float32)
+# Of an isotropic field 3/8 of the squared Laplacian is the square of a second derivative.
+_ALONG = np.sqrt(3 / 8) / 12
+
+
+def curvature(shading: Shading, system: System) -> float:
+    """Root mean square of the Laplacian of a part's radiance over the mirror direction, over that of its radiance.
+
+    Under light of natural spectrum, C_l = (l + 1/2)^-2, from a view of 37 degrees, by the zonal harmonics of BRDF times
+    cosine about the mirror direction; as far as the system has harmonics.
+
+    Args:
+        shading: The part; channels count with their mean weights.
+        system: Its system.
+
+    Returns:
+        In 1 / radian^2.
+    """
+    brdf: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
+    wo = jnp.asarray(_VIEW)
+    mirror = jnp.asarray(_VIEW * [-1, -1, 1])
+    wi, area = hemisphere.arcs(mirror, rings=_RINGS, sectors=_SECTORS)
+    value = np.asarray(grid.as_argument(brdf)(wi, jnp.broadcast_to(wo, wi.shape)), np.float64)
+    if shading.blend is not None:
+        value = value @ np.asarray(jnp.mean(shading.blend.weight, 0), np.float64)
+    mass = value.mean(-1) * np.asarray(area) * np.maximum(np.asarray(wi)[:, 2], 0)
+    cosine = np.clip(np.asarray(wi, np.float64) @ np.asarray(mirror, np.float64), -1, 1)
+    degree = np.arange(_DEGREE + 1)
+    # The coefficients of a Legendre series with 1 at one degree evaluate to the polynomial of that degree.
+    zonal = mass @ np.polynomial.legendre.legvander(cosine, _DEGREE)
+    inner = system.system if isinstance(system, BrightTexels) else system
+    if isinstance(inner, HarmonicSystem):
+        zonal = zonal[: inner.degree + 1]
+    degree = degree[: len(zonal)]
+    power = (2 * degree + 1) / (degree + 0.5) ** 2 * zonal**2
+    total = power.sum()
+    return float(np.sqrt((power * (degree * (degree + 1.0)) ** 2).sum() / total)) if total > 0 else 0.0
+
+
+@jax.jit
+def error(
+    position: Float[Array, "v 3"],
+    normal: Float[Array, "v 3"],
+    face: Int[Array, "f 3"],
+    eye: Float[Array, "3"],
+    curvature: Float[Array, " v"],
+) -> Float[Array, " f"]:
+    """Relative error of radiance that is interpolated over each triangle, at most 1.
+
+    Args:
+        position: Vertices.
+        normal: Their normals.
+        face: Triangles.
+        eye: Position of the viewer.
+        curvature: From `curvature`, of each vertex.
+    """
+    toward = directions.normalize(eye - position)
+    mirror = 2 * jnp.sum(normal * toward, -1, keepdims=True) * normal - toward
+    a, b, c = (mirror[face[:, k]] for k in range(3))
+    square = jnp.stack([jnp.sum((x - y) ** 2, -1) for x, y in ((a, b), (b, c), (c, a))])
+    return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[face[:, 0]], 1)

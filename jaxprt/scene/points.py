@@ -1,0 +1,92 @@
+"""Points on the triangles of a mesh: where radiance is asked for between the vertices."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Integer
+
+from jaxprt.sphere import directions
+
+_ROUNDED = 1e-4  # by which weights may miss the triangle
+
+
+class Points(eqx.Module):
+    """Points on the triangles of a mesh, each a weighted mean of the corners of its triangle.
+
+    Attributes:
+        corner: Numbers of the vertices.
+        weight: Barycentric weights of each; they sum to 1.
+        slope: Change of the weights from one pixel to the next, to the right and down; None for points of no picture.
+    """
+
+    corner: Int[Array, "k p"]
+    weight: Float[Array, "k p"]
+    slope: Float[Array, "2 k p"] | None = None
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return self.corner.shape[1]
+
+    def carry(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
+        """An attribute of the vertices, along an axis, interpolated at the points: linear in it."""
+        wide = [1] * attribute.ndim
+        wide[axis] = len(self)
+        parts = [
+            jnp.take(attribute, corner, axis, mode="clip") * weight.astype(attribute.dtype).reshape(wide)
+            for corner, weight in zip(self.corner, self.weight, strict=True)
+        ]
+        return sum(parts[1:], start=parts[0])
+
+    def slopes(self, attribute: Float[Array, "v c"]) -> Float[Array, "2 p c"]:
+        """Change of an attribute of the vertices from one pixel to the next, to the right and down."""
+        assert self.slope is not None
+        return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])
+
+    def frame(self, frame: Float[Array, "v 3 3"]) -> Float[Array, "p 3 3"]:
+        """Shading frames: the interpolated normal at unit length, and the interpolated tangent orthogonal to it.
+
+        Args:
+            frame: Those of the vertices; rows are tangent, bitangent, normal.
+        """
+        rows = self.carry(frame[:, ::2].reshape(len(frame), 6))
+        return directions.frame(directions.normalize(rows[:, 3:]), rows[:, :3])
+
+
+def placed(
+    position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], points: Points | None
+) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 3"]]:
+    """Positions and shading frames of points; those of the vertices for None."""
+    return (position, frame) if points is None else (points.carry(position), points.frame(frame))
+
+
+def on_triangles(
+    face: Integer[ArrayLike, "f 3"], triangle: Integer[ArrayLike, " p"], barycentric: Float[ArrayLike, "p 3"]
+) -> Points:
+    """Points given by their triangles, as `jaxprt.image.rasterize` and ray tracers have them.
+
+    Args:
+        face: Triangles of the mesh, `Mesh.face`.
+        triangle: The number of each point's triangle.
+        barycentric: Weights of its three vertices, which sum to 1.
+
+    Raises:
+        ValueError: There is no such triangle, or a point lies outside its triangle. Inside `jax.jit` values are not
+            known: the nearest number counts there, and weights are taken as they are.
+    """
+    if np.shape(barycentric) != (*np.shape(triangle), 3) or np.ndim(triangle) != 1:
+        shapes = f"{list(np.shape(triangle))} and {list(np.shape(barycentric))}"
+        raise ValueError(f"points must be triangles [p] and weights [p, 3], got {shapes}")
+    if not any(isinstance(each, Tracer) for each in (face, triangle, barycentric)):
+        face, triangle, barycentric = (np.asarray(each) for each in (face, triangle, barycentric))
+        if triangle.size and (triangle.min() < 0 or triangle.max() >= len(face)):
+            raise ValueError(f"triangles must be from 0 to {len(face) - 1}, got {triangle.min()} to {triangle.max()}")
+        off = np.maximum(-barycentric.min(1, initial=0), np.abs(barycentric.sum(1) - 1))
+        if not np.all(off <= _ROUNDED):
+            worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
+            raise ValueError(
+                f"weights of points must be at least 0 and sum to 1, got {barycentric[worst]} at point {worst}"
+            )
+        return Points(jnp.asarray(face[triangle].T), jnp.asarray(np.ascontiguousarray(barycentric.T)))
+    return Points(jnp.take(jnp.asarray(face), triangle, 0, mode="clip").T, jnp.asarray(barycentric).T)
