@@ -10,7 +10,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxprt.image import raster
 from jaxprt.image.raster import SAMPLES, Fragments
@@ -29,8 +30,7 @@ class Pixels(eqx.Module):
 
     Attributes:
         triangle: Number of the triangle that each point lies on, -1 in padding.
-        barycentric: Perspective-correct weights of its three vertices at the point, none negative; they sum to 1, or are
-            0 in padding.
+        barycentric: Perspective-correct weights of its three vertices, not negative; they sum to 1, to 0 in padding.
         slope: Change of the weights per pixel to the right, and per pixel down.
         pixel: Number of the point's pixel, row * width + column.
         coverage: Share of the pixel's samples that see the surface of the point, 0 in padding.
@@ -68,21 +68,25 @@ def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
         ValueError: The fragments are of a picture of another size, or of triangles that the mesh does not have.
     """
     shape = fragments.triangle.shape
-    if shape[:2] != (camera.height, camera.width) or shape[2:] not in ((), (4,)):
+    if shape[:2] != (camera.height, camera.width) or shape[2:] not in ((), (4,)) or 0 in shape:
         raise ValueError(
-            f"the fragments must be [{camera.height}, {camera.width}] or [{camera.height}, {camera.width}, 4] "
-            f"as the camera has it, got {list(shape)}"
+            f"the fragments must be of the camera's {camera.height} x {camera.width} pixels, at least one, with one "
+            f"sample or four in each, got {list(shape)}"
         )
-    members, background = _surfaces(fragments, mesh, camera)
-    if isinstance(members, jax.core.Tracer):
-        index = _used_first(members)
-    else:
-        highest = int(np.max(fragments.triangle))
-        if highest >= len(mesh.face):
-            raise ValueError(f"the fragments must be of the mesh's {len(mesh.face)} triangles, got triangle {highest}")
-        used = np.flatnonzero(np.asarray(members))
-        index = jnp.asarray(np.pad(used, (0, _room(len(used)) - len(used)), constant_values=-1), jnp.int32)
-    return Pixels(*_points(index, members, fragments.triangle, mesh, camera), background)
+    concrete = not isinstance(fragments.triangle, Tracer)
+    if concrete and (highest := int(np.max(fragments.triangle))) >= len(mesh.face):
+        raise ValueError(f"the fragments must be of the mesh's {len(mesh.face)} triangles, got triangle {highest}")
+    facing = raster.front_faces(mesh, camera)
+    members, mixed, background = _uniform(fragments, facing)
+    if len(shape) == 3:
+        row = _numbers(mixed)
+        shown, samples = _samples(row, fragments, (facing, *_faces(mesh, camera)))
+        members = _merge(row, members, shown, _same(*samples))
+    triangle, pixel, coverage, corner, step = _points(_numbers(members.ravel()), members, fragments, mesh, camera)
+    linear = _linear(*corner)
+    weight, rate = _weights(*linear, *step)
+    barycentric, slope = _packed(triangle, weight, rate, *linear[1:])
+    return Pixels(triangle, barycentric, slope, pixel, coverage, background)
 
 
 @jax.jit
@@ -171,129 +175,159 @@ def render(
     return resolve(pixels, interpolate(pixels, mesh.face, color), background=background)
 
 
-def _room(count: int) -> int:
-    """The next number that is a small multiple of a power of two: at most a sixteenth more."""
-    unit = 1 << max(count.bit_length() - 5, 0)
-    return max(-(-count // unit) * unit, 1)
+def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"]) -> Int[Array, " m"]:
+    """Numbers of the flags that are set, in order, then -1: as many as there are, and some, or n inside of jax.jit."""
+    if isinstance(flag, Tracer):
+        place = jnp.where(flag > 0, jnp.cumsum(flag > 0, dtype=jnp.int32) - 1, flag.size)
+        return jnp.full(flag.size, -1, jnp.int32).at[place].set(jnp.arange(flag.size, dtype=jnp.int32), mode="drop")
+    number = np.flatnonzero(np.asarray(flag)).astype(np.int32)
+    unit = 1 << max(len(number).bit_length() - 5, 0)
+    room = max(-(-len(number) // unit) * unit, 1)
+    return jnp.asarray(np.pad(number, (0, room - len(number)), constant_values=-1))
+
+
+# What follows is cut into several programs, for XLA fuses all that one program computes into each of its results, and
+# repeats it for each.
 
 
 @jax.jit
-def _used_first(members: UInt8[Array, "h w s"]) -> Int[Array, " p"]:
-    """Numbers of the samples that stand for a surface, in order, then -1."""
-    used = members.ravel() > 0
-    place = jnp.where(used, jnp.cumsum(used, dtype=jnp.int32) - 1, used.size)
-    return jnp.full(used.size, -1, jnp.int32).at[place].set(jnp.arange(used.size, dtype=jnp.int32), mode="drop")
+def _uniform(fragments: Fragments, facing: Bool[Array, " f"]):
+    """Pixels that show one triangle, pixels that show several, and the share of each pixel that shows none.
 
-
-@jax.jit
-def _surfaces(fragments: Fragments, mesh: Mesh, camera: Camera) -> tuple[UInt8[Array, "h w s"], Float[Array, "h w"]]:
-    """Which samples of each pixel are one surface, and the share of its samples that see none.
-
-    The first sample of a surface stands for it. It has a bit for each sample of the surface; other samples have 0.
+    Of the samples that see one surface, the first stands for it: its member has a bit for each of them, and theirs
+    have none. Only the pixels that show one triangle have members yet.
     """
-    mesh, camera, fragments = jax.lax.stop_gradient((mesh, camera, fragments))
     height, width, *_ = fragments.triangle.shape
-    triangle = fragments.triangle.reshape(height, width, -1)
-    samples = triangle.shape[-1]
-    background = jnp.mean(triangle < 0, -1, dtype=mesh.position.dtype)
-    shown = raster.front_faces(mesh, camera)[triangle] & (triangle >= 0)
-    if samples == 1:
-        return shown.astype(jnp.uint8), background
-    same = _smooth(triangle, fragments.depth, mesh, camera)
-    first = []
-    for j in range(samples):
-        leader = jnp.full((height, width), j)
-        for i in reversed(range(j)):
-            leader = jnp.where(same[i, j] & (first[i] == i), i, leader)
-        first.append(jnp.where(shown[..., j], leader, -1))
-    members = [sum((first[j] == i) << j for j in range(i, samples)) for i in range(samples)]
-    return jnp.stack(members, -1).astype(jnp.uint8), background
+    triangle = fragments.triangle.reshape(height * width, -1).T
+    shown = facing[triangle] & (triangle >= 0)
+    same = functools.reduce(jnp.logical_and, [each == triangle[0] for each in triangle])
+    mixed = ~same & functools.reduce(jnp.logical_or, list(shown))
+    whole = jnp.where(same & shown[0], (1 << len(triangle)) - 1, 0).astype(jnp.uint8)
+    members = jnp.pad(whole[:, None], ((0, 0), (0, len(triangle) - 1)))
+    empty = functools.reduce(jnp.add, [(each < 0).astype(fragments.depth.dtype) for each in triangle])
+    return members, mixed, (empty / len(triangle)).reshape(height, width)
 
 
-def _smooth(triangle: Int[Array, "h w s"], depth: Float[Array, "h w s"], mesh: Mesh, camera: Camera) -> dict:
-    """Whether two samples of a pixel are of one surface, for each pair (i, j) of samples with i < j.
+@jax.jit
+def _faces(mesh: Mesh, camera: Camera):
+    """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down.
 
-    The inverse depth is linear on a triangle's picture. Between samples of two triangles it changes by the mean of both
-    gradients, give or take what either explains.
+    1 / depth is linear in the picture of a triangle. Normals are sums of those of the vertices.
     """
-    normal = sum(mesh.normal[mesh.face[:, i]] for i in range(3))
-    size = jnp.sum(normal**2, -1, keepdims=True)
-    normal = normal / jnp.sqrt(jnp.where(size > 0, size, 1))
-    region = mesh.region[mesh.face[:, :1]].astype(normal.dtype)
-    column, row = _inverse_depth_gradient(*(axis[mesh.face.T] for axis in raster.project(mesh.position, camera)))
-    table = jnp.concatenate([normal, region, column[:, None], row[:, None]], -1)[triangle]
-    each = [table[..., i, :] for i in range(triangle.shape[-1])]
-    inverse = 1 / depth
-    offset = SAMPLES[triangle.shape[-1]]
+    mesh, camera = jax.lax.stop_gradient((mesh, camera))
+    face = mesh.face.T
+    normal = jax.lax.map(lambda axis: axis[face], mesh.normal.T)
+    x, y, q = jax.lax.map(lambda axis: axis[face], jnp.stack(raster.project(mesh.position, camera)))
+    s = jnp.sign(q)
+    value, right, down = _affine(x - s * s[0] * x[0], y - s * s[0] * y[0], q)
+    area = sum(value[i] * s[i] for i in range(3))
+    scale = [jnp.where(area == 0, 0, jnp.abs(each) / jnp.where(area == 0, 1, area)) for each in q]
+    change = [sum(part[i] * scale[i] for i in range(3)) for part in (right, down)]
+    return mesh.region[face[0]], *(each[0] + each[1] + each[2] for each in normal), *change
+
+
+@jax.jit
+def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...]):
+    """What the samples of some pixels see, as arrays [s, m]: whether it is a front, and what `_same` takes."""
+    shape = (fragments.depth.shape[0] * fragments.depth.shape[1], -1)
+    triangle, depth = (each.reshape(shape)[row].T for each in (fragments.triangle, fragments.depth))
+    facing, *rest = (each[triangle] for each in face)
+    return facing & (triangle >= 0), (triangle, 1 / depth, *rest)
+
+
+@jax.jit
+def _same(triangle, inverse, region, x, y, z, right, down) -> dict[tuple[int, int], Bool[Array, " m"]]:
+    """Whether two samples are of one surface, for each pair (i, j) of the samples of a pixel with i < j.
+
+    Where two triangles meet between the samples, the inverse depth changes by a mean of what each explains.
+    """
+    offset = SAMPLES[len(triangle)]
     same = {}
-    for j in range(len(each)):
+    for j in range(len(triangle)):
         for i in range(j):
-            right, down = offset[j] - offset[i]
-            step = [right * one[..., 4] + down * one[..., 5] for one in (each[i], each[j])]
-            near, far = inverse[..., i], inverse[..., j]
-            jump = jnp.abs(far - near - (step[0] + step[1]) / 2)
-            explained = (jnp.abs(step[0]) + jnp.abs(step[1])) / 2 + SAME_DEPTH * near
-            alike = sum(each[i][..., axis] * each[j][..., axis] for axis in range(3)) >= SMOOTH
-            joined = alike & (each[i][..., 3] == each[j][..., 3]) & (jump <= explained)
-            same[i, j] = joined | (triangle[..., i] == triangle[..., j])
+            step = [(offset[j] - offset[i]) @ jnp.stack([right[k], down[k]]) for k in (i, j)]
+            jump = jnp.abs(inverse[j] - inverse[i] - (step[0] + step[1]) / 2)
+            near = jump <= (jnp.abs(step[0]) + jnp.abs(step[1])) / 2 + SAME_DEPTH * inverse[i]
+            dot, *square = (x[a] * x[b] + y[a] * y[b] + z[a] * z[b] for a, b in ((i, j), (i, i), (j, j)))
+            alike = (dot >= 0) & (dot**2 >= SMOOTH**2 * square[0] * square[1])
+            same[i, j] = (triangle[i] == triangle[j]) | (near & alike & (region[i] == region[j]))
     return same
 
 
-def _inverse_depth_gradient(x, y, q) -> tuple[Float[Array, " f"], Float[Array, " f"]]:
-    """Change of 1 / depth on each triangle per pixel to the right, and per pixel down; 0 without area."""
-    s = jnp.sign(q)
-    value, column, row = _affine(x, y, q, s[0] * x[0], s[0] * y[0])
-    area = sum(value[i] * s[i] for i in range(3))
-    inverse = jnp.where(area == 0, 0, 1 / jnp.where(area == 0, 1, area))
-    weight = jnp.abs(q)
-    return tuple(sum(part[i] * weight[i] for i in range(3)) * inverse for part in (column, row))
-
-
-def _affine(x, y, q, column, row):
-    """The three determinants of `raster.rasterize` at points of the picture, and their change to the right and down."""
-    s = [jnp.sign(q[i]) for i in range(3)]
-    a = [x[i] - s[i] * column for i in range(3)]
-    b = [y[i] - s[i] * row for i in range(3)]
-    pairs = ((1, 2), (2, 0), (0, 1))
-    value = [a[i] * b[j] - a[j] * b[i] for i, j in pairs]
-    return value, [s[j] * b[i] - s[i] * b[j] for i, j in pairs], [s[i] * a[j] - s[j] * a[i] for i, j in pairs]
+@jax.jit
+def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> UInt8[Array, "n s"]:
+    """Members with those of the pixels `row`: samples of one surface join the first of them."""
+    first = []
+    for j in range(len(shown)):
+        leader = jnp.full(row.shape, j)
+        for i in reversed(range(j)):
+            leader = jnp.where(same[i, j] & (first[i] == i), i, leader)
+        first.append(jnp.where(shown[j], leader, -1))
+    each = [sum((first[j] == i) << j for j in range(i, len(first))) for i in range(len(first))]
+    row = jnp.where(row < 0, len(members), row)
+    return members.at[row].set(jnp.stack(each, -1).astype(members.dtype), mode="drop")
 
 
 @jax.jit
-def _points(index: Int[Array, " p"], members: UInt8[Array, "h w s"], triangle, mesh: Mesh, camera: Camera):
-    """Triangles, weights, slopes, pixels and coverage of the surfaces that the samples `index` stand for."""
+def _points(sample: Int[Array, " p"], members: UInt8[Array, "n s"], fragments: Fragments, mesh: Mesh, camera: Camera):
+    """Points of the surfaces that some samples stand for.
+
+    Returns:
+        Triangles, pixels and coverage; the projected vertices as seen from the sample, and the step from there to the
+        mean position of the surface's samples.
+    """
     mesh, camera = jax.lax.stop_gradient((mesh, camera))
-    samples, dtype = members.shape[-1], mesh.position.dtype
-    used, sample = index >= 0, jnp.maximum(index, 0)
+    samples, dtype = members.shape[1], mesh.position.dtype
+    used, sample = sample >= 0, jnp.maximum(sample, 0)
     pixel = jnp.where(used, sample // samples, camera.width * camera.height - 1)
-    triangle = jnp.where(used, triangle.ravel()[sample], -1)
+    triangle = jnp.where(used, fragments.triangle.ravel()[sample], -1)
     member = jnp.where(used, members.ravel()[sample], 0)
     middle, coverage = (jnp.asarray(each, dtype)[member] for each in _subsets(samples))
     start = jnp.asarray(SAMPLES[samples], dtype)[sample % samples]
-    vertex = mesh.face[jnp.maximum(triangle, 0)]
-    projected = jnp.stack(raster.project(mesh.position, camera), -1)[vertex]
-    x, y, q = ([projected[:, i, axis] for i in range(3)] for axis in range(3))
+    vertex = mesh.face[jnp.maximum(triangle, 0)].T
+    x, y, q = jax.lax.map(lambda axis: axis[vertex], jnp.stack(raster.project(mesh.position, camera)))
     column = (pixel % camera.width).astype(dtype) + (1 - camera.width) / 2 + start[:, 0]
     row = (pixel // camera.width).astype(dtype) + (1 - camera.height) / 2 + start[:, 1]
+    s, step = jnp.sign(q), (middle - start).T
+    return triangle, pixel, coverage, (x - s * column, y - s * row, q), (step[0], step[1])
 
-    value, right, down = _affine(x, y, q, column, row)
-    turned = jnp.sign(sum(value[i] * jnp.sign(q[i]) for i in range(3)))
-    scale = [turned * jnp.abs(q[i]) for i in range(3)]
-    value, right, down = ([scale[i] * part[i] for i in range(3)] for part in (value, right, down))
-    step = middle - start
-    change = [step[:, 0] * right[i] + step[:, 1] * down[i] for i in range(3)]
+
+def _affine(x, y, q):
+    """The determinants of `raster.rasterize` where x = y = 0, and their change per pixel to the right and down."""
+    s, pairs = jnp.sign(q), ((1, 2), (2, 0), (0, 1))
+    value = [x[i] * y[j] - x[j] * y[i] for i, j in pairs]
+    return value, [s[j] * y[i] - s[i] * y[j] for i, j in pairs], [s[i] * x[j] - s[j] * x[i] for i, j in pairs]
+
+
+@jax.jit
+def _linear(x, y, q):
+    """Weights of the vertices up to a common factor, which are linear in the picture, and their changes."""
+    value, right, down = _affine(x, y, q)
+    side = jnp.sign(sum(value[i] * jnp.sign(q[i]) for i in range(3)))
+    return [[side * jnp.abs(q[i]) * part[i] for i in range(3)] for part in (value, right, down)]
+
+
+@jax.jit
+def _weights(value, right, down, across, along):
+    """Perspective-correct weights after a step, which ends where it would leave the triangle, and 1 / their sum."""
+    change = [across * right[i] + along * down[i] for i in range(3)]
     leaves = [value[i] + change[i] < 0 for i in range(3)]
     reach = [jnp.where(leaves[i], -value[i] / jnp.where(leaves[i], change[i], 1), 1) for i in range(3)]
     reach = jnp.clip(jnp.minimum(jnp.minimum(reach[0], reach[1]), reach[2]), 0, 1)
-    weight = jnp.stack([jnp.maximum(value[i] + reach * change[i], 0) for i in range(3)], -1)
-    total = jnp.sum(weight, -1, keepdims=True)
-    some = total > 0
-    total = jnp.where(some, total, 1)
-    weight = jnp.where(some, weight / total, 1 / 3)
-    slope = jnp.stack([jnp.stack(right, -1), jnp.stack(down, -1)], 1)
-    slope = (slope - weight[:, None] * jnp.sum(slope, -1, keepdims=True)) / total[:, None]
-    slope = jnp.where(some[:, None] & used[:, None, None], jnp.clip(slope, -STEEPEST, STEEPEST), 0)
-    return triangle, jnp.where(used[:, None], weight, 0), slope, pixel, coverage
+    weight = [jnp.maximum(value[i] + reach * change[i], 0) for i in range(3)]
+    total = sum(weight)
+    rate = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
+    return [jnp.where(total > 0, each * rate, 1 / 3) for each in weight], rate
+
+
+@jax.jit
+def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
+    """Weights and their slopes, zero in padding."""
+    slope = [[(part[i] - weight[i] * sum(part)) * rate for i in range(3)] for part in change]
+    slope = jnp.stack([jnp.stack(each, -1) for each in slope], 1)
+    used = (triangle >= 0)[:, None]
+    slope = jnp.where(used[..., None], jnp.clip(slope, -STEEPEST, STEEPEST), 0)
+    return jnp.where(used, jnp.stack(weight, -1), 0), slope
 
 
 @functools.cache

@@ -99,14 +99,18 @@ def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     The triangle's plane decides. Shading normals of a coarse mesh may look away from the eye where the triangle does
     not; they only tell its two sides apart. A triangle whose mean shading normal is zero has two fronts.
     """
-    corner = [mesh.position[mesh.face[:, i]] - camera.eye for i in range(3)]
-    plane = jnp.cross(corner[1] - corner[0], corner[2] - corner[0])
-    side = jnp.sum(plane * sum(mesh.normal[mesh.face[:, i]] for i in range(3)), -1)
-    middle = sum(corner)
-    distance = -jnp.sum(plane * middle, -1)
+    mesh, camera = jax.lax.stop_gradient((mesh, camera))
+    vertex = jnp.concatenate([mesh.position - camera.eye, mesh.normal], -1)
+    x, y, z, *normal = jax.lax.map(lambda axis: axis[mesh.face.T], vertex.T)
+    middle, edge, other = (
+        [op(each) for each in (x, y, z)] for op in (sum, lambda c: c[1] - c[0], lambda c: c[2] - c[0])
+    )
+    plane = [edge[i - 2] * other[i - 1] - edge[i - 1] * other[i - 2] for i in range(3)]
+    side = sum(plane[i] * sum(normal[i]) for i in range(3))
+    distance = -sum(plane[i] * middle[i] for i in range(3))
     # Rounding may turn triangles that are seen edge-on.
-    edge = EDGE_ON * jnp.sqrt(jnp.sum(plane**2, -1) * jnp.sum(middle**2, -1))
-    return (jnp.sign(side) * distance >= -edge) | (side == 0)
+    plain = EDGE_ON * jnp.sqrt(sum(each**2 for each in plane) * sum(each**2 for each in middle))
+    return (jnp.sign(side) * distance >= -plain) | (side == 0)
 
 
 @jax.jit
