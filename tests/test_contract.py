@@ -737,6 +737,7 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
+    "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lobe.relight.prefilter": example(lambda draw: call(draw.light(8))),
     "systems.lobe.relight.combine": example(

@@ -14,7 +14,7 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.bounces.jobs import DEGREE
-from jaxprt.systems.bounces.relight import LitTransfer, collect, gathered, light_side
+from jaxprt.systems.bounces.relight import LitTransfer, area_mean, collect, gathered, light_side
 from jaxprt.systems.bounces.tensor import TransferTensor
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.protocol import Blend
@@ -136,9 +136,7 @@ class PartBounces(protocol.System):
             return None
         blend.check(len(part.position), self.tensor.factor[number].shape[1])
         first = sum(len(each.position) for each in self.part[:number])
-        area = self.tensor.area[first : first + len(part.position)]
-        whole = jnp.sum(area)
-        return jnp.einsum("v,vkc->kc", area, blend.weight) / jnp.where(whole > 0, whole, 1)
+        return area_mean(blend.weight, self.tensor.area[first : first + len(part.position)])
 
     def _given(self, materials: Any) -> Sequence[Blend | None]:
         if materials is None:

@@ -161,7 +161,9 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
             continue
         dynamic.relight.check_material(number, material, len(factor), len(tensor.place))
         area = jnp.where(tensor.region == number, tensor.area, 0)
-        diffuse, specular = (_mean(each, area) for each in (material.diffuse, material.specular))
+        diffuse, specular = (
+            each if each.ndim == 1 else area_mean(each, area) for each in (material.diffuse, material.specular)
+        )
         rows.append(functions.weights(factor, material.weight, diffuse, specular))
     return gathered(tensor, rows)
 
@@ -170,6 +172,12 @@ def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "_ _"]]) -> Flo
     """Weights of the functions that the tensor keeps, given those of all functions of each region."""
     colors = max(each.shape[1] for each in rows)
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
+
+
+def area_mean(value: Float[Array, "v *c"], area: Float[Array, " v"]) -> Float[Array, "*c"]:
+    """Mean of a value over a surface, given the area of each vertex; zero if there is no area."""
+    whole = jnp.sum(area)
+    return jnp.tensordot(area, value, 1) / jnp.where(whole > 0, whole, 1)
 
 
 @isolated
@@ -321,11 +329,3 @@ def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) ->
     """Coefficients of a factored BRDF at each row."""
     view = brdf.view(directions.view(frame, position, eye))
     return jnp.einsum("sk,qke->seq", functions.project(brdf, degree=DEGREE), view)
-
-
-def _mean(value: Array, area: Array) -> Array:
-    """Mean of a texture over a region, of whose surface each vertex has some."""
-    if value.ndim == 1:
-        return value
-    whole = jnp.sum(area)
-    return area @ value / jnp.where(whole > 0, whole, 1)
