@@ -291,7 +291,7 @@ def drawn(mesh: Mesh, models: Sequence[Any], light: Environment, view: Camera, e
 
 
 def wrong(determined, found, true) -> float:
-    """Of the combinations of numbers that the picture determines, in units of these."""
+    """Relative L2 error of the combinations of numbers that the pictures determine."""
     return norm(determined @ np.ravel(found - true)) / norm(determined @ np.ravel(true))
 
 

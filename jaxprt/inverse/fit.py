@@ -36,8 +36,9 @@ def light(
         lower: Bounds: one number for all, or a pytree like the start, with None where there is no bound.
         upper: The same from above.
         prior: Added to half the squared residual; as `smoothness` of the texels or their sum, times a weight.
-        error: Of what is solved for at once, the relative L2 to which combinations count as determined, as far as parts
-            of the pictures disagree about them: the less error, the fewer.
+        error: Largest relative L2 error at which a combination of numbers counts as determined, estimated from how much
+            parts of the pictures disagree about it. A smaller error keeps fewer combinations. Only for
+            numbers that are solved for at once.
         steps: At most so many.
 
     Raises:

@@ -49,13 +49,13 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
-    """How much of the light that each part sends on was reflected once at least before, and twice at least.
+    """Fraction of each part's radiance that other surfaces reflected at least once, and at least twice.
 
     An estimate: surfaces count as matte, with the mean albedo of their parts, and three bounces or more as none.
 
     Args:
         shadings: What the parts are to systems.
-        environments: Lights; that with the largest share counts.
+        environments: Lights; the largest fraction under any of them counts.
 
     Returns:
         Relative L2, by bounces and parts.

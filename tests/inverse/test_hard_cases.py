@@ -147,7 +147,7 @@ def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, dull, view):
 
 @pytest.mark.parametrize("degree", [2, 3])
 def test_of_a_sun_some_is_determined_although_most_of_it_is_too_fine(mesh, dull, view, degree):
-    """Of what is left out nothing may make the rest doubtful, until nothing remains."""
+    """Combinations that are left out must not make the others count as undetermined, one after another."""
     light = np.zeros((6, 16, 16, 3), np.float32)
     light[2, 8:11, 3:6] = 50
     low, high = dull(degree), dull(6)

@@ -145,7 +145,7 @@ def weights(
 
     Args:
         factor: The set's `jaxprt.dynamic.DynamicBrdf.factor`.
-        weight: Of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
+        weight: The weight of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
         diffuse: Albedo of the diffuse part.
         specular: What the BRDF of the set is multiplied by.
 

@@ -41,7 +41,7 @@ class Material(eqx.Module):
     twice as bright lobes, and a NaN in one region reaches every vertex to which that region sends light.
 
     Attributes:
-        weight: Of each BRDF in the region's set, as `jaxprt.brdf.navigation` makes them from coordinates.
+        weight: The weight of each BRDF in the region's set; `jaxprt.brdf.navigation` makes weights from coordinates.
         diffuse: Albedo of the diffuse part: gray, a color, or a texture of one for each vertex of the mesh.
         specular: What the BRDF of the set is multiplied by; the same.
     """
