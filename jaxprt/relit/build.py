@@ -89,7 +89,7 @@ def precompute(
     reflected = None
     if bounces:
         # One store for one bounce and two: the second goes on from the first.
-        target = Target(mesh, path=folder and folder / "scene", executor=executor, progress=progress)
+        target = Target(mesh, size=size, path=folder and folder / "scene", executor=executor, progress=progress)
         reflected = reflection.make(shadings, bounces, target)
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
 

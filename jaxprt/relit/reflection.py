@@ -19,6 +19,7 @@ from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.harmonic import TransferVector
 
 MOST = 2  # bounces
+_EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
 _VIEWS = 16  # over whose angles albedo is averaged
@@ -31,15 +32,16 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
     Args:
         shadings: What the parts are to systems.
         count: How many times light is reflected, 1 or 2.
-        target: Where that is done; occluder, size and vertices are not used.
+        target: The light's size, and where that is done; the parts occlude each other, and all vertices are lit.
 
     Returns:
         The system of reflected light alone.
     """
     mesh = _joined(shadings)
     paths = [_factored(each) for each in shadings]
+    options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Nothing is left out: how many bounces there are is decided, and materials may change to what brings more.
-    tensor = bounces.precompute(mesh, paths, bounces=count, **target.options("bounces"))
+    tensor = bounces.precompute(mesh, paths, bounces=count, **options)
     frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
     parts = [
         ReflectingPart(each.mesh.position, axes, harmonic_table(each, degree=DEGREE))

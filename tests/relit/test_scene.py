@@ -17,7 +17,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import pixels, raster
-from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms
+from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -272,6 +272,18 @@ def test_bounces_are_added_to_direct_light(reflecting):
     np.testing.assert_allclose(direct, relit("harmonic").radiance(light(), eye=EYE), rtol=1e-4, atol=1e-5)
     assert 0.02 < np.linalg.norm(reflected) / np.linalg.norm(direct) < 0.5
     assert prt.memory(reflecting) > prt.memory(reflecting.direct)
+
+
+def test_lights_of_small_faces_have_bounces(monkeypatch):
+    """Reflected light has as many texels as the light where that is small."""
+    coarser = functools.partial(bounces.precompute.__wrapped__, size=8, components=8, modes=8)
+    monkeypatch.setattr(reflection.bounces, "precompute", coarser)
+    parts = [Part("floor", mesh("floor"), Lambert(0.7)), Part("wall", mesh("wall"), Lambert(0.5))]
+    ready = prt.precompute(Scene(parts), system=RECIPES["harmonic"], bounces=1, size=4, progress=False)
+    sky = Environment(jnp.ones((6, 4, 4, 3)))
+    whole, direct = (np.asarray(prt.radiance(each, sky, eye=EYE)) for each in (ready, ready.direct))
+    assert np.isfinite(whole).all()
+    assert 1.05 < whole.sum() / direct.sum() < 1.5
 
 
 def test_a_part_sends_the_color_of_its_material_at_present(reflecting):
