@@ -39,9 +39,10 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
     """
     mesh = _joined(shadings)
     paths = [_factored(each) for each in shadings]
+    weights = [None if each.blend is None else jnp.mean(each.blend.weight, 0) for each in shadings]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Nothing is left out: how many bounces there are is decided, and materials may change to what brings more.
-    tensor = bounces.precompute(mesh, paths, bounces=count, **options)
+    tensor = bounces.precompute(mesh, paths, weights=weights, bounces=count, **options)
     frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
     parts = [
         ReflectingPart(each.mesh.position, axes, harmonic_table(each, degree=DEGREE))

@@ -25,7 +25,7 @@ import numpy as np
 import tqdm
 from jaxtyping import Array, Float, Float16, Int
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.scene.mesh import Mesh
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import functions, jobs
@@ -158,6 +158,7 @@ def precompute(
     mesh: Mesh,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     *,
+    weights: Sequence[Float[Array, "k c"] | None] | None = None,
     bounces: int = 2,
     least: float = 0.0,
     components: int = 32,
@@ -174,6 +175,8 @@ def precompute(
         mesh: The whole scene, which lights itself.
         brdfs: What light meets on its way, for each region in the order of their numbers: a set from
             `jaxprt.bounces.factor`, or the one BRDF that it has for good, factored.
+        weights: Typical weights of the channels k of each region's BRDF in each color, by which `worth` is judged. None
+            for a set, and for a BRDF whose channels are colors.
         bounces: 1 or 2.
         least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
             less than this share of what arrives.
@@ -191,12 +194,14 @@ def precompute(
 
     Raises:
         TypeError: A mesh or BRDFs of another kind.
-        ValueError: Not one BRDF for each region, a set without terms or with lobes, bounces other than 1 and 2, numbers
-            below 1, or an edge that is no power of two.
+        ValueError: Not one BRDF for each region, weights of other channels or not finite, a set without terms or with
+            lobes, bounces other than 1 and 2, numbers below 1, or an edge that is no power of two.
 
     Reference: Sun et al. 2007, sections 3.1 and 4.3.
     """
     numbers = _regions(mesh, brdfs)
+    weights = [None] * len(brdfs) if weights is None else weights
+    _check_weights(weights, brdfs)
     _check_sizes(bounces, least, components, modes, edge, size)
     bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
     factor = tuple(each.factor if isinstance(each, DynamicBrdf) else functions.fixed_weights(each) for each in brdfs)
@@ -212,7 +217,7 @@ def precompute(
         size,
         bases=bases,
         response=_responses(mesh, bases, numbers, edge, run),
-        white=np.concatenate([_white(each) for each in factor]),
+        white=np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
         scale=np.asarray(scales(factor)),
         region=np.searchsorted(numbers, region),
         member=member,
@@ -267,6 +272,21 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
     if len(brdfs) != len(numbers):
         raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
     return numbers
+
+
+def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[DynamicBrdf | SeparableBrdf]) -> None:
+    """Refuses weights of other regions or channels."""
+    if len(weights) != len(brdfs):
+        raise ValueError(f"weights must be one, or None, for each of {len(brdfs)} regions, got {len(weights)}")
+    for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
+        if each is None:
+            continue
+        if isinstance(brdf, DynamicBrdf):
+            raise ValueError(f"the weights of region {number}, which has a set of BRDFs, must be None")
+        shape, channels = np.shape(each), brdf.view_map.shape[-1]
+        if len(shape) != 2 or shape[0] != channels:
+            raise ValueError(f"the weights of region {number} must be [{channels} channels, c], got {list(shape)}")
+        require.finite(f"the weights of region {number}", each)
 
 
 def _check_sizes(bounces: int, least: float, components: int, modes: int, edge: int, size: int) -> None:
@@ -326,11 +346,11 @@ def _twice(components: int) -> int:
     return max(1, components // _FEWER)
 
 
-def _white(factor: Array) -> np.ndarray:
+def _white(factor: Array, channel: Array | None) -> np.ndarray:
     """Weights of the functions of a region that is white if it can be, else as it is, brightest color."""
     if factor.ndim == 3:
         return np.append(np.zeros(factor.shape[2], np.float32), np.float32(1))
-    weight = np.asarray(factor)
+    weight = np.asarray(factor if channel is None else factor @ channel)
     return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
 
 

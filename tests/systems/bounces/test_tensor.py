@@ -8,6 +8,7 @@ import pytest
 from jaxprt import bounces, harmonic, separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.models import CookTorrance
+from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
@@ -232,9 +233,14 @@ def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
         few.shorten(error=0.01)
 
 
-def test_what_brings_little_is_left_out_and_told(mesh, capsys):
+@pytest.fixture(scope="module")
+def changing():
+    """A set of BRDFs."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
-    changing = bounces.factor(members, functions=2, terms=6, resolution=12)
+    return bounces.factor(members, functions=2, terms=6, resolution=12)
+
+
+def test_what_brings_little_is_left_out_and_told(mesh, changing, capsys):
     dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
     options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
     every = bounces.precompute(mesh, [changing, dark], progress=False, **options)
@@ -249,6 +255,20 @@ def test_what_brings_little_is_left_out_and_told(mesh, capsys):
     assert f"of {len(every.function)} functions" in told.out + told.err
     np.testing.assert_allclose(few.worth[0], every.worth[0], rtol=1e-5)
     assert few.worth[1] < 0.05
+
+
+def test_channels_with_weights_are_worth_what_the_brdf_is_that_they_add_up_to(mesh):
+    """In the brightest of three colors; without weights the channels would count as colors."""
+    weight = jnp.array([[0.3, 0.1, 0.4], [0.2, 0.3, 0.5]])
+    glossy = {"diffuse": 0.3, "specular": 0.7, "roughness": 0.5, "f0": 0.5}
+    whole = CookTorrance(**glossy | {"diffuse": 0.4 + 0.5 * 0.3, "specular": 0.5 * 0.7})
+    brdfs = Channels((Lambert(1.0), CookTorrance(**glossy)), jnp.ones(2)), whole
+    channels, alone = (separable.factor(each, terms=12, resolution=16) for each in brdfs)
+    options = {"components": ALL, "modes": ALL, "edge": 2, "size": 8, "progress": False}
+    exact = bounces.precompute(mesh, [alone, alone], **options).worth
+    found = bounces.precompute(mesh, [alone, channels], weights=[None, weight], **options).worth
+    np.testing.assert_allclose(found, exact, rtol=0.01)
+    assert np.all(bounces.precompute(mesh, [alone, channels], **options).worth > 1.1 * exact)
 
 
 def test_a_coarse_light_is_where_the_light_is():
@@ -299,6 +319,19 @@ def test_what_makes_no_tensor_is_refused(mesh, brdfs):
         bounces.precompute(mesh, brdfs, edge=6, progress=False)
     with pytest.raises(ValueError, match="bounces must be 1 or 2, got 3"):
         bounces.precompute(mesh, brdfs, bounces=3, progress=False)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs, changing):
+    def refused(weights, message, brdfs=brdfs):
+        with pytest.raises(ValueError, match=message):
+            bounces.precompute(mesh, brdfs, weights=weights, progress=False)
+
+    refused([None], "weights must be one, or None, for each of 2 regions, got 1")
+    refused([None, jnp.ones((2, 3))], r"the weights of region 1 must be \[3 channels, c\], got \[2, 3\]")
+    refused([jnp.ones(3), None], r"the weights of region 0 must be \[3 channels, c\], got \[3\]")
+    refused([jnp.full((3, 1), jnp.nan), None], r"the weights of region 0 must be finite, got 3 of 3")
+    refused([jnp.ones((1, 1)), None], "region 0, which has a set of BRDFs, must be None", [changing, brdfs[1]])
 
 
 def test_the_default_number_of_components_keeps_the_light_of_two_bounces(whole):
