@@ -185,8 +185,15 @@ def plan(
 
 
 def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
-    """Fingerprint of a scene and its lights: meshes, parameters of materials, textures, radiance."""
-    return blocks.fingerprint(*jax.tree.leaves((scene, tuple(environments))))
+    """Fingerprint of a scene and its lights: meshes, classes and parameters of materials, textures, radiance.
+
+    A function counts by its qualified name alone, which another process finds again.
+    """
+    leaves, structure = jax.tree.flatten((scene, tuple(environments)))
+    arrays = [each for each in leaves if not callable(each)]
+    functions = [getattr(each, "__qualname__", type(each).__qualname__) for each in leaves if callable(each)]
+    kinds = re.sub(r" at 0x[0-9a-f]+", "", f"{structure} {functions}")  # without addresses of static functions
+    return blocks.fingerprint(np.frombuffer(kinds.encode(), np.uint8), *arrays)
 
 
 def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):

@@ -1,7 +1,9 @@
 """Plans against the error that carrying them out has, under lights and from views that they did not see."""
 
 import importlib
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +11,11 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import lobe, reference
-from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.brdf import AshikhminShirley, Lambert, Ward, WardDuer
 from jaxprt.relit import Clusters, Harmonics, Lobes, reflection
 from jaxprt.scene import Environment, TexturedMaterial, builtin
-from jaxprt.scene.mesh import ground_plane
+from jaxprt.scene.material import Texture
+from jaxprt.scene.mesh import ground_plane, make_mesh
 
 measuring = importlib.import_module("jaxprt.relit.measuring")
 planning = importlib.import_module("jaxprt.relit.planning")
@@ -131,6 +134,56 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
     for other, lights in ((part, [darker]), (painted, [sky])):
         with pytest.raises(ValueError, match="made for another scene, other materials or other lights"):
             prt.precompute(other, error=ASKED, **options | {"environments": lights})
+
+
+class Masked(eqx.Module):
+    """A BRDF with a function among what JAX does not trace."""
+
+    mask: Callable = eqx.field(static=True)
+
+    def __call__(self, wi, wo):
+        """Value in 1/sr."""
+        return self.mask(wi) * Lambert(0.5)(wi, wo)
+
+
+def half(wi):
+    """A gray of one half."""
+    return 0.5 + 0 * wi[..., :1]
+
+
+def gray():
+    """A function that is made anew by each call."""
+    return lambda wi, wo=None: half(wi)
+
+
+def test_the_key_of_a_plan_knows_classes_and_textures_of_materials_and_functions_by_name(sky):
+    plane = builtin.plane(cells=1)
+    mesh = make_mesh(plane.position, plane.face, texture=np.asarray(plane.position)[:, [0, 2]])
+
+    def key(material, name="plane"):
+        return planning.key_of(prt.Scene([prt.Part(name, mesh, material)]), [sky])
+
+    def wood(**options):
+        return TexturedMaterial(base_color_texture=Texture(jnp.full((2, 2, 3), 0.5), **options))
+
+    brushed = {"diffuse": 0.3, "specular": 0.2, "along": 0.3, "across": 0.4}
+    made = [gray(), gray()]
+    same = [
+        (Ward(**brushed), Ward(**brushed)),
+        (wood(), wood()),
+        tuple(made),
+        tuple(Masked(each) for each in made),
+    ]
+    other = [
+        (Ward(**brushed), WardDuer(**brushed)),
+        (wood(), wood(wrap=("clamp", "clamp"))),
+        (made[0], half),
+        (Masked(made[0]), Masked(half)),
+    ]
+    assert made[0] is not made[1]
+    assert all(key(first) == key(second) for first, second in same)
+    assert all(key(first) != key(second) for first, second in other)
+    assert key(Lambert(0.5)) != key(Lambert(0.5), name="wall")
 
 
 def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_path, monkeypatch):
