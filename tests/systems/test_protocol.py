@@ -28,6 +28,7 @@ pytestmark = pytest.mark.usefixtures("coarse")
 SIZE = 8
 EYE = jnp.array([1.5, 2.0, 2.5])
 GLOSSY = CookTorrance(diffuse=0.5, specular=0.5, roughness=0.5, f0=0.4)
+MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]  # without diffuse parts
 MODELS = {
     "white": Lambert(1.0),
     "glossy": GLOSSY,
@@ -83,10 +84,9 @@ def factored(model: str) -> separable.SeparableBrdf:
 
 @functools.cache
 def members() -> dynamic.DynamicBrdf:
-    """A set of two BRDFs without diffuse parts."""
-    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
+    """MEMBERS as a set, with their lobes."""
     free = functools.partial(lobe.tabulate, lobes=4, resolution=8)
-    return dynamic.factor(each, dynamic.separate(each, separator=free))
+    return dynamic.factor(MEMBERS, dynamic.separate(MEMBERS, separator=free))
 
 
 @functools.cache
@@ -104,8 +104,7 @@ def harmonic_table(model: str) -> harmonic.HarmonicBrdf:
 @functools.cache
 def members_along() -> dynamic.DynamicBrdf:
     """What the members reflect on to other surfaces."""
-    each = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]
-    return bounces.factor(each, terms=6, resolution=16)
+    return bounces.factor(MEMBERS, terms=6, resolution=16)
 
 
 @functools.cache
