@@ -263,7 +263,7 @@ def test_channels_with_weights_are_worth_what_the_brdf_is_that_they_add_up_to(me
     glossy = {"diffuse": 0.3, "specular": 0.7, "roughness": 0.5, "f0": 0.5}
     whole = CookTorrance(**glossy | {"diffuse": 0.4 + 0.5 * 0.3, "specular": 0.5 * 0.7})
     brdfs = Channels((Lambert(1.0), CookTorrance(**glossy)), jnp.ones(2)), whole
-    channels, alone = (separable.factor(each, terms=12, resolution=16) for each in brdfs)
+    channels, alone = (separable.factor(each, terms=8, resolution=12) for each in brdfs)
     options = {"components": ALL, "modes": ALL, "edge": 2, "size": 8, "progress": False}
     exact = bounces.precompute(mesh, [alone, alone], **options).worth
     found = bounces.precompute(mesh, [alone, channels], weights=[None, weight], **options).worth
