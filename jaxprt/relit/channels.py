@@ -168,6 +168,14 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
     return Appearance(blend, surface.emissive)
 
 
+def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | None]:
+    """The BRDF of points of a part for the exact sum, and what they emit; textures are read, not averaged."""
+    if not isinstance(part.material, TexturedMaterial):
+        return shading.exact, None
+    surface = part.surface(Points(points.corner, points.weight))
+    return PerVertex(_material(surface)), surface.emissive
+
+
 def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
     """Whether the terms and the roughness of each vertex were precomputed; refuses those that were not, if known."""
     missing = np.setdiff1d(np.arange(len(_NAMES)), shading.term)

@@ -13,6 +13,7 @@ from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive
 
@@ -29,20 +30,22 @@ def radiance(
     eye: Float[Array, "3"],
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
+    points: Points | None = None,
     error: float = 1e-3,
     progress: bool = False,
 ) -> Float[Array, "..."]:
-    """Radiance that vertices send to the eye: visibility traced, and BRDF and cosine integrated over every texel.
+    """Radiance that vertices or points send to the eye: visibility traced, BRDF and cosine integrated over every texel.
 
     Args:
         mesh: The vertices.
         brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions, of which values below
             the horizon do not count; a new function object, as a lambda in a loop, compiles anew. `PerVertex` has one
-            for each vertex of the mesh.
+            for each vertex of the mesh, or each point.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
         occluder: What casts shadows; the mesh itself if None.
         vertex: Numbers of the vertices asked for, or a mask; all if None.
+        points: Points on triangles of the mesh, with rays of their own, in place of vertices.
         error: Relative error that the integrals of BRDF times cosine may cause in the radiance of each vertex, mean
             over colors. It is an estimate: a peak of the BRDF narrower than a texel is found around the mirror
             direction only. The light counts as constant over each texel, and visibility as a share of it, in
@@ -64,10 +67,17 @@ def radiance(
     require.finite("the light", light.radiance)
     require.position("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
-    start = visibility.start_points(mesh, rays)
-    vertex = visibility.rays.chosen(mesh, vertex)
-    normal = np.asarray(mesh.normal, np.float32)
-    position, upright, tangent = (np.asarray(each) for each in (mesh.position, mesh.normal, mesh.tangent))
+    if points is None:
+        start = visibility.start_points(mesh, rays)
+        vertex = visibility.rays.chosen(mesh, vertex)
+        position, frame = mesh.position, directions.frame(mesh.normal, mesh.tangent)
+    elif vertex is not None:
+        raise ValueError("give either vertices or points, got both")
+    else:
+        start = visibility.point_starts(mesh, points, rays)
+        vertex = np.arange(len(points))
+        position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
+    position, frame = np.asarray(position), np.asarray(frame)
     size = light.radiance.shape[-2]
     if isinstance(brdf, PerVertex) and brdf.vertices != len(position):
         raise ValueError(f"the BRDF must be of the mesh's {len(position)} vertices, got {brdf.vertices}")
@@ -76,10 +86,9 @@ def radiance(
     result = []
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
-        seen, _ = visibility.fractional(rays, start[part], normal[part], size=size)
-        frame = directions.frame(upright[part], tangent[part])
+        seen, _ = visibility.fractional(rays, start[part], np.asarray(frame[part, 2], np.float32), size=size)
         own = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
-        block = integrate(seen, position[part], frame, own, light, eye, error=error)
+        block = integrate(seen, position[part], frame[part], own, light, eye, error=error)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
 

@@ -1,6 +1,7 @@
 """What vertices see of the distant sphere: rays, hits, stored visibility, and the loop over blocks."""
 
-from jaxprt.visibility import blocks, hits, rays, stored
+from jaxprt.visibility import blocks, hits, points, rays, stored
+from jaxprt.visibility.points import point_starts
 from jaxprt.visibility.rays import LEVELS, Occluder, exhaustive, fractional, start_points
 from jaxprt.visibility.stored import StoredVisibility, precompute
 
@@ -12,6 +13,8 @@ __all__ = [
     "exhaustive",
     "fractional",
     "hits",
+    "point_starts",
+    "points",
     "precompute",
     "rays",
     "start_points",
