@@ -19,6 +19,7 @@ from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
 SMOOTH = math.cos(math.radians(10))  # Cosine between mean normals of triangles that may share a point.
+BLOCK = 1 << 15  # Points and pixels that are worked on at once, so that programs fit any number of them.
 SAME_DEPTH = 1e-4  # Relative difference in depth that rounding may make.
 STEEPEST = 1e6  # Slopes are clamped to it: those of a triangle a millionth of a pixel wide.
 
@@ -55,7 +56,7 @@ def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
     of its samples, or as near to it as the triangle of the first sample reaches. What is seen from behind, see
     `raster.front`, has no point. The result is constant for derivatives.
 
-    Outside of `jax.jit` and `jax.vmap` there are as many points as needed and at most a sixteenth more of padding, so
+    Outside of `jax.jit` and `jax.vmap` there are as many points as needed and at most an eighth more of padding, so
     that programs compiled for one view mostly fit the next. Inside, where the number is unknown, there are as many
     as samples.
 
@@ -76,17 +77,21 @@ def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
     concrete = not isinstance(fragments.triangle, Tracer)
     if concrete and (highest := int(np.max(fragments.triangle))) >= len(mesh.face):
         raise ValueError(f"the fragments must be of the mesh's {len(mesh.face)} triangles, got triangle {highest}")
+    projected, block = _projected(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
     members, mixed, background = _uniform(fragments, facing)
     if len(shape) == 3:
-        row = _numbers(mixed)
-        shown, samples = _samples(row, fragments, (facing, *_faces(mesh, camera)))
-        members = _merge(row, members, shown, _same(*samples))
-    triangle, pixel, coverage, corner, step = _points(_numbers(members.ravel()), members, fragments, mesh, camera)
-    linear = _linear(*corner)
-    weight, rate = _weights(*linear, *step)
-    barycentric, slope = _packed(triangle, weight, rate, *linear[1:])
-    return Pixels(triangle, barycentric, slope, pixel, coverage, background)
+        face = facing, *_faces(mesh, projected)
+        for row in _numbers(mixed, block):
+            shown, samples = _samples(row, fragments, face)
+            members = _merge(row, members, shown, _same(samples))
+    parts = []
+    for sample in _numbers(members.ravel(), block):
+        triangle, pixel, coverage, corner, step = _points(sample, members, fragments, mesh.face, projected)
+        linear = _linear(*corner)
+        weight, rate = _weights(*linear, *step)
+        parts.append((triangle, *_packed(triangle, weight, rate, *linear[1:]), pixel, coverage))
+    return Pixels(*_joined(parts), background)
 
 
 @jax.jit
@@ -175,15 +180,27 @@ def render(
     return resolve(pixels, interpolate(pixels, mesh.face, color), background=background)
 
 
-def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"]) -> Int[Array, " m"]:
-    """Numbers of the flags that are set, in order, then -1: as many as there are, and some, or n inside of jax.jit."""
+def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[Int[Array, " m"]]:
+    """Numbers of the flags that are set, in order, then -1: in blocks, or in one of n inside of jax.jit."""
     if isinstance(flag, Tracer):
         place = jnp.where(flag > 0, jnp.cumsum(flag > 0, dtype=jnp.int32) - 1, flag.size)
-        return jnp.full(flag.size, -1, jnp.int32).at[place].set(jnp.arange(flag.size, dtype=jnp.int32), mode="drop")
+        every = jnp.arange(flag.size, dtype=jnp.int32)
+        return [jnp.full(flag.size, -1, jnp.int32).at[place].set(every, mode="drop")]
     number = np.flatnonzero(np.asarray(flag)).astype(np.int32)
-    unit = 1 << max(len(number).bit_length() - 5, 0)
-    room = max(-(-len(number) // unit) * unit, 1)
-    return jnp.asarray(np.pad(number, (0, room - len(number)), constant_values=-1))
+    blocks = max(-(-len(number) // block), 1)
+    number = np.pad(number, (0, blocks * block - len(number)), constant_values=-1)
+    return [jax.device_put(each) for each in number.reshape(-1, block)]
+
+
+def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
+    """Fields of all parts; outside of jax.jit without most of their padding."""
+    if isinstance(parts[0][0], Tracer):
+        return list(parts[0])
+    count = sum(int(np.count_nonzero(part[0] >= 0)) for part in parts)
+    unit = 1 << max(count.bit_length() - 4, 0)
+    room = max(-(-count // unit) * unit, 1)
+    field = (np.concatenate([np.asarray(each) for each in same]) for same in zip(*parts, strict=True))
+    return [jax.device_put(each[:room]) for each in field]
 
 
 # What follows is cut into several programs, for XLA fuses all that one program computes into each of its results, and
@@ -209,15 +226,20 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"]):
 
 
 @jax.jit
-def _faces(mesh: Mesh, camera: Camera):
+def _projected(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
+    """Vertices as of `raster.project`."""
+    return jnp.stack(raster.project(*jax.lax.stop_gradient((mesh.position, camera))))
+
+
+@jax.jit
+def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
     """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down.
 
     1 / depth is linear in the picture of a triangle. Normals are sums of those of the vertices.
     """
-    mesh, camera = jax.lax.stop_gradient((mesh, camera))
     face = mesh.face.T
-    normal = jax.lax.map(lambda axis: axis[face], mesh.normal.T)
-    x, y, q = jax.lax.map(lambda axis: axis[face], jnp.stack(raster.project(mesh.position, camera)))
+    normal = jax.lax.map(lambda axis: axis[face], jax.lax.stop_gradient(mesh.normal.T))
+    x, y, q = jax.lax.map(lambda axis: axis[face], projected)
     s = jnp.sign(q)
     value, right, down = _affine(x - s * s[0] * x[0], y - s * s[0] * y[0], q)
     area = sum(value[i] * s[i] for i in range(3))
@@ -236,11 +258,12 @@ def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...
 
 
 @jax.jit
-def _same(triangle, inverse, region, x, y, z, right, down) -> dict[tuple[int, int], Bool[Array, " m"]]:
+def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]]:
     """Whether two samples are of one surface, for each pair (i, j) of the samples of a pixel with i < j.
 
     Where two triangles meet between the samples, the inverse depth changes by a mean of what each explains.
     """
+    triangle, inverse, region, x, y, z, right, down = samples
     offset = SAMPLES[len(triangle)]
     same = {}
     for j in range(len(triangle)):
@@ -269,25 +292,31 @@ def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> 
 
 
 @jax.jit
-def _points(sample: Int[Array, " p"], members: UInt8[Array, "n s"], fragments: Fragments, mesh: Mesh, camera: Camera):
+def _points(
+    sample: Int[Array, " p"],
+    members: UInt8[Array, "n s"],
+    fragments: Fragments,
+    face: Int[Array, "f 3"],
+    projected: Float[Array, "3 v"],
+):
     """Points of the surfaces that some samples stand for.
 
     Returns:
         Triangles, pixels and coverage; the projected vertices as seen from the sample, and the step from there to the
         mean position of the surface's samples.
     """
-    mesh, camera = jax.lax.stop_gradient((mesh, camera))
-    samples, dtype = members.shape[1], mesh.position.dtype
+    height, width, *_ = fragments.depth.shape
+    samples, dtype = members.shape[1], projected.dtype
     used, sample = sample >= 0, jnp.maximum(sample, 0)
-    pixel = jnp.where(used, sample // samples, camera.width * camera.height - 1)
+    pixel = jnp.where(used, sample // samples, height * width - 1)
     triangle = jnp.where(used, fragments.triangle.ravel()[sample], -1)
     member = jnp.where(used, members.ravel()[sample], 0)
     middle, coverage = (jnp.asarray(each, dtype)[member] for each in _subsets(samples))
     start = jnp.asarray(SAMPLES[samples], dtype)[sample % samples]
-    vertex = mesh.face[jnp.maximum(triangle, 0)].T
-    x, y, q = jax.lax.map(lambda axis: axis[vertex], jnp.stack(raster.project(mesh.position, camera)))
-    column = (pixel % camera.width).astype(dtype) + (1 - camera.width) / 2 + start[:, 0]
-    row = (pixel // camera.width).astype(dtype) + (1 - camera.height) / 2 + start[:, 1]
+    vertex = face[jnp.maximum(triangle, 0)].T
+    x, y, q = jax.lax.map(lambda axis: axis[vertex], projected)
+    column = (pixel % width).astype(dtype) + (1 - width) / 2 + start[:, 0]
+    row = (pixel // width).astype(dtype) + (1 - height) / 2 + start[:, 1]
     s, step = jnp.sign(q), (middle - start).T
     return triangle, pixel, coverage, (x - s * column, y - s * row, q), (step[0], step[1])
 

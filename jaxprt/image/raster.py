@@ -18,7 +18,7 @@ from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
 FACES = (1 << 24) - 1  # Triangles whose numbers a float32 holds exactly.
-PATCH = 3  # Pixels along the edge of the square patches that triangles are cut into.
+PATCH = {1: 3, 2: 4}  # Cells along the edge of the square patches that triangles are cut into, by cells along a pixel.
 CHUNK = 1 << 13  # Patches drawn at once; CHUNK * (CHUNK + 1) must fit in an int32.
 EDGE_ON = 1e-3  # Sine of the angle between a triangle and the view within which the triangle counts as front.
 TILE = 8  # Pixels along the edge of the tiles whose farthest depth hides what lies behind.
@@ -285,7 +285,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
     Cuts the pixels' box of every triangle into patches, and draws the patches of all triangles in order, CHUNK at a
     time: each step looks at the next CHUNK triangles and draws the first CHUNK of their patches that are still to do.
     """
-    faces = q.shape[1]
+    faces, patch = q.shape[1], PATCH[fine]
     chunk = min(CHUNK, -(-faces // 1024) * 1024)
     height = nearest.shape[0] // width
     column, row, columns, rows = bounds
@@ -297,8 +297,8 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
     def step(state):
         start, done, nearest = state
         t = jax.lax.dynamic_slice(number, (start,), (chunk,))
-        across = jax.lax.div(columns[t] + (PATCH - 1), jnp.int32(PATCH))
-        count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (PATCH - 1), jnp.int32(PATCH)), 0)
+        across = jax.lax.div(columns[t] + (patch - 1), jnp.int32(patch))
+        count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (patch - 1), jnp.int32(patch)), 0)
         count = jnp.minimum(count.at[0].add(-done), chunk + 1)  # One more, to tell that some are left over.
         last = _running_sum(count)
         first = last - count
@@ -307,26 +307,26 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
 
         part = slot - first[owner] + jnp.where(owner == 0, done, 0)
         t, wide = t[owner], jnp.maximum(across[owner], 1)
-        left, top = column[t] + jax.lax.rem(part, wide) * PATCH, row[t] + jax.lax.div(part, wide) * PATCH
+        left, top = column[t] + jax.lax.rem(part, wide) * patch, row[t] + jax.lax.div(part, wide) * patch
         right, bottom = jnp.where(slot < last[-1], column[t] + columns[t], 0), row[t] + rows[t]
         corner = [[axis[i][t] for i in range(3)] for axis in (x, y, q)]
         identity = t.astype(x.dtype)
 
         def pixel(nearest, k):
-            i, j = top + jax.lax.div(k, jnp.int32(PATCH)), left + jax.lax.rem(k, jnp.int32(PATCH))
+            i, j = top + jax.lax.div(k, jnp.int32(patch)), left + jax.lax.rem(k, jnp.int32(patch))
             at = j.astype(x.dtype) + (1 - width) / 2, i.astype(x.dtype) + (1 - height) / 2
             inside = (i < bottom) & (j < right)
             i, j = jnp.minimum(i, height - 1), jnp.minimum(j, width - 1)
             place = i * width + j
             if fine > 1:
                 lower, later = i & 1, j & 1
-                at = at[0] + SHIFT * (1 - 2 * lower), at[1] + SHIFT * (2 * later - 1)
+                at = at[0] + SHIFT * (1 - 2 * lower).astype(x.dtype), at[1] + SHIFT * (2 * later - 1).astype(x.dtype)
                 place = (i >> 1) * (2 * width) + (j >> 1) * 4 + 2 * lower + later
             d = jnp.where(inside, _cover(corner[0], corner[1], corner[2], *at), jnp.inf)
             return nearest.at[place].min(jax.lax.complex(d, identity), mode="promise_in_bounds"), None
 
         # A scan, since XLA would else compute what belongs to a patch anew for each of its pixels.
-        nearest, _ = jax.lax.scan(pixel, nearest, jnp.arange(PATCH * PATCH, dtype=jnp.int32))
+        nearest, _ = jax.lax.scan(pixel, nearest, jnp.arange(patch * patch, dtype=jnp.int32))
 
         over = last[-1] > chunk
         part = jnp.where(over, part[-1] + 1, 0)
