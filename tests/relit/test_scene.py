@@ -16,7 +16,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
-from jaxprt.image import pixels, raster
+from jaxprt.image import raster
 from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
@@ -356,14 +356,11 @@ def test_memory_counts_every_array_once():
 
 
 def test_pictures_show_the_radiance_before_the_light():
-    ready = relit("harmonic")
-    picture = ready.picture(light(), CAMERA, materials={"floor": wood(seed=1)})
-    color = ready.radiance(light(), eye=EYE, materials={"floor": wood(seed=1)})
+    picture = relit("harmonic").picture(light(), CAMERA, materials={"floor": wood(seed=1)})
     seen = np.asarray(raster.rasterize(scene().mesh, CAMERA, samples=4).triangle).max(-1) >= 0
     sky = np.asarray(background(light(), raster.ray_direction(CAMERA)))
     assert picture.shape == (16, 24, 3)
     np.testing.assert_array_equal(np.asarray(picture)[~seen], sky[~seen])
-    np.testing.assert_array_equal(picture, pixels.render(scene().mesh, color, CAMERA, background=jnp.asarray(sky)))
     assert 0.2 < seen.mean() < 0.9
 
 

@@ -1,0 +1,189 @@
+"""Pictures of scenes: radiance and textures at pixels, against exact pixels, closed forms and the vertices."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import bounces, lobe, visibility
+from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.image import rasterize
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, pictures
+from jaxprt.relit.exact import exact_pixels
+from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene.material import Texture
+from jaxprt.scene.mesh import make_mesh
+from jaxprt.scene.points import Points, on_triangles
+
+SIZE = 8
+CAMERA = Camera([0.6, 2.2, 2.6], [0.0, 0.4, 0.0], [0.0, 1.0, 0.0], 0.9, 20, 16)
+SHARP = CookTorrance(diffuse=0.3, specular=0.7, roughness=0.3, f0=0.6)
+SQUARE = np.array([[-1.0, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]])
+CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse, bound):
+    """Small maps, and rows of few points, so that parts have several."""
+    with pytest.MonkeyPatch.context() as patch:
+        bound(patch, lobe.tabulate, resolution=12)
+        bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
+        patch.setattr(pictures, "CHUNK", 64)
+        patch.setattr(pictures, "_FEWEST", 16)
+        yield
+
+
+def image(edge: int = 8) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.9, (edge, edge, 3)).astype(np.float32)
+
+
+def matte(**more) -> TexturedMaterial:
+    """What reflects diffusely alone, with a texture of color."""
+    return TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(image()), **more)
+
+
+def scene(*, floor=None, ball=SHARP) -> Scene:
+    sphere = builtin.sphere(rings=5, sectors=8)
+    raised = make_mesh(0.6 * sphere.position + jnp.array([0.0, 0.7, 0.0]), sphere.face, normal=sphere.normal)
+    flat = make_mesh(1.5 * SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS)
+    return Scene([Part("floor", flat, matte() if floor is None else floor), Part("ball", raised, ball)])
+
+
+def light(seed: int = 1) -> Environment:
+    radiance = np.random.default_rng(seed).uniform(0.2, 1.0, (6, SIZE, SIZE, 3))
+    return Environment(jnp.asarray(radiance, jnp.float32))
+
+
+@functools.cache
+def relit(system=None, bounces: int = 0) -> RelitScene:
+    system = Lobes(lobes=4, texels=0) if system is None else system
+    return prt.precompute(scene(), system=system, size=SIZE, bounces=bounces, progress=False)
+
+
+@pytest.mark.parametrize("system", [Lobes(4, 8), Harmonics(degree=3), Terms(terms=4, keep=384, resolution=16)], ids=str)
+def test_a_white_scene_in_a_white_light_is_white_to_its_edges(system):
+    white = scene(floor=Lambert(1.0), ball=Lambert(1.0))
+    ready = prt.precompute(Scene([white["ball"]]), system=system, size=SIZE, progress=False)
+    picture = np.asarray(ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), CAMERA))
+    np.testing.assert_allclose(picture, 1, atol=0.03)
+
+
+def test_pixels_are_nearer_to_the_exact_ones_than_vertices_are():
+    ready = relit()
+    camera = dataclasses.replace(CAMERA, width=40, height=32)
+    exact = exact_pixels(ready.scene, ready.shading, [light()], camera, pixels=120)
+    on_ball = exact.part == 1
+    assert exact.color.shape == (1, len(exact.pixel), 3)
+    assert 0 < exact.error[0] < 0.05
+
+    def wrong(picture):
+        off = np.asarray(picture).reshape(-1, 3)[exact.pixel] - exact.color[0]
+        return np.linalg.norm(off[on_ball]) / np.linalg.norm(exact.color[0][on_ball])
+
+    vertices = prt.image.render(ready.mesh, ready.radiance(light(), eye=camera.eye), camera)
+    assert wrong(ready.picture(light(), camera)) < 0.06 < wrong(vertices)
+
+
+def test_textures_are_read_at_the_pixels():
+    # Two triangles in a light that is the same from everywhere: the picture is the texture.
+    square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS)
+    ready = prt.precompute(Scene([Part("square", square, matte())]), system="lobe", size=SIZE, progress=False)
+    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 16, 16)
+    picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above, samples=1)
+    row = (np.arange(16) + 0.5) / 16
+    place = np.stack(np.meshgrid(row, 1 - row), -1)
+    np.testing.assert_allclose(picture, Texture(image()).at(jnp.asarray(place, jnp.float32)), atol=0.01)
+
+
+def test_far_textures_are_averaged():
+    square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=8 * CORNERS)
+    checks = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((4, 4)))[..., None] * np.ones(3)
+    material = TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(checks))
+    ready = prt.precompute(Scene([Part("square", square, material)]), system="lobe", size=SIZE, progress=False)
+    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 8, 8)
+    picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above)
+    np.testing.assert_allclose(picture, 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize("bounced", [0, 1])
+def test_a_kept_view_gives_the_picture_of_every_light(bounced, close):
+    ready = relit(bounces=bounced)
+    view = ready.picture_view(CAMERA)
+    for seed in (1, 2):
+        close(view.picture(light(seed)), ready.picture(light(seed), CAMERA), tolerance=1e-5)
+    assert {each.at_pixels for each in view.part} == {True, False}
+
+
+def test_bounces_are_in_the_picture():
+    color = relit(bounces=1).picture(light(), CAMERA) - relit().picture(light(), CAMERA)
+    assert float(jnp.min(color)) > -1e-5
+    assert 0.01 < float(jnp.max(color)) < 0.3
+
+
+@pytest.mark.parametrize("name", ["floor", "ball"])
+def test_pictures_have_other_materials(name, close):
+    ready = relit()
+    if name == "ball":
+        with pytest.raises(TypeError, match="is a BRDF, which cannot be replaced"):
+            ready.picture(light(), CAMERA, materials={"ball": matte()})
+        return
+    half = {"floor": matte(base_color=0.5)}
+    color = ready.picture(light(), CAMERA, materials=half)
+    shown = np.asarray(rasterize(ready.mesh, CAMERA, samples=4).triangle)
+    floor = np.all((shown >= 0) & (shown < 2), -1)
+    close(np.asarray(color)[floor], 0.5 * np.asarray(ready.picture(light(), CAMERA))[floor], tolerance=1e-5)
+    same = ready.picture(light(), CAMERA, materials=ready.appearances({"floor": matte()}))
+    assert np.isfinite(same).all()
+
+
+def test_pictures_go_through_programs_and_have_gradients(close):
+    ready = relit(Harmonics(degree=2))
+
+    def picture(radiance, eye):
+        return ready.picture(Environment(radiance), dataclasses.replace(CAMERA, eye=eye))
+
+    radiance = light().radiance
+    whole = picture(radiance, CAMERA.eye)
+    close(jax.jit(picture)(radiance, CAMERA.eye), whole, tolerance=1e-4)
+    weight = np.random.default_rng(2).normal(size=whole.shape).astype(np.float32)
+    slope = jax.grad(lambda each: jnp.vdot(weight, picture(each, CAMERA.eye)))(radiance)
+    close(jnp.vdot(slope, light(2).radiance), np.vdot(weight, picture(light(2).radiance, CAMERA.eye)), tolerance=1e-4)
+    turned = jax.jit(jax.vmap(picture, (None, 0)))(radiance, jnp.stack([CAMERA.eye, CAMERA.eye + 0.1]))
+    close(turned[0], whole, tolerance=1e-4)
+    bright = jax.jit(jax.grad(lambda eye: jnp.sum(picture(radiance, eye))))(CAMERA.eye)
+    assert np.isfinite(bright).all()
+
+
+def test_exact_pixels_of_a_bare_square_are_closed_forms():
+    square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]])), Lambert(0.5))
+    ready = prt.precompute(Scene([square]), system="harmonic", size=SIZE, progress=False)
+    white = [Environment(jnp.full((6, SIZE, SIZE, 3), each)) for each in (1.0, 3.0)]
+    exact = exact_pixels(ready.scene, ready.shading, white, CAMERA, pixels=40)
+    inside = np.isclose(exact.color[0, :, 0], 0.5, atol=1e-3)
+    assert inside.mean() > 0.5
+    assert np.all((exact.color[0] > 0.5 - 1e-3) & (exact.color[0] < 1 + 1e-3))
+    np.testing.assert_allclose(exact.color[1], 3 * exact.color[0], rtol=1e-5)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_points_that_are_none_are_refused():
+    face = np.array([[0, 1, 2]])
+    inside = np.full((1, 3), 1 / 3, np.float32)
+    with pytest.raises(ValueError, match="triangles must be from 0 to 0, got 1 to 1"):
+        on_triangles(face, np.array([1]), inside)
+    with pytest.raises(ValueError, match=r"weights of points must be at least 0 and sum to 1, got .* at point 0"):
+        on_triangles(face, np.array([0]), np.array([[1.2, -0.2, 0.0]]))
+    with pytest.raises(ValueError, match=r"weights of points must be at least 0 and sum to 1, got .*nan"):
+        on_triangles(face, np.array([0]), np.array([[np.nan, 0.5, 0.5]]))
+    with pytest.raises(ValueError, match=r"points must be triangles \[p\] and weights \[p, 3\]"):
+        on_triangles(face, np.array([0]), np.ones(3))
+    square, points = make_mesh(SQUARE, face), on_triangles(face, np.array([0]), inside)
+    with pytest.raises(ValueError, match="either vertices or points"):
+        prt.reference.radiance(square, SHARP, light(), eye=CAMERA.eye, vertex=np.array([0]), points=points)
+    alone, rays = Points(jnp.zeros((1, 1), int), jnp.ones((1, 1))), visibility.Occluder(square)
+    with pytest.raises(ValueError, match="three corners"):
+        visibility.point_starts(square, alone, rays)
