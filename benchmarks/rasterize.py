@@ -1,8 +1,10 @@
-"""Is drawing a mesh in JAX as fast as tracing its primary rays with Embree on two threads?
+"""Is drawing a mesh in JAX as fast as tracing its primary rays with Embree on two threads, and what do edges cost?
 
     python -m benchmarks.rasterize [--quick] [--output FILE]
 
-The error is the part of the pixels whose triangle differs from Embree's.
+The error is the part of the pixels, or of their samples, whose triangle differs from Embree's. Of pictures with four
+samples in each pixel the peer is the picture with one, and the error is the relative L2 of the coverage from that of a
+picture eight times as fine; `peer_error` is that of the picture with one.
 """
 
 import concurrent.futures
@@ -18,8 +20,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks import harness
-from jaxprt.image import rasterize, ray_direction
+from jaxprt.image import rasterize, ray_direction, render
+from jaxprt.image.raster import SAMPLES
 from jaxprt.scene import Camera, Mesh
+from jaxprt.scene.mesh import make_mesh
 
 THREADS = 2
 
@@ -36,30 +40,30 @@ def main(options: Sequence[str] | None = None) -> None:
     repeats = 5 if arguments.quick else 30
     with concurrent.futures.ThreadPoolExecutor(THREADS) as pool:
         for name, (position, face) in cases.items():
-            harness.report(compare(pool, name, position, face, size, repeats), arguments.output)
+            mesh = make_mesh(position.astype(np.float32), face.astype(np.int32))
+            camera = facing(np.asarray(mesh.position), size)
+            for samples in (1, 4):
+                harness.report(compare(pool, name, mesh, camera, samples, repeats), arguments.output)
+            harness.report(edges(name, mesh, camera, repeats), arguments.output)
 
 
-def compare(pool, name: str, position: np.ndarray, face: np.ndarray, size: int, repeats: int) -> dict:
+def compare(pool, name: str, mesh: Mesh, camera: Camera, samples: int, repeats: int) -> dict:
     """Draws the same picture by both, and gives the line to report."""
-    position, face = position.astype(np.float32), face.astype(np.int32)
-    zero = jnp.zeros(position.shape, jnp.float32)
-    mesh = Mesh(jnp.asarray(position), jnp.asarray(face), zero, zero, jnp.zeros(len(position), jnp.int32))
-    camera = facing(position, size)
     scene = EmbreeScene()
-    TriangleMesh(scene, position, face)
-    ray = np.asarray(ray_direction(camera), np.float32).reshape(-1, 3)
+    TriangleMesh(scene, np.asarray(mesh.position), np.asarray(mesh.face))
+    ray = rays(camera, samples).reshape(-1, 3)
     origin = np.broadcast_to(np.asarray(camera.eye, np.float32), ray.shape)
     parts = [tuple(x.copy() for x in p) for p in zip(np.split(origin, THREADS), np.split(ray, THREADS), strict=True)]
 
     def trace():
         return list(pool.map(lambda part: scene.run(*part, query="INTERSECT"), parts))
 
-    mine, peer = harness.compare(lambda: rasterize(mesh, camera), trace, repeats=repeats)
-    fragments = rasterize(mesh, camera)
+    mine, peer = harness.compare(lambda: rasterize(mesh, camera, samples=samples), trace, repeats=repeats)
+    fragments = rasterize(mesh, camera, samples=samples)
     drawn, traced = np.asarray(fragments.triangle).ravel(), np.concatenate(trace())
     return {
         "benchmark": "rasterize",
-        "case": f"{name}, {len(face)} triangles, {size} x {size}, {100 * np.mean(drawn >= 0):.0f} % covered",
+        "case": f"{title(name, mesh, camera, samples)}, {100 * np.mean(drawn >= 0):.0f} % covered",
         **mine.line(),
         "error": float(np.mean(drawn != traced)),
         "bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(fragments)),
@@ -68,6 +72,45 @@ def compare(pool, name: str, position: np.ndarray, face: np.ndarray, size: int, 
         "peer_error": 0.0,
         "pixels_that_differ": int(np.sum(drawn != traced)),
         "pixels_seen_by_one_only": int(np.sum((drawn < 0) != (traced < 0))),
+    }
+
+
+def title(name: str, mesh: Mesh, camera: Camera, samples: int) -> str:
+    """What is drawn."""
+    return f"{name}, {len(mesh.face)} triangles, {camera.height} x {camera.width}, samples {samples}"
+
+
+def rays(camera: Camera, samples: int) -> np.ndarray:
+    """Directions of the samples [h, w, s, 3]. Four are centers of pixels of a picture four times as fine."""
+    if samples == 1:
+        return np.asarray(ray_direction(camera), np.float32)[:, :, None]
+    every = np.asarray(ray_direction(finer(camera, 4)), np.float32)
+    return np.stack([every[y::4, x::4] for x, y in (4 * SAMPLES[4] + 1.5).astype(int)], 2)
+
+
+def finer(camera: Camera, times: int) -> Camera:
+    """A camera of the same view with more pixels."""
+    width, height = times * camera.width, times * camera.height
+    return Camera(camera.eye, camera.target, camera.up, camera.field_of_view, width, height)
+
+
+def edges(name: str, mesh: Mesh, camera: Camera, repeats: int) -> dict:
+    """A whole picture with four samples in each pixel beside that with one, and how they cover pixels."""
+    color = jnp.ones((len(mesh.position), 3), jnp.float32)
+    picture = {samples: lambda samples=samples: render(mesh, color, camera, samples=samples) for samples in (1, 4)}
+    mine, peer = harness.compare(picture[4], picture[1], repeats=repeats)
+    seen = np.asarray(rasterize(mesh, finer(camera, 8)).triangle) >= 0
+    truth = seen.reshape(camera.height, 8, camera.width, 8).mean((1, 3))[..., None]
+    four, one = (float(np.linalg.norm(picture[s]() - truth) / np.linalg.norm(np.tile(truth, 3))) for s in (4, 1))
+    return {
+        "benchmark": "rasterize",
+        "case": f"{title(name, mesh, camera, 4)}, picture",
+        **mine.line(),
+        "error": four,
+        "bytes": picture[4]().nbytes,
+        "peer": "one sample",
+        "peer_seconds": peer.seconds,
+        "peer_error": one,
     }
 
 

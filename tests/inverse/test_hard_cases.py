@@ -55,7 +55,7 @@ def matte(mesh):
 
 @pytest.fixture(scope="module")
 def image(mesh, matte, sky, view):
-    image = render(mesh, matte(sky, view.eye), view)
+    image = render(mesh, matte(sky, view.eye), view, samples=1)
     assert float(image.min()) >= 0
     return np.asarray(image)
 
@@ -78,7 +78,7 @@ def test_a_sharp_material_tells_all_of_it(mesh, sky, view):
     def shiny(light, eye):
         return harmonic.unshadowed_radiance(mesh, table, light, eye=eye)
 
-    image = render(mesh, shiny(sky, view.eye), view)
+    image = render(mesh, shiny(sky, view.eye), view, samples=1)
     found = fit(mesh, shiny, Picture(image, view, mask=image.min(-1) >= 0))
     assert found.rank == 75
     np.testing.assert_allclose(found.value, sky, atol=2e-3 * np.linalg.norm(sky))
@@ -134,7 +134,7 @@ def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, dull, view):
     """What is left of the pictures is no noise but harmonics of higher degrees, in patterns wider than any block."""
     light = builtin.daylight(size=16)
     low, high = dull(2), dull(4)
-    image = render(mesh, high(harmonic.project(light, degree=4), view.eye), view)
+    image = render(mesh, high(harmonic.project(light, degree=4), view.eye), view, samples=1)
     found = inverse.light(low, jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
     true = harmonic.project(light, degree=2)
     wrong = np.linalg.norm(found.determined @ np.ravel(found.value - true)) / np.linalg.norm(
@@ -151,7 +151,7 @@ def test_of_a_sun_some_is_determined_although_most_of_it_is_too_fine(mesh, dull,
     light = np.zeros((6, 16, 16, 3), np.float32)
     light[2, 8:11, 3:6] = 50
     low, high = dull(degree), dull(6)
-    image = render(mesh, high(harmonic.project(Environment(jnp.asarray(light)), degree=6), view.eye), view)
+    image = render(mesh, high(harmonic.project(Environment(jnp.asarray(light)), degree=6), view.eye), view, samples=1)
     pixels = inverse.observe(mesh, [Picture(np.maximum(image, 0), view)])
     found = inverse.light(low, jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
     true = harmonic.project(Environment(jnp.asarray(light)), degree=degree)
@@ -238,7 +238,7 @@ def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypa
         return m["weight"] * lobe.radiance(seen, table.at(jnp.log(m["roughness"])), light, eye=eye)
 
     true = {"weight": jnp.array(0.8), "roughness": jnp.array(0.03)}
-    image = render(mesh, radiance(true, view.eye), view)
+    image = render(mesh, radiance(true, view.eye), view, samples=1)
     pixels = inverse.observe(mesh, [Picture(image, view, mask=image.min(-1) >= 0)])
     start = {"weight": jnp.array(0.3), "roughness": jnp.array(0.4)}
     found = inverse.material(
@@ -382,7 +382,7 @@ def shaded(mesh, view):
     def radiance(weight, eye):
         return weight["a"] * basis[0] + weight["b"] * basis[1]
 
-    image = render(mesh, radiance({"a": 0.8, "b": 0.1}, view.eye), view)
+    image = render(mesh, radiance({"a": 0.8, "b": 0.1}, view.eye), view, samples=1)
     return radiance, inverse.observe(mesh, [Picture(noisy(np.asarray(image), 0.02), view)])
 
 
