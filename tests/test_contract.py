@@ -36,6 +36,8 @@ from jaxprt import separable as separable_system
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
+from jaxprt.scene import mipmap
+from jaxprt.scene.points import Points
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -50,6 +52,9 @@ HOST = {
     "cli.animation": "the same",
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
+    "scene.points.on_triangles": "checks values",
+    "scene.texture.bilinear": "gives numbers of texels",
+    "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
     "image.raster.front_faces": "the same",
     "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
@@ -682,6 +687,18 @@ EXAMPLES = {
     ),
     "systems.separable.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "scene.texture.lookup": example(lambda draw: call(draw.normal(3, 4, 2), draw.normal(5, 2))),
+    "scene.mipmap.make": example(lambda draw: call(draw.normal(3, 4, 2))),
+    # Footprints are constant.
+    "scene.mipmap.lookup": example(
+        lambda draw: call(mipmap.make(draw.normal(3, 4, 2)), draw.normal(5, 2), 0.3 * draw.normal(2, 5, 2)),
+        gradient=("mipmap", "coordinate"),
+        wrap=("repeat", "clamp"),
+    ),
+    "scene.points.placed": example(
+        lambda draw: call(
+            draw.normal(4, 3), draw.rotation(4), Points(jnp.array([[0, 3], [1, 2]]), jnp.full((2, 2), 0.5))
+        )
+    ),
     # Rounding is constant but for the largest coefficient, which makes steps of all others.
     "systems.separable.relight.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
     "systems.separable.relight.modulate": example(
@@ -808,6 +825,9 @@ EXAMPLES = {
     "systems.separable.relight.light_tuple": example(lambda draw: call(draw.sparse(), draw.light()), light_keep=40),
     "systems.separable.relight.view_tuple": example(
         lambda draw: call(mesh := draw.sparse(), draw.separable(), draw.above(mesh)),
+    ),
+    "systems.separable.relight.view_factors": example(
+        lambda draw: call(draw.separable(), (mesh := draw.sparse()).position, mesh.frame, draw.above(mesh)),
     ),
     "systems.separable.relight.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
     "systems.separable.relight.radiance": example(

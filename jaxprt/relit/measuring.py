@@ -1,4 +1,8 @@
-"""Scenes and recipes measured on samples of their vertices: errors by the exact sum, times and bytes."""
+"""Scenes and recipes measured: errors of pictures by the exact sum, times and bytes.
+
+A recipe is carried out for some vertices of a part, and judged at points of the triangles between them. A scene that is
+ready is judged by pixels of its pictures, and by its vertices.
+"""
 
 import dataclasses
 import math
@@ -17,18 +21,24 @@ from jaxtyping import Array, Float
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.relit.channels import Shading
+from jaxprt.relit.channels import Shading, at_points, exact_at
+from jaxprt.relit.exact import exact_pixels
 from jaxprt.relit.recipes import Known, Recipe, Target
-from jaxprt.scene import Environment, Mesh, Scene, builtin
+from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, builtin
+from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import bounds
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import directions
 from jaxprt.systems import protocol, reference, separable
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.protocol import Blend, Joined, System
 
 MEMBERS = 225  # vertices in a cluster
 _CLUSTERS = 24  # of all parts together that are measured: of the bunny, half of the squared error is in an eighth
-_JUDGED = 1350  # vertices of all parts together whose exact radiance is summed
+_JUDGED = 1350  # points of all parts together whose exact radiance is summed
 _FEWEST = 100  # of one part
+_PICTURE = 192  # edge of the pictures that are judged
+_PIXELS = 120  # of each picture
 
 
 class Candidate(eqx.Module):
@@ -56,11 +66,20 @@ class Candidate(eqx.Module):
 
 
 class PartReport(NamedTuple):
-    """How one part of a scene does: relative L2 error of its radiance under each light, its vertices and bytes."""
+    """How one part of a scene does in direct light.
+
+    Attributes:
+        name: Of the part.
+        vertices: Their number.
+        errors: Relative L2 error of its pixels under each light.
+        vertex_errors: Relative L2 error of the radiance of its vertices under each light.
+        nbytes: Size of transport and BRDF in bytes.
+    """
 
     name: str
     vertices: int
     errors: tuple[float, ...]
+    vertex_errors: tuple[float, ...]
     nbytes: int
 
 
@@ -69,12 +88,16 @@ class Report(NamedTuple):
 
     Attributes:
         part: One entry for each part of the scene.
-        light_seconds: Time of a new light on this machine.
-        view_seconds: Time of a new view on this machine.
+        errors: Relative L2 error of the pictures under each light.
+        uncertainty: How much of that the exact pixels themselves may be off by.
+        light_seconds: Time of a new light for all vertices on this machine.
+        view_seconds: Time of a new view for all vertices on this machine.
         nbytes: Size of all transport and BRDFs in bytes.
     """
 
     part: tuple[PartReport, ...]
+    errors: tuple[float, ...]
+    uncertainty: tuple[float, ...]
     light_seconds: float
     view_seconds: float
     nbytes: int
@@ -82,24 +105,33 @@ class Report(NamedTuple):
     def __str__(self) -> str:
         """One row for each part."""
         rows = [
-            f"{each.name}: {each.vertices} vertices, {each.nbytes / 1e6:.2f} MB, off by "
-            + ", ".join(f"{100 * error:.1f} %" for error in each.errors)
+            f"{each.name}: {each.vertices} vertices, {each.nbytes / 1e6:.2f} MB, pixels off by "
+            f"{_percent(each.errors)}, vertices by {_percent(each.vertex_errors)}"
             for each in self.part
         ]
+        rows.append(f"pictures off by {_percent(self.errors)}, measured to {_percent(self.uncertainty)}")
         times = f"{1e3 * self.light_seconds:.1f} ms for a new light, {1e3 * self.view_seconds:.1f} ms for a new view"
         return "\n".join([*rows, f"in all: {self.nbytes / 1e6:.2f} MB, {times}"])
 
 
+def _percent(errors: Sequence[float]) -> str:
+    return ", ".join("-" if math.isnan(each) else f"{100 * each:.1f} %" for each in errors)
+
+
 def measure(
+    picture: Callable[[Environment, Camera], Array],
+    camera: Camera,
     direct: Joined,
     system: System,
     scene: Scene,
     shadings: Sequence[Shading],
     environments: Sequence[Environment],
 ) -> Report:
-    """Measures the parts of a scene against the exact sum, on a sample of their vertices, from eight views.
+    """Measures a scene against the exact sum: pixels of pictures, and a sample of its vertices from eight views.
 
     Args:
+        picture: Draws the scene in direct light.
+        camera: From where it is looked at; two more stand on other sides of it.
         direct: The systems of all parts, whose radiance is that of direct light.
         system: The system whose bytes and times are reported, with bounces if there are any.
         scene: The scene.
@@ -111,6 +143,7 @@ def measure(
     seen = [direct.view(jnp.asarray(eye), blends) for eye in views]
     lit = [direct.light(each) for each in environments]
     color = np.stack([[np.asarray(direct.combine(light, view)) for view in seen] for light in lit])
+    pixels = _pictures(picture, camera, scene, shadings, environments)
     parts, first = [], 0
     for part, shading, each in zip(scene.parts, shadings, direct.part, strict=True):
         count = len(part.mesh.position)
@@ -121,8 +154,9 @@ def measure(
         exact = _exact(visible, judged, _exact_brdf(shading, vertex), environments, views)
         facing, now = _facing(visible, judged, views), color[:, :, first + vertex]
         pairs = zip(np.broadcast_to(now, exact.shape), exact, strict=True)
-        errors = tuple(_relative(a[facing], b[facing]) for a, b in pairs)
-        parts.append(PartReport(part.name, count, errors, protocol.memory(each)))
+        vertex_errors = tuple(_relative(a[facing], b[facing]) for a, b in pairs)
+        shown = tuple(pixels[1][:, len(parts)])
+        parts.append(PartReport(part.name, count, shown, vertex_errors, protocol.memory(each)))
         first += count
 
     def arriving():
@@ -136,7 +170,27 @@ def measure(
         _seconds(lambda: system.combine(arriving(), viewed)),
         _seconds(lambda: system.combine(arrived, view())),
     )
-    return Report(tuple(parts), new_light, new_view, protocol.memory(system))
+    return Report(tuple(parts), tuple(pixels[0]), tuple(pixels[2]), new_light, new_view, protocol.memory(system))
+
+
+def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of pictures from three sides [light], of their parts [light, part], and of the yardstick [light]."""
+    around = [orbit(scene.mesh, azimuth=turn, elevation=0.4) for turn in (2.2, 4.4)]
+    wrong, right, unsure = (np.zeros((len(environments), len(scene.parts))) for _ in range(3))
+    for each in (camera, *around):
+        small = dataclasses.replace(each, width=_PICTURE, height=_PICTURE)
+        exact = exact_pixels(scene, shadings, environments, small, pixels=_PIXELS)
+        for number, light in enumerate(environments):
+            off = np.asarray(picture(light, small)).reshape(_PICTURE**2, -1)[exact.pixel] - exact.color[number]
+            for part in range(len(scene.parts)):
+                own = exact.part == part
+                wrong[number, part] += np.sum(off[own] ** 2)
+                right[number, part] += np.sum(exact.color[number][own] ** 2)
+            unsure[number, 0] += exact.error[number] ** 2 * np.sum(exact.color[number] ** 2)
+    whole = np.maximum(right.sum(1), np.finfo(float).tiny)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        parts = np.sqrt(wrong / right)  # NaN for parts that no picture shows
+    return np.sqrt(wrong.sum(1) / whole), parts, np.sqrt(unsure.sum(1) / whole)
 
 
 def lights_of(scene: Scene) -> tuple[Environment, ...]:
@@ -146,24 +200,26 @@ def lights_of(scene: Scene) -> tuple[Environment, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """Some vertices of a part, and what is known of them.
+    """Some vertices of a part, points on the triangles between them, and what is known of both.
 
     Attributes:
-        shading: The part.
+        shading: The part, as systems take it.
         target: Which vertices, and what they see.
         vertex_ratio: How many times as many the part has.
-        judged: Which of them are judged.
-        facing: Which of the judged ones face each view.
+        points: Where recipes are judged, numbered as the vertices of the sample are.
+        blend: What the points are made of.
+        facing: Which of the points face each view.
         exact: Their exact radiance.
         environments: Under these lights.
         views: From these places.
-        rays_seconds: What tracing took.
+        rays_seconds: What tracing the vertices took.
     """
 
     shading: Shading
     target: Target
     vertex_ratio: float
-    judged: np.ndarray
+    points: Points
+    blend: Blend | None
     facing: np.ndarray
     exact: np.ndarray
     environments: tuple[Environment, ...]
@@ -171,7 +227,9 @@ class Sample:
     rays_seconds: float
 
     @classmethod
-    def make(cls, shading: Shading, scene: Mesh, total: int, size: int, environments, views: np.ndarray) -> "Sample":
+    def make(
+        cls, part: Part, shading: Shading, scene: Mesh, total: int, size: int, environments, views: np.ndarray
+    ) -> "Sample":
         """Traces and sums for whole clusters of vertices, a share of all that are measured."""
         mesh = shading.mesh
         count = len(mesh.position)
@@ -183,18 +241,13 @@ class Sample:
         visible = visibility.precompute(mesh, size=size, occluder=scene, vertex=vertex, progress=False)
         seconds = time.perf_counter() - start
         few = max(_FEWEST, round(_JUDGED * count / total))
-        judged = np.sort(np.random.default_rng(1).permutation(len(vertex))[:few])
+        points = _scattered(mesh, vertex, few)
         target = Target(scene, size=size, vertex=vertex, known=Known(visible), progress=False)
-        facing = _facing(visible, judged, views)
-        exact = _exact(visible, judged, _exact_brdf(shading, vertex[judged]), environments, views)
-        vertex_ratio = count / len(vertex)
-        return cls(shading, target, vertex_ratio, judged, facing, exact, tuple(environments), views, seconds)
-
-    @property
-    def blend(self) -> Blend | None:
-        """What the sampled vertices are made of."""
-        whole, vertex = self.shading.blend, self.target.vertex
-        return None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
+        whole = Points(jnp.asarray(vertex)[points.corner], points.weight)
+        blend = at_points(part, shading, None, whole).blend
+        facing, exact = _judged(part, shading, whole, scene, environments, views)
+        ratio = count / len(vertex)
+        return cls(shading, target, ratio, points, blend, facing, exact, tuple(environments), views, seconds)
 
     def least_bytes(self, recipe: Any) -> int:
         """Bytes that a recipe has at least for the whole part."""
@@ -210,19 +263,60 @@ class Sample:
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
 
     def _error(self, system: System, light: Environment, exact: np.ndarray) -> float:
-        """Relative L2 error over all views, as far as vertices face the viewer."""
-        lit = system.shade(system.light(light), self.blend)
-        views = (system.view(jnp.asarray(eye), self.blend) for eye in self.views)
-        now = np.stack([np.asarray(system.combine(lit, view))[self.judged] for view in views])
+        """Relative L2 error over all views, as far as points face the viewer."""
+        lit, placed = system.light(light), system.at(self.points)
+        views = (placed.view(jnp.asarray(eye), self.blend) for eye in self.views)
+        now = np.stack([np.asarray(placed.combine(lit, view)) for view in views])
         return _relative(np.broadcast_to(now, exact.shape)[self.facing], exact[self.facing])
 
     def _frame(self, system: System) -> float:
         """Seconds of a frame of the whole part. A light that all vertices share does not grow with them."""
         light, eye = self.environments[0], jnp.asarray(self.views[0])
-        lit, view = system.light(light), system.view(eye, self.blend)
+        whole, vertex = self.shading.blend, self.target.vertex
+        blend = None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
+        lit, view = system.light(light), system.view(eye, blend)
         once = _seconds(lambda: system.light(light))
-        rest = _seconds(lambda: system.view(eye, self.blend)) + _seconds(lambda: system.combine(lit, view))
+        rest = _seconds(lambda: system.view(eye, blend)) + _seconds(lambda: system.combine(lit, view))
         return once * (self.vertex_ratio if system.shared_light is None else 1) + self.vertex_ratio * rest
+
+
+def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
+    """Points by chance on the triangles between some vertices, by area; numbered as these vertices are."""
+    number = np.full(len(mesh.position), -1)
+    number[vertex] = np.arange(len(vertex))
+    corner = number[np.asarray(mesh.face)]
+    corner = corner[np.all(corner >= 0, 1)]
+    a, b, c = np.asarray(mesh.position, np.float64)[vertex[corner]].swapaxes(0, 1)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    random = np.random.default_rng(1)
+    if not len(corner) or not area.sum() > 0:
+        # Vertices without triangles among them stand for points.
+        alone = random.integers(len(vertex), size=count)
+        corner, chosen = np.repeat(alone[:, None], 3, 1), np.arange(count)
+    else:
+        chosen = random.choice(len(corner), count, p=area / area.sum())
+    weight = random.dirichlet(np.ones(3), count).astype(np.float32)
+    return Points(jnp.asarray(corner[chosen].T), jnp.asarray(weight.T))
+
+
+def _judged(
+    part: Part, shading: Shading, points: Points, scene: Mesh, environments: Sequence[Environment], views: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which points face each view, and their exact radiance [light, view, point, color]."""
+    mesh = shading.mesh
+    position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
+    toward = views[:, None] - np.asarray(position)
+    facing = np.einsum("vi,wvi->wv", np.asarray(frame)[:, 2], toward) > 0
+    brdf, _ = exact_at(part, shading, points)
+    batch = Environment(jnp.stack([light.radiance for light in environments]))
+    rays = visibility.Occluder(scene)
+    start, normal = visibility.point_starts(mesh, points, rays), np.asarray(frame[:, 2], np.float32)
+    seen, _ = visibility.fractional(rays, start, normal, size=batch.radiance.shape[-2])
+    brdf = brdf if isinstance(brdf, PerVertex) else grid.as_argument(brdf)
+    each = [reference.integrate(jnp.asarray(seen), position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
+    exact = np.stack(each, 1)
+    require.finite("what the BRDF makes of the lights, by light, view, point and color,", exact)
+    return facing, exact
 
 
 def checked(environments: Sequence[Environment], error: float, rate: float) -> int:

@@ -142,7 +142,7 @@ def plan(
     Args:
         scene: The scene.
         environments: Lights that the error must hold for, of one size; the scene's own, or else the two embedded ones.
-        error: Relative L2 error of the radiance of the vertices of each part.
+        error: Relative L2 error of the radiance of each part, between its vertices too, as pictures show it.
         rate: Frames per second with new light and new view, for the scene as a whole, without drawing.
         path: Folder that keeps what was measured; a call that was stopped, or killed, goes on from there.
         progress: Whether to show a progress bar.
@@ -165,7 +165,7 @@ def plan(
     for number, (part, shading) in tqdm.tqdm(
         pairs, desc="plan", unit="part", total=len(shadings), disable=not progress
     ):
-        sample = Sample.make(shading, mesh, total, size, environments, views)
+        sample = Sample.make(part, shading, mesh, total, size, environments, views)
         count = len(part.mesh.position)
         kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
         considered = tuple(_considered(sample, kept, error, count / total / rate))

@@ -186,10 +186,10 @@ class RelitScene(System):
         return pictures.make(self.mesh, self.system, surfaces, camera, samples=samples, keep=keep)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
-        """Errors of the parts against the exact sum, times and bytes, measured on this machine.
+        """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
 
-        Errors are those of direct light alone, of a sample of each part's vertices, from eight views around the scene;
-        times and bytes are those of all light.
+        Errors are those of direct light alone: of some pixels of pictures from three sides, and of some vertices of
+        each part from eight; times and bytes are those of all light.
 
         Args:
             environments: Lights of one size; the scene's own, or else the two embedded ones.
@@ -201,7 +201,8 @@ class RelitScene(System):
             ValueError: No lights, lights of different sizes, or NaN or infinity in them.
         """
         lights = measuring.lights_of(self.scene) if environments is None else environments
-        return measuring.measure(self.direct, self.system, self.scene, self.shading, lights)
+        alone = RelitScene(self.scene, self.direct, self.shading)
+        return measuring.measure(alone.picture, self.camera, self.direct, self.system, self.scene, self.shading, lights)
 
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
         """Materials evaluated at the vertices: once for all views.

@@ -17,6 +17,7 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.protocol import Blend, System, VertexSystem
+from jaxprt.visibility.points import PointVisibility
 
 _ROW = 32  # texels of which the brightest is looked at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
@@ -72,37 +73,6 @@ class BrightView(eqx.Module):
     rest: PyTree
     eye: Float[Array, "3"]
     blend: Blend | None
-
-
-class PointVisibility(eqx.Module):
-    """Visibility of single texels at points: the mean of what the corners of their triangles see.
-
-    Attributes:
-        vertices: Visibility of the vertices.
-        points: The points.
-    """
-
-    vertices: Any
-    points: Points
-
-    @property
-    def position(self) -> Float[Array, "p 3"]:
-        """Positions in world units."""
-        return self.points.carry(self.vertices.position)
-
-    @property
-    def frame(self) -> Float[Array, "p 3 3"]:
-        """Rows are tangent, bitangent, normal."""
-        return self.points.frame(self.vertices.frame)
-
-    @property
-    def size(self) -> int:
-        """Edge of the cubemap's faces in texels."""
-        return self.vertices.size
-
-    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t p"]:
-        """Share of some texels that is seen."""
-        return self.points.carry(self.vertices.visible(texel), axis=1)
 
 
 class BrightTexels(VertexSystem):

@@ -1,11 +1,45 @@
-"""Where rays start at points between the vertices."""
+"""Visibility of points between the vertices: interpolated, or by rays of their own."""
 
+from typing import Any
+
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Array, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.visibility.rays import Occluder
+
+
+class PointVisibility(eqx.Module):
+    """Visibility of single texels at points: the mean of what the corners of their triangles see.
+
+    Attributes:
+        vertices: Visibility of the vertices.
+        points: The points.
+    """
+
+    vertices: Any
+    points: Points
+
+    @property
+    def position(self) -> Float[Array, "p 3"]:
+        """Positions in world units."""
+        return self.points.carry(self.vertices.position)
+
+    @property
+    def frame(self) -> Float[Array, "p 3 3"]:
+        """Rows are tangent, bitangent, normal."""
+        return self.points.frame(self.vertices.frame)
+
+    @property
+    def size(self) -> int:
+        """Edge of the cubemap's faces in texels."""
+        return self.vertices.size
+
+    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t p"]:
+        """Share of some texels that is seen."""
+        return self.points.carry(self.vertices.visible(texel), axis=1)
 
 
 def point_starts(mesh: Mesh, points: Points, occluder: Occluder) -> Float32[np.ndarray, "p 3"]:

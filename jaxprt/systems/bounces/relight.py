@@ -239,6 +239,7 @@ def combine(
     transport: DynamicTransport,
     arriving: tuple[Arriving, ...],
     view: tuple[ReflectedView, ...],
+    *,
     points: Sequence[Points] | None = None,
 ) -> Float[Array, "v c"]:
     """Radiance of reflected light alone.

@@ -54,7 +54,7 @@ class BouncesSystem(protocol.System):
     ) -> tuple[ReflectedView, ...]:
         """What each region sends to the eye of what arrives: `jaxprt.bounces.view_side`."""
         points = self.direct.points
-        surfaces = dynamic.mix(self.direct.transport, self.direct.brdf, self.direct.given(materials), points)
+        surfaces = dynamic.mix(self.direct.transport, self.direct.brdf, self.direct.given(materials), points=points)
         return view_side(self.direct.transport, surfaces, eye=eye, points=points)
 
     def combine(self, light: tuple[Arriving, ...], view: tuple[ReflectedView, ...]) -> Float[Array, "v c"]:

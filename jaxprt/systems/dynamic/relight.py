@@ -25,6 +25,7 @@ from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
 from jaxprt.systems.lobe import LobeLight, LobeView
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.separable.factorization import check_mark
+from jaxprt.visibility.points import PointVisibility
 
 _ROUNDED = 1e-4  # By which a sum of weights is off where they are in single precision.
 
@@ -187,7 +188,9 @@ def view_side(
     require.position("the eye", eye)
     region = []
     several = [None] * len(transport.region) if points is None else points
-    for own, surface, at in zip(transport.region, mix(transport, brdfs, materials, points), several, strict=True):
+    for own, surface, at in zip(
+        transport.region, mix(transport, brdfs, materials, points=points), several, strict=True
+    ):
         brdf = surface.brdf
         place = placed(own.seen.position, own.seen.frame, at)
         if isinstance(brdf, SeparableBrdf):
@@ -204,6 +207,7 @@ def mix(
     transport: DynamicTransport,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     materials: Sequence[Material | None],
+    *,
     points: Sequence[Points] | None = None,
 ) -> tuple[RegionBrdf, ...]:
     """What each region reflects with, at its vertices or at points: what changes with the materials alone.
@@ -245,7 +249,7 @@ def combine(
         model = brdf.brdf if isinstance(brdf, Mixed) and brdf.brdf is not None else brdf
         seen: bright_texels.Visibility = own.seen
         if each.points is not None:
-            seen = bright_texels.PointVisibility(own.seen, each.points)
+            seen = PointVisibility(own.seen, each.points)
             met, matte = (each.points.carry(light) for light in (met, matte))
         single = bright_texels.radiance(seen, model, light.texel, light.excess, eye=view.eye, samples=samples)
         if isinstance(brdf, SeparableBrdf):
