@@ -109,8 +109,9 @@ def _some(own: np.ndarray, count: int) -> np.ndarray:
 
 def _mean(value: Float[np.ndarray, "l m c"], row: np.ndarray, rows: int) -> Float[np.ndarray, "l n c"]:
     """Means of values that belong to the same row; zero of none."""
-    total = np.zeros((value.shape[0], rows, value.shape[2]))
-    np.add.at(total, (slice(None), row), value)
+    total = np.stack(
+        [np.stack([np.bincount(row, each, rows) for each in light.T], -1) for light in np.asarray(value, np.float64)]
+    )
     return total / np.maximum(np.bincount(row, minlength=rows), 1)[:, None]
 
 

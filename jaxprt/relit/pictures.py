@@ -1,7 +1,7 @@
 """Pictures of scenes: radiance at pixels where it pays, at vertices where it does not, and textures at pixels."""
 
 from collections.abc import Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -102,7 +102,7 @@ class PictureView(eqx.Module):
         arriving = self.system.shade(self.system.light(environment), blends)
         if self.surface[0].reflecting is None:
             arriving = arriving, [None] * len(self.surface)
-        rows = [self._rows(own, tuple(lit[own.number] for lit in arriving)) for own in self.part]
+        rows = [self._rows(own, (arriving[0][own.number], arriving[1][own.number])) for own in self.part]
         colors = max((each.shape[-1] for each in rows), default=environment.radiance.shape[-1])
         color = jnp.zeros((len(self.pixels.triangle), colors), self.mesh.position.dtype)
         for own, row in zip(self.part, rows, strict=True):
@@ -226,7 +226,8 @@ def _lit(
     elif appearance.blend is None:
         color = points.carry(vertices[0])
     else:
-        color = sum(points.carry(own) * appearance.blend.weight[:, k] for k, own in enumerate(vertices))
+        rows = (points.carry(own) * appearance.blend.weight[:, k] for k, own in enumerate(vertices))
+        color = reduce(jnp.add, rows)
     return color if appearance.emitted is None else color + appearance.emitted
 
 

@@ -21,8 +21,9 @@ from jaxprt.brdf import Lambert
 from jaxprt.files import objects
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import of_part
-from jaxprt.relit.measuring import MEMBERS, Candidate, Sample, checked, lights_of, views_around
+from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
+from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
 from jaxprt.scene import Environment, Scene
 from jaxprt.visibility import blocks
 
@@ -57,10 +58,13 @@ class PartPlan(eqx.Module):
         vertices: Number of its vertices.
         chosen: What was chosen.
         considered: All that was measured, in this order.
+        mesh_error: Relative L2 error that the mesh adds under the worst of the lights, whatever the system: shadows
+            finer than its triangles.
     """
 
     name: str
     vertices: int
+    mesh_error: float
     chosen: Candidate
     considered: tuple[Candidate, ...]
 
@@ -113,6 +117,8 @@ class Plan(eqx.Module):
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
             rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
+            advice = "; `jaxprt.relit.refine` divides its triangles" if part.mesh_error > self.asked else ""
+            rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
         for part, (once, twice) in zip(self.part, self.reflected.T, strict=True):
             rows.append(f"{part.name}: {100 * once:.1f} % of its light is reflected, {100 * twice:.1f} % twice or more")
         rows.append(f"bounces: {self.bounces}")
@@ -142,7 +148,8 @@ def plan(
     Args:
         scene: The scene.
         environments: Lights that the error must hold for, of one size; the scene's own, or else the two embedded ones.
-        error: Relative L2 error of the radiance of each part, between its vertices too, as pictures show it.
+        error: Relative L2 error of the radiance of each part, between its vertices too, as pictures show it, but for
+            shadows that are finer than the triangles: `PartPlan.mesh_error`.
         rate: Frames per second with new light and new view, for the scene as a whole, without drawing.
         path: Folder that keeps what was measured; a call that was stopped, or killed, goes on from there.
         progress: Whether to show a progress bar.
@@ -178,7 +185,7 @@ def plan(
             )
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
-        parts.append(PartPlan(part.name, count, chosen, considered))
+        parts.append(PartPlan(part.name, count, sample.mesh_error, chosen, considered))
     reflected = reflection.fractions(shadings, environments)
     bounces = reflection.needed(reflected, error)
     return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key)

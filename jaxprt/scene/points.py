@@ -1,5 +1,7 @@
 """Points on the triangles of a mesh: where radiance is asked for between the vertices."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +39,7 @@ class Points(eqx.Module):
             jnp.take(attribute, corner, axis, mode="clip") * weight.astype(attribute.dtype).reshape(wide)
             for corner, weight in zip(self.corner, self.weight, strict=True)
         ]
-        return sum(parts[1:], start=parts[0])
+        return functools.reduce(jnp.add, parts)
 
     def slopes(self, attribute: Float[Array, "v c"]) -> Float[Array, "2 p c"]:
         """Change of an attribute of the vertices from one pixel to the next, to the right and down."""

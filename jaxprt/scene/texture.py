@@ -42,7 +42,10 @@ def lookup(
         raise ValueError(f"image must be [h, w, c] and coordinates [..., 2], got {got}")
     if not set(wrap) <= set(WRAPS):
         raise ValueError(f"wrap must be two of {', '.join(WRAPS)}, got {wrap}")
-    parts = [image[place] * weight[..., None] for place, weight in bilinear(coordinate, image.shape[:2], wrap)]
+    parts = [
+        image[place] * weight[..., None]
+        for place, weight in bilinear(coordinate, (image.shape[0], image.shape[1]), wrap)
+    ]
     return sum(parts[1:], start=parts[0])
 
 

@@ -27,15 +27,17 @@ _GROUP = 16  # texels at once: what is held for each vertex meanwhile
 
 @runtime_checkable
 class Visibility(Protocol):
-    """What this system asks of transport: visibility of single texels.
+    """What this system asks of transport: visibility of single texels."""
 
-    Attributes:
-        position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-    """
+    @property
+    def position(self) -> Float[Array, "v 3"]:
+        """Positions in world units."""
+        ...
 
-    position: Float[Array, "v 3"]
-    frame: Float[Array, "v 3 3"]
+    @property
+    def frame(self) -> Float[Array, "v 3 3"]:
+        """Rows are tangent, bitangent, normal."""
+        ...
 
     @property
     def size(self) -> int:

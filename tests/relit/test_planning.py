@@ -18,6 +18,7 @@ from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import ground_plane, make_mesh
 
 measuring = importlib.import_module("jaxprt.relit.measuring")
+sampling = importlib.import_module("jaxprt.relit.sampling")
 planning = importlib.import_module("jaxprt.relit.planning")
 ASKED = 0.3
 VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
@@ -77,10 +78,12 @@ def test_the_report_has_the_error_of_every_part(scene, sky, planned, ready):
     found = ready.report([sky, Environment(jnp.ones((6, 8, 8, 3)))])
     assert [(each.name, each.vertices) for each in found.part] == [(each.name, each.vertices) for each in planned.part]
     for each, part in zip(found.part, planned.part, strict=True):
-        assert len(each.errors) == 2
-        assert 0 < each.errors[0] < 2 * part.chosen.error + 0.01
+        assert len(each.errors) == len(each.vertex_errors) == 2
+        assert 0 < each.vertex_errors[0] < 2 * part.chosen.error + 0.01
+        assert each.errors[0] < 2 * (part.chosen.error + part.mesh_error) + 0.05
+    assert 0 < found.uncertainty[0] < found.errors[0] < 1
     assert found.nbytes == prt.memory(ready.system)
-    assert str(found).count("off by") == 3
+    assert str(found).count("off by") == 4
 
 
 def test_bytes_are_those_of_what_is_made(planned, ready):
@@ -105,6 +108,7 @@ def test_the_table_names_every_part_and_marks_one_choice_of_each(planned):
     assert all(f"{name}: " in table for name in ("ball", "ground", "paint"))
     assert f"in all: {100 * planned.error:.1f} %" in table
     assert "slower" not in table
+    assert table.count("% of shadows between its vertices") == 3
 
 
 def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
@@ -189,7 +193,7 @@ def test_the_key_of_a_plan_knows_classes_and_textures_of_materials_and_functions
 def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_path, monkeypatch):
     ground = prt.Scene([scene["ground"]])
     options = {"environments": [sky], "error": 0.02, "path": tmp_path / "plan", "progress": False}
-    measure, measured = measuring.Sample.measure, []
+    measure, measured = sampling.Sample.measure, []
 
     def stopped(sample, recipe):
         if measured:
@@ -201,10 +205,10 @@ def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_
         measured.append(recipe)
         return measure(sample, recipe)
 
-    monkeypatch.setattr(measuring.Sample, "measure", stopped)
+    monkeypatch.setattr(sampling.Sample, "measure", stopped)
     with pytest.raises(InterruptedError):
         prt.plan(ground, **options)
-    monkeypatch.setattr(measuring.Sample, "measure", counted)
+    monkeypatch.setattr(sampling.Sample, "measure", counted)
     found = prt.plan(ground, **options)
     assert [each.recipe for each in found.part[0].considered] == measured
     assert len(measured) > 1

@@ -105,7 +105,7 @@ class PartBounces(protocol.System):
         """Harmonics of the BRDF of each vertex or point for its view."""
         require.position("the eye", eye)
         rows = zip(self.part, self._given(materials), self._points(), strict=True)
-        return tuple(part.view(eye, *own) for part, *own in rows)
+        return tuple(part.view(eye, own, points) for part, own, points in rows)
 
     def combine(
         self, light: tuple[Float[Array, "lm _ _"], ...], view: tuple[Float[Array, "lm _ _"], ...]
@@ -113,7 +113,8 @@ class PartBounces(protocol.System):
         """Radiance of reflected light."""
         require.kind("the light", light, tuple, source="PartBounces.shade")
         require.kind("the view", view, tuple, source="PartBounces.view")
-        rows = [part.combine(*own) for part, *own in zip(self.part, light, view, self._points(), strict=True)]
+        sides = zip(self.part, light, view, self._points(), strict=True)
+        rows = [part.combine(arriving, seen, points) for part, arriving, seen, points in sides]
         colors = max(each.shape[1] for each in rows)
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
