@@ -5,11 +5,11 @@
 Scenes are glTF files of JAXPRT_DATA, one of them also with its triangles divided, and spheres with sharper materials.
 `seconds` are of a picture: light, view and materials redone, and drawing. `bytes` are what the system holds.
 
-Mitsuba gets the same triangles, and the same materials as a plugin, with their parameters interpolated between the
-vertices; direct light alone. `peer_error` is the noise of one of its pictures, relative L2, from two of unlike seeds;
+Mitsuba gets the same surfaces, and the same materials as a plugin, with their parameters interpolated between the
+vertices; triangles with textures are divided for it until they are as small as pixels. Direct light alone. `peer_error` is the noise of one of its pictures, relative L2, from two of unlike seeds;
 `peer_seconds` is the time of one. `error` is the relative L2 of ours against both, in whose product their noise has no
 part. `bias` is the error of the sums over all pixels, with its sign. The pixels are those that the object fills.
-Pixels are means over their squares on both sides: ours of 3 x 3 points.
+Pixels are means over their squares on both sides.
 
 Lines of `lobe, 2 bounces` are held to Mitsuba's pictures of as many bounces, and so are those of `lobe, no bounces`,
 which tell what bounces bring.
@@ -57,6 +57,7 @@ LIGHTS = {
 }
 AZIMUTH = {"duck": 0.5, "truck": 0.9, "truck, divided": 0.9, "spheres": 0.25}
 LONGEST = 0.03  # edge of divided triangles, over the diagonal of the scene
+FINEST = 0.004  # edge of triangles whose materials Mitsuba interpolates
 REFLECTING = ("duck", "spheres")  # scenes that are relit with bounces too
 BOUNCES = 2
 RAMP = "ramp"  # the part whose roughness varies, which the separable system does not take
@@ -82,7 +83,7 @@ def scenes(quick: bool) -> dict[str, Scene]:
     paths = {"duck": folder / "Duck.glb", "truck": folder / "CesiumMilkTruck.glb"}
     found = {name: load_scene(path) for name, path in paths.items() if path.is_file()}
     if "truck" in found:
-        found["truck, divided"] = divided(found["truck"])
+        found["truck, divided"] = divided(found["truck"], LONGEST)
     return found | {"spheres": spheres(sectors=112, ground=6400)}
 
 
@@ -141,17 +142,17 @@ def reflected(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, 
             timing = harness.measure(
                 lambda each=each, light=light: each.picture(light, camera), repeats=3 if quick else 9
             )
-            drawn = averaged(each.picture(light, finer(camera)))
+            drawn = np.asarray(each.picture(light, camera))
             yield line((name, light_name, system), timing, judge, drawn, memory(each))
             if pictures is not None:
                 write(pictures / f"{file_name(name, light_name, system)}.png", drawn, judge)
 
 
 def frames(scene: Scene, relit: Mapping[str, RelitScene], light: Environment, camera: Camera, quick: bool):
-    """System, time of a picture, the picture drawn finer, and bytes, of each system and of the exact sum."""
+    """System, time of a picture, the picture, and bytes, of each system and of the exact sum at the vertices."""
     for system, each in relit.items():
         timing = harness.measure(lambda each=each: each.picture(light, camera), repeats=3 if quick else 9)
-        yield system, timing, averaged(each.picture(light, finer(camera))), memory(each)
+        yield system, timing, np.asarray(each.picture(light, camera)), memory(each)
     start = time.perf_counter()
     color = exact_radiance(scene, light, camera)
     timing = harness.Timing(time.perf_counter() - start, 0.0, 1)  # with compiling, since it is slow
@@ -189,7 +190,7 @@ class Judge:
     """Two pictures by Mitsuba, and what a picture is off from them, where the object fills pixels."""
 
     def __init__(self, scene: Scene, light: Environment, camera: Camera, samples: int, *, bounces: int = 0):
-        parts, depth = traced_parts(scene), 2 + bounces
+        parts, depth = traced_parts(scene if samples < SAMPLES else divided(scene, FINEST)), 2 + bounces
         path_tracing.trace(parts, light, camera, depth=depth, samples=1)  # compiles
         self.samples, drawn, seconds = samples, [], []
         for seed in (1, 2):
@@ -294,10 +295,10 @@ def ball(sectors: int, center: np.ndarray) -> Mesh:
     return brush(mesh, dpdu(mesh))
 
 
-def divided(scene: Scene) -> Scene:
-    """The same surfaces in smaller triangles, so that radiance at vertices shows textures and shadows."""
+def divided(scene: Scene, longest: float) -> Scene:
+    """The same surfaces in triangles whose edges are at most so long, over the diagonal of the scene."""
     low, high = np.asarray(scene.mesh.position).min(0), np.asarray(scene.mesh.position).max(0)
-    return Scene([halved(part, LONGEST * float(np.linalg.norm(high - low))) for part in scene.parts], scene.cameras)
+    return Scene([halved(part, longest * float(np.linalg.norm(high - low))) for part in scene.parts], scene.cameras)
 
 
 def halved(part: Part, longest: float) -> Part:
