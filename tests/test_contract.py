@@ -172,6 +172,8 @@ HOST = {
     "scene.texture.dpdu": "reads a mesh on the host",
     "scene.texture.handedness": "the same",
     "scene.occluder": "simplifies meshes on the host",
+    "scene.subdivision": "divides meshes on the host",
+    "scene.light_samples": "NumPy on the host",
     "scene.builtin": "builds meshes and lights",
     "scene.shapes": "builds meshes",
     "scene.interiors": "builds meshes",

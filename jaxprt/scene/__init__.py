@@ -1,6 +1,17 @@
 """What is looked at: meshes, environments, cameras, embedded scenes."""
 
-from jaxprt.scene import builtin, camera, environment, interiors, material, mesh, occluder, texture
+from jaxprt.scene import (
+    builtin,
+    camera,
+    environment,
+    interiors,
+    light_samples,
+    material,
+    mesh,
+    occluder,
+    subdivision,
+    texture,
+)
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
 from jaxprt.scene.formats.scene_file import load_scene
@@ -20,11 +31,13 @@ __all__ = [
     "camera",
     "environment",
     "interiors",
+    "light_samples",
     "load_environment",
     "load_mesh",
     "load_scene",
     "material",
     "mesh",
     "occluder",
+    "subdivision",
     "texture",
 ]

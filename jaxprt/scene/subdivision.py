@@ -1,0 +1,313 @@
+"""Triangles divided at the middles of their edges, so that a mesh has vertices where they are needed.
+
+Vertices at one place count as one when edges are looked for: both sides of a seam are divided alike, and so are parts
+of a scene that share a border. The surface has no gaps afterwards that it did not have before.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Int, Integer
+
+from jaxprt import require
+from jaxprt.brdf.varying import PerVertex
+from jaxprt.scene.mesh import Mesh, make_mesh
+from jaxprt.scene.scene import Part, Scene
+
+# Steps by which points fill a square evenly, the first two of the R2 sequence.
+_R2 = np.array([0.7548776662466927, 0.5698402909980532])
+_CANCELED = 1e-6  # Length of the mean of two unit normals below which it has no direction.
+
+# Triangles that replace one whose edges are cut or not, counted from its longest edge. Corners are 0 to 2, from the
+# start of that edge; 3 to 5 are the middles of the edges from there.
+_CHILDREN = {
+    (False, False, False): [[0, 1, 2]],
+    (True, False, False): [[0, 3, 2], [3, 1, 2]],
+    (True, True, False): [[0, 3, 2], [3, 1, 4], [3, 4, 2]],
+    (True, False, True): [[3, 1, 2], [0, 3, 5], [3, 2, 5]],
+    (True, True, True): [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]],
+}
+
+
+class Division(NamedTuple):
+    """Triangles after a division. Added vertices come after those that were there.
+
+    Attributes:
+        face: Vertices of each triangle.
+        origin: Number of the triangle that each was cut from, in ascending order.
+        parent: The two vertices in whose middle each added vertex lies, the lower number first.
+    """
+
+    face: Int[np.ndarray, "f 3"]
+    origin: Int[np.ndarray, " f"]
+    parent: Int[np.ndarray, "n 2"]
+
+
+class Points(NamedTuple):
+    """Points on triangles.
+
+    Attributes:
+        triangle: The triangle of each.
+        weight: Barycentric weights of its corners.
+    """
+
+    triangle: Int[np.ndarray, " p"]
+    weight: Float[np.ndarray, "p 3"]
+
+
+class Edges:
+    """The edges of a mesh, found by the places of their ends.
+
+    Args:
+        position: Positions of the vertices.
+        face: Vertices of each triangle.
+
+    Attributes:
+        face: Vertices of each triangle.
+        number: Number of the edge from each corner of a triangle to the next: equal for all triangles at the edge.
+        length: Length of each edge.
+        added: How many vertices the middle of each edge needs: two at a seam.
+        longest: Number of each triangle's longest edge; of equally long ones, that of the highest number.
+    """
+
+    def __init__(self, position: Float[ArrayLike, "v 3"], face: Integer[ArrayLike, "f 3"]):
+        self.face = np.asarray(face, np.int64)
+        position = np.asarray(position)
+        self._vertices = len(position)
+        self._ends = np.stack([self.face, np.roll(self.face, -1, 1)], -1)
+        low, high = np.moveaxis(np.sort(places(position)[self._ends], -1), -1, 0)
+        _, first, number = np.unique(low * self._vertices + high, return_index=True, return_inverse=True)
+        self.number = number.reshape(-1, 3)
+        start, stop = position.astype(np.float64)[self._ends.reshape(-1, 2)[first].T]
+        self.length = np.linalg.norm(stop - start, axis=1)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(self.length, kind="stable")] = np.arange(len(first))
+        self._turn = np.argmax(rank[self.number], 1)
+        self.longest = np.take_along_axis(self.number, self._turn[:, None], 1)[:, 0]
+        _, one = np.unique(self._pairs(), return_index=True)
+        self.added = np.bincount(self.number.ravel()[one], minlength=len(first))
+
+    def closed(self, marked: Bool[np.ndarray, " e"]) -> Bool[np.ndarray, " e"]:
+        """The marked edges, and the longest edge of each triangle that has a marked one.
+
+        These can be cut without gaps, and angles stay above half of the smallest angle that there was. Edges without
+        length are not cut.
+
+        Reference: Rivara 1984, "Algorithms for refining triangular grids suitable for adaptive and multigrid
+        techniques".
+        """
+        marked = marked & (self.length > 0)
+        while (open_ := marked[self.number].any(1) & ~marked[self.longest]).any():
+            marked[self.longest[open_]] = True
+        return marked
+
+    def divide(self, marked: Bool[np.ndarray, " e"]) -> Division:
+        """Cuts marked edges in the middle.
+
+        A triangle whose three edges are cut becomes four similar ones. Another is cut from the middle of its longest
+        edge to the opposite corner first.
+
+        Args:
+            marked: The edges, from `closed`.
+
+        Reference: Carstensen 2004, "An adaptive mesh-refining algorithm allowing for an H1 stable L2 projection onto
+        Courant finite element spaces": red, green and blue refinement.
+        """
+        cut = marked[self.number]
+        parent, index = np.unique(self._pairs()[cut], return_inverse=True)
+        middle = np.full(cut.shape, -1)
+        middle[cut] = self._vertices + index
+        turn = (self._turn[:, None] + np.arange(3)) % 3
+        corner, middle = (np.take_along_axis(each, turn, 1) for each in (self.face, middle))
+        every = np.concatenate([corner, middle], 1)
+        face, origin = [], []
+        for which, children in _CHILDREN.items():
+            own = np.flatnonzero(((middle >= 0) == which).all(1))
+            face.append(every[own][:, children].reshape(-1, 3))
+            origin.append(np.repeat(own, len(children)))
+        order = np.argsort(np.concatenate(origin), kind="stable")
+        ends = np.stack(np.divmod(parent, self._vertices), -1)
+        return Division(np.concatenate(face)[order], np.concatenate(origin)[order], ends)
+
+    def _pairs(self) -> np.ndarray:
+        """One number for the two vertices at the ends of each triangle's edges."""
+        low, high = np.moveaxis(np.sort(self._ends, -1), -1, 0)
+        return low * self._vertices + high
+
+
+def middle(value: Float[np.ndarray, "v *c"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n *c"]:
+    """Values in the middle between vertices, in the type of the values."""
+    return value[parent].mean(1)
+
+
+def middle_normal(normal: Float[np.ndarray, "v 3"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Normals in the middle between vertices, not of unit length; that of the first where two cancel."""
+    mean = middle(normal, parent)
+    return np.where(np.linalg.norm(mean, axis=1, keepdims=True) > _CANCELED, mean, normal[parent[:, 0]])
+
+
+def scatter(count: Int[np.ndarray, " f"]) -> Points:
+    """Points that fill triangles evenly, so many in each; they are the same in every run.
+
+    Reference: the additive recurrence R2, folded from the square into the triangle.
+    """
+    triangle = np.repeat(np.arange(len(count)), count)
+    rank = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
+    place = ((rank + 0.5)[:, None] * _R2) % 1
+    place = np.where(place.sum(1, keepdims=True) > 1, 1 - place, place)
+    return Points(triangle, np.column_stack([place, 1 - place.sum(1)]))
+
+
+def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -> Points:
+    """The same points in the triangles after a division.
+
+    Args:
+        points: The points. They lie in no triangle that has a vertex twice.
+        face: Vertices of each triangle before the division.
+        division: The division.
+    """
+    children = np.bincount(division.origin, minlength=len(face))[points.triangle]
+    first = np.searchsorted(division.origin, points.triangle)
+    before = division.face.max() + 1 - len(division.parent)
+    ends = np.concatenate([np.repeat(np.arange(before)[:, None], 2, 1), division.parent])
+    triangle, weight = first, np.full(points.weight.shape, -np.inf)
+    for number in range(4):
+        child = first + np.minimum(number, children - 1)
+        # Weights of the corners of the old triangle at the corners of the new one.
+        corner = (ends[division.face[child]][..., None] == face[points.triangle][:, None, None]).mean(2)
+        now = np.linalg.solve(np.swapaxes(corner, 1, 2), points.weight[..., None])[..., 0]
+        better = now.min(1) > weight.min(1)
+        triangle, weight = np.where(better, child, triangle), np.where(better[:, None], now, weight)
+    return Points(triangle, weight)
+
+
+def subdivide(mesh: Mesh, divisions: Sequence[Division]) -> Mesh:
+    """The mesh after divisions of its triangles, one after another.
+
+    Positions and texture coordinates are interpolated, so that the surface and the images on it stay the same.
+    Normals are interpolated as pictures interpolate them, and made unit; tangents are made orthogonal to them. An added
+    vertex is in the region of the first of the two between which it lies. Vertices that were there stay as they are.
+    """
+    return _subdivided(mesh, [each.parent for each in divisions], divisions[-1].face) if divisions else mesh
+
+
+def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
+    """The scene after divisions of the triangles of `scene.mesh`.
+
+    Parts keep their materials. Colors and second texture coordinates are interpolated. The rest is as in `subdivide`.
+
+    Raises:
+        TypeError: The material of a part has one BRDF for each vertex.
+    """
+    for part in scene.parts:
+        if isinstance(part.material, PerVertex):
+            raise TypeError(
+                f"the material of part {part.name!r} must be one BRDF for all vertices or a TexturedMaterial, "
+                "got a BRDF for each vertex"
+            )
+    if not divisions:
+        return scene
+    counts = [len(part.mesh.position) for part in scene.parts]
+    owner = np.repeat(np.arange(len(counts)), counts)
+    number = np.concatenate([np.arange(count) for count in counts])
+    parents: list[list[np.ndarray]] = [[] for _ in counts]
+    for division in divisions:
+        of_added, place = owner[division.parent[:, 0]], np.empty(len(division.parent), np.int64)
+        for part, all_parents in enumerate(parents):
+            own = np.flatnonzero(of_added == part)
+            place[own] = np.count_nonzero(owner == part) + np.arange(len(own))
+            all_parents.append(number[division.parent[own]])
+        owner, number = np.concatenate([owner, of_added]), np.concatenate([number, place])
+    face = divisions[-1].face
+    faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
+    parts = [_subdivided_part(*each) for each in zip(scene.parts, parents, faces, strict=True)]
+    return Scene(parts, scene.cameras, scene.environments)
+
+
+def divide(scene: Scene, *, edge: float) -> Scene:
+    """The scene with all edges halved that are longer than a length, until none is left.
+
+    Args:
+        scene: The scene.
+        edge: The largest length of an edge, in world units.
+
+    Returns:
+        The scene; see `subdivide_scene`.
+
+    Raises:
+        TypeError: There is no scene, or the material of a part has one BRDF for each vertex.
+        ValueError: The length is not positive and finite.
+    """
+    require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    if not 0 < edge < np.inf:
+        raise ValueError(f"edge must be positive and finite, got {edge}")
+    mesh = scene.mesh
+    position, face = np.asarray(mesh.position), np.asarray(mesh.face)
+    divisions = []
+    while True:
+        edges = Edges(position, face)
+        marked = edges.length > edge
+        if not marked.any():
+            return subdivide_scene(scene, divisions)
+        divisions.append(edges.divide(edges.closed(marked)))
+        face = divisions[-1].face
+        position = np.concatenate([position, middle(position, divisions[-1].parent)])
+
+
+def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> Mesh:
+    """The mesh with added vertices, each between two of those before it."""
+    triangle = jax.device_put(face.astype(np.asarray(mesh.face).dtype))
+    if not any(len(each) for each in parents):
+        return eqx.tree_at(lambda each: each.face, mesh, triangle)
+    count = len(mesh.position)
+    position, tangent = _rows(mesh.position, parents), _rows(np.asarray(mesh.tangent, np.float64), parents)
+    normal = np.asarray(mesh.normal, np.float64)
+    for parent in parents:
+        normal = np.concatenate([normal, middle_normal(normal, parent)])
+    # Of one face that has no area: only frames are made.
+    new = make_mesh(position[count:], np.zeros((1, 3), int), normal=normal[count:], tangent=tangent[count:])
+
+    def appended(old, rows):
+        return jax.device_put(np.concatenate([old, np.asarray(rows).astype(np.asarray(old).dtype)]))
+
+    texture = None if mesh.texture is None else jax.device_put(_rows(mesh.texture, parents))
+    frame = appended(mesh.normal, new.normal), appended(mesh.tangent, new.tangent)
+    return Mesh(jax.device_put(position), triangle, *frame, jax.device_put(_first(mesh.region, parents)), texture)
+
+
+def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
+    """The part with added vertices, each between two of those before it."""
+    color, second = (
+        None if each is None else jax.device_put(_rows(each, parents)) for each in (part.color, part.second)
+    )
+    handedness = None if part.handedness is None else jax.device_put(_first(part.handedness, parents))
+    return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness)
+
+
+def _rows(value, parents: Sequence[np.ndarray]) -> np.ndarray:
+    """Values of all vertices; those of added ones are means."""
+    value = np.asarray(value)
+    for parent in parents:
+        value = np.concatenate([value, middle(value, parent)])
+    return value
+
+
+def _first(value, parents: Sequence[np.ndarray]) -> np.ndarray:
+    """Values of all vertices; those of added ones are those of the first between which they lie."""
+    value = np.asarray(value)
+    for parent in parents:
+        value = np.concatenate([value, value[parent[:, 0]]])
+    return value
+
+
+def places(position: np.ndarray) -> np.ndarray:
+    """Numbers that are equal for vertices at one place."""
+    order = np.lexsort(position.T)
+    another = (position[order[1:]] != position[order[:-1]]).any(1)
+    place = np.empty(len(position), np.int64)
+    place[order] = np.concatenate([[0], np.cumsum(another)])
+    return place

@@ -1,0 +1,243 @@
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxprt import brdf
+from jaxprt.brdf.varying import PerVertex
+from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin, subdivision
+from jaxprt.scene.mesh import grid_face, make_mesh
+from jaxprt.scene.subdivision import Edges
+
+
+def watertight(mesh) -> bool:
+    """Whether trimesh finds two triangles at every edge, where vertices at one place count as one."""
+    solid = trimesh.Trimesh(np.asarray(mesh.position), np.asarray(mesh.face), process=False)
+    solid.merge_vertices(merge_tex=True, merge_norm=True)
+    return solid.is_watertight and solid.is_winding_consistent
+
+
+def hanging(mesh) -> int:
+    """How many vertices lie inside of an edge of a triangle: T-junctions."""
+    position = np.unique(np.asarray(mesh.position, np.float64), axis=0)
+    corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)]
+    start, stop = corner.reshape(-1, 3), np.roll(corner, -1, 1).reshape(-1, 3)
+    along = stop - start
+    square = np.sum(along**2, 1)
+    away = position[:, None] - start
+    part = np.sum(away * along, -1) / np.where(square > 0, square, 1)
+    apart = np.linalg.norm(away - part[..., None] * along, axis=-1)
+    return int(np.sum((part > 1e-4) & (part < 1 - 1e-4) & (apart < 1e-6)))
+
+
+def areas(face, corner) -> np.ndarray:
+    a, b, c = np.swapaxes(np.asarray(corner, np.float64)[np.asarray(face)], 0, 1)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
+
+
+def cube():
+    """A cube whose faces have vertices of their own, with creases, on [-1, 1]^3."""
+    box = trimesh.creation.box(extents=[2, 2, 2])
+    position = np.asarray(box.vertices)[np.asarray(box.faces)].reshape(-1, 3)
+    place = position[:, :2] + 0.3 * position[:, 2:]
+    return make_mesh(position, np.arange(36).reshape(-1, 3), texture=place)
+
+
+def random_divisions(mesh, *, passes=4, share=0.1, seed=0) -> list:
+    """Divisions at random edges."""
+    rng = np.random.default_rng(seed)
+    position, face, result = np.asarray(mesh.position), np.asarray(mesh.face), []
+    for _ in range(passes):
+        edges = Edges(position, face)
+        result.append(edges.divide(edges.closed(rng.random(len(edges.length)) < share)))
+        face = result[-1].face
+        position = np.concatenate([position, subdivision.middle(position, result[-1].parent)])
+    return result
+
+
+def angles(mesh) -> np.ndarray:
+    corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)]
+    return trimesh.triangles.angles(corner)
+
+
+@pytest.mark.parametrize("mesh", [cube(), builtin.sphere(rings=6, sectors=9)], ids=["cube", "sphere"])
+def test_a_closed_surface_stays_closed_without_hanging_vertices(mesh):
+    assert watertight(mesh)
+    divided = subdivision.subdivide(mesh, random_divisions(mesh))
+    assert len(divided.face) > 3 * len(mesh.face)
+    assert watertight(divided)
+    assert hanging(divided) == 0
+
+
+def test_surface_and_images_on_it_stay_where_they_are(close):
+    mesh = cube()
+    divisions = random_divisions(mesh)
+    divided = subdivision.subdivide(mesh, divisions)
+    origin = np.arange(len(divisions[-1].face))
+    for each in reversed(divisions):
+        origin = each.origin[origin]
+    place = [np.column_stack([np.asarray(each.texture), np.zeros(len(each.texture))]) for each in (mesh, divided)]
+    for before, after in ((mesh.position, divided.position), place):
+        parts = np.bincount(origin, areas(divided.face, after))
+        close(parts, areas(mesh.face, before), tolerance=1e-6)
+    # The texture is the same function of the place on every side.
+    texture = np.asarray(divided.position)[:, :2] + 0.3 * np.asarray(divided.position)[:, 2:]
+    close(np.asarray(divided.texture), texture)
+
+
+def test_angles_stay_above_half_of_the_smallest():
+    mesh = builtin.sphere(rings=6, sectors=9)
+    divided = subdivision.subdivide(mesh, random_divisions(mesh, passes=7, share=0.02))
+    assert angles(divided).min() > 0.45 * angles(mesh).min()
+
+
+def test_vertices_that_were_there_stay_as_they_are_and_first():
+    mesh = builtin.sphere(rings=6, sectors=9)
+    divided = subdivision.subdivide(mesh, random_divisions(mesh))
+    for field in ("position", "normal", "tangent", "region"):
+        before, after = (np.asarray(getattr(each, field)) for each in (mesh, divided))
+        assert before.dtype == after.dtype
+        np.testing.assert_array_equal(after[: len(before)], before)
+
+
+def test_normals_are_interpolated_as_pictures_do_and_frames_are_orthonormal(close):
+    # A triangle with three different normals: at each added vertex they are mixed by its barycentric weights.
+    normal = np.array([[0.6, 0.8, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.8, 0.6]])
+    position = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]])
+    mesh = make_mesh(position, np.array([[0, 1, 2]]), normal=normal, tangent=np.tile([1.0, 0.2, 0.1], (3, 1)))
+    divided = subdivision.subdivide(mesh, random_divisions(mesh, share=1.0))
+    x, z = np.asarray(divided.position)[:, 0], -np.asarray(divided.position)[:, 2]
+    mixed = np.stack([1 - x - z, x, z], -1) @ normal
+    close(np.asarray(divided.normal), (mixed / np.linalg.norm(mixed, axis=1, keepdims=True)).astype(np.float32))
+    across = np.asarray(divided.tangent)
+    close(np.linalg.norm(across, axis=1), np.ones(len(x), np.float32))
+    assert np.abs(np.sum(across * np.asarray(divided.normal), 1)).max() < 1e-6
+
+
+def test_normals_that_cancel_leave_that_of_the_first_vertex():
+    normal = np.array([[0.0, 1, 0], [0, -1, 0], [0, 1, 0]])
+    mesh = make_mesh(np.eye(3), np.array([[0, 1, 2]]), normal=normal)
+    divided = subdivision.subdivide(mesh, random_divisions(mesh, passes=1, share=1.0))
+    assert np.isfinite(np.asarray(divided.normal)).all()
+    np.testing.assert_array_equal(np.abs(np.asarray(divided.normal)), np.tile([0.0, 1, 0], (6, 1)))
+
+
+def test_a_hanging_vertex_of_the_mesh_is_met_where_it_is_the_middle():
+    # One triangle on one side of an edge, two on the other.
+    position = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 1], [0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 0, -1]])
+    mesh = make_mesh(position, np.array([[0, 2, 1], [3, 4, 6], [4, 5, 6]]))
+    edges = Edges(position, mesh.face)
+    divided = subdivision.subdivide(mesh, [edges.divide(edges.closed(edges.length == 2))])
+    assert hanging(mesh) == 1
+    assert len(divided.position) == 8
+    assert hanging(divided) == 0
+    assert np.sum(np.bincount(Edges(divided.position, divided.face).number.ravel()) == 2) == 4
+
+
+@pytest.mark.parametrize("face", [[[0, 0, 1]], [[0, 1, 2], [0, 1, 3]], [[0, 0, 0]]], ids=["edge", "straight", "point"])
+def test_triangles_without_area_are_divided_too(face):
+    position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [1, 0, 0]])
+    mesh = make_mesh(position, np.array(face))
+    divided = subdivision.subdivide(mesh, random_divisions(mesh, passes=3, share=1.0))
+    assert all(np.isfinite(np.asarray(getattr(divided, name))).all() for name in ("position", "normal", "tangent"))
+    assert np.sum(areas(divided.face, divided.position)) == pytest.approx(np.sum(areas(face, position)))
+    assert len(divided.position) > 4 or face == [[0, 0, 0]]
+
+
+def test_points_stay_where_they_are():
+    mesh = builtin.sphere(rings=4, sectors=5)
+    points = subdivision.scatter(np.arange(len(mesh.face)) % 4)
+    position, face, divisions = np.asarray(mesh.position, np.float64), np.asarray(mesh.face), random_divisions(mesh)
+    place = np.einsum("pk,pkc->pc", points.weight, position[face[points.triangle]])
+    triangle = points.triangle
+    for division in divisions:
+        points = subdivision.relocate(points, face, division)
+        np.testing.assert_array_equal(division.origin[points.triangle], triangle)
+        face, triangle = division.face, points.triangle
+        position = np.concatenate([position, subdivision.middle(position, division.parent)])
+    assert points.weight.min() > -1e-9
+    moved = np.einsum("pk,pkc->pc", points.weight, position[face[triangle]])
+    np.testing.assert_allclose(moved, place, atol=1e-12)
+
+
+def test_scattered_points_fill_a_triangle_evenly():
+    points = subdivision.scatter(np.array([0, 400]))
+    assert np.all(points.triangle == 1)
+    assert points.weight.min() > 0
+    # Moments of the uniform distribution: mean 1/3, mean square 1/6.
+    np.testing.assert_allclose(points.weight.mean(0), 1 / 3, atol=2e-3)
+    np.testing.assert_allclose((points.weight**2).mean(0), 1 / 6, atol=2e-3)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Two parts that share a border, the first with colors, a second set of coordinates and mirrored textures."""
+    u, v = (each.ravel() for each in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 1, 3), indexing="xy"))
+    position = np.stack([u, 0 * u, -v], -1)
+    face = grid_face(rows=3, columns=4)[:, ::-1]
+    place = np.stack([u, v], -1).astype(np.float32)
+    left = make_mesh(position, face, texture=place)
+    right = make_mesh(position + [1, 0, 0], face)
+    image = Texture(np.random.default_rng(0).random((4, 4, 3), np.float32))
+    first = Part(
+        "left",
+        left,
+        TexturedMaterial(base_color_texture=image),
+        color=jnp.asarray(np.stack([u, v, u + v], -1), jnp.float32),
+        second=jnp.asarray(3 * place[:, ::-1] + 1),
+        handedness=jnp.asarray(np.where(u < 0.5, -1.0, 1.0), jnp.float32),
+    )
+    light = Environment(jnp.ones((6, 1, 1, 3)))
+    camera = Camera([0, 1, 0], [0, 0, 0], [0, 0, 1], 0.5, 8, 8)
+    return Scene([Part("right", right, brdf.Lambert(0.5)), first], [camera], [light])
+
+
+def test_parts_keep_what_belongs_to_them_and_share_their_border(scene, close):
+    divided = subdivision.subdivide_scene(scene, random_divisions(scene.mesh, passes=3))
+    assert [part.name for part in divided.parts] == ["right", "left"]
+    assert eqx.tree_equal(divided.cameras, scene.cameras)
+    assert eqx.tree_equal(divided.environments, scene.environments)
+    left, right = divided["left"], divided["right"]
+    assert left.material is scene["left"].material
+    assert right.color is right.second is right.handedness is right.mesh.texture is None
+    u, v = np.asarray(left.mesh.position)[:, 0], -np.asarray(left.mesh.position)[:, 2]
+    close(np.asarray(left.color), np.stack([u, v, u + v], -1))
+    close(np.asarray(left.mesh.texture), np.stack([u, v], -1))
+    close(np.asarray(left.second), 3 * np.stack([v, u], -1) + 1)
+    assert set(np.asarray(left.handedness)) == {-1.0, 1.0}
+    np.testing.assert_array_equal(np.asarray(left.handedness)[:12], np.asarray(scene["left"].handedness))
+    assert hanging(divided.mesh) == 0
+    border = [np.asarray(part.mesh.position) for part in divided.parts]
+    ends = [set(map(tuple, each[each[:, 0] == 1])) for each in border]
+    assert ends[0] == ends[1]
+    assert len(ends[0]) > 3
+    together = subdivision.subdivide(scene.mesh, random_divisions(scene.mesh, passes=3))
+    assert len(divided.mesh.face) == len(together.face)
+    assert sum(areas(divided.mesh.face, divided.mesh.position)) == pytest.approx(2)
+
+
+def test_no_edge_is_longer_than_asked(scene):
+    divided = subdivision.divide(scene, edge=0.2)
+    corner = np.asarray(divided.mesh.position)[np.asarray(divided.mesh.face)]
+    longest = np.linalg.norm(corner - np.roll(corner, 1, 1), axis=-1).max()
+    assert 0.1 < longest <= 0.2
+    assert hanging(divided.mesh) == 0
+    assert subdivision.divide(scene, edge=10.0) is scene
+
+
+@pytest.mark.parametrize("edge", [0.0, -1.0, np.nan, np.inf])
+def test_edges_without_a_length_are_refused(scene, edge):
+    with pytest.raises(ValueError, match="edge must be positive and finite, got"):
+        subdivision.divide(scene, edge=edge)
+
+
+def test_what_cannot_be_divided_is_refused(scene, unchecked):
+    with pytest.raises(TypeError, match="the scene must be of class Scene, which"):
+        subdivision.divide(scene.mesh, edge=1.0)
+    varying = PerVertex(brdf.Lambert(jnp.full((12,), 0.5)))
+    broken = dataclasses.replace(scene.parts[0], material=varying)
+    with pytest.raises(TypeError, match="part 'right' must be one BRDF for all vertices or a TexturedMaterial"):
+        subdivision.divide(Scene([broken]), edge=1.0)
