@@ -60,6 +60,8 @@ HOST = {
     "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
     "visibility.rays": "traces rays",
     "visibility.blocks": "runs workers and writes files",
+    "visibility.refinement": "traces rays, and chooses by values",
+    "visibility.diffuse": "traces rays",
     "systems.separable.wavelets.precompute": "traces rays",
     "visibility.stored.precompute": "traces rays",
     "systems.lobe.pyramid.precompute": "traces rays",

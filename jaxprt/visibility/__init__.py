@@ -1,8 +1,9 @@
-"""What vertices see of the distant sphere: rays, hits, stored visibility, and the loop over blocks."""
+"""What vertices see of the distant sphere: rays, hits, stored visibility, the loop over blocks, and refinement."""
 
-from jaxprt.visibility import blocks, hits, points, rays, stored
+from jaxprt.visibility import blocks, diffuse, hits, points, rays, refinement, stored
 from jaxprt.visibility.points import point_starts
 from jaxprt.visibility.rays import LEVELS, Occluder, exhaustive, fractional, start_points
+from jaxprt.visibility.refinement import refine
 from jaxprt.visibility.stored import StoredVisibility, precompute
 
 __all__ = [
@@ -10,6 +11,7 @@ __all__ = [
     "Occluder",
     "StoredVisibility",
     "blocks",
+    "diffuse",
     "exhaustive",
     "fractional",
     "hits",
@@ -17,6 +19,8 @@ __all__ = [
     "points",
     "precompute",
     "rays",
+    "refine",
+    "refinement",
     "start_points",
     "stored",
 ]

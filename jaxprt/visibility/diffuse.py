@@ -1,0 +1,110 @@
+"""What a white diffuse surface reflects of distant light, at any point of the surface."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from jaxprt.scene import subdivision
+from jaxprt.scene.light_samples import LightSamples
+from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility.rays import Occluder, start_points
+
+_RAYS = 1 << 17  # rays in one call: what a core's cache holds
+
+
+class DiffuseTracer:
+    """Traces light at points of a surface while the surface is divided.
+
+    Args:
+        mesh: The surface, before it is divided.
+        occluder: What casts shadows; it may have some or all triangles of the surface.
+        samples: The light.
+        pool: Where rays are traced.
+
+    Attributes:
+        nudge: How far from the surface rays start.
+        casts: Which triangles of the surface are in the occluder.
+        double: Which triangles of the surface have the same corners as another one: the two sides of a sheet.
+    """
+
+    casts: Bool[np.ndarray, " f"]
+    double: Bool[np.ndarray, " f"]
+
+    def __init__(self, mesh: Mesh, occluder: Mesh, samples: LightSamples, pool: ThreadPoolExecutor):
+        self._samples, self._pool = samples, pool
+        # In NumPy, so that shapes do not compile.
+        mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
+        self._mesh, self._rays = mesh, Occluder(occluder)
+        self.nudge = self._rays.nudge
+        count = len(mesh.face)
+        corner = np.concatenate([mesh.face, occluder.face + len(mesh.position)])
+        place = subdivision.places(np.concatenate([mesh.position, occluder.position]))
+        _, alike = np.unique(np.sort(place[corner], 1), axis=0, return_inverse=True)
+        own, other = np.split(alike.ravel(), [count])
+        self.casts = np.isin(own, other)
+        self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
+        self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
+
+    def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
+        """Light at the vertices of the surface before it is divided."""
+        return self._light(start_points(self._mesh, self._rays), np.asarray(self._mesh.normal, np.float64))
+
+    def at(
+        self,
+        position: Float[np.ndarray, "v 3"],
+        normal: Float[np.ndarray, "v 3"],
+        around: Int[np.ndarray, "n 3"],
+        casting: Int[np.ndarray, "m 3"],
+        vertex: Int[np.ndarray, " p"],
+    ) -> Float32[np.ndarray, "p l c"]:
+        """Light at some vertices of the divided surface.
+
+        Args:
+            position: Positions of all vertices.
+            normal: Their normals, of any length.
+            around: All triangles around the vertices that are asked for.
+            casting: What those triangles of the surface that are in the occluder have become.
+            vertex: The vertices.
+
+        Returns:
+            Light for each source and color of the samples.
+        """
+        if not vertex.size:
+            return np.zeros((0, *self._samples.weight.shape[1:]), np.float32)
+        used, index = np.unique(np.concatenate([around.ravel(), vertex]), return_inverse=True)
+        mesh = _mesh(position[used], index[: around.size].reshape(-1, 3), normal[used])
+        other = self._other
+        place, face = (
+            np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
+        )
+        start = start_points(mesh, Occluder(_mesh(place, face)))
+        return self._light(start[index[around.size :]], normal[vertex])
+
+    def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Light that a surface of some normals reflects where rays start."""
+        direction, weight = self._samples
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        upright = (normal / np.where(length > 0, length, 1)).astype(np.float32)
+        result = np.empty((len(start), *weight.shape[1:]), np.float32)
+        step = max(1, _RAYS // len(weight))
+
+        def fill(part: slice) -> None:
+            cosine = np.maximum(upright[part] @ direction.T, 0)
+            point, way = np.nonzero(cosine)
+            blocked = self._rays.blocked(start[part][point], direction[way])
+            cosine[point[blocked], way[blocked]] = 0
+            result[part] = (cosine @ weight.reshape(len(weight), -1)).reshape(-1, *weight.shape[1:])
+
+        list(self._pool.map(fill, (slice(first, first + step) for first in range(0, len(start), step))))
+        return result
+
+
+def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray | None = None) -> Mesh:
+    """A mesh in NumPy arrays, so that new shapes do not compile, with what `start_points` and `Occluder` look at."""
+    upright = np.zeros_like(position) if normal is None else normal
+    fields = position.astype(np.float32), face.astype(np.int32), upright.astype(np.float32)
+    place, corner, upright = (jax.device_put(each) for each in fields)
+    region = jax.device_put(np.zeros(len(position), np.int32))
+    return jax.tree.map(np.asarray, Mesh(place, corner, upright, upright, region))
