@@ -17,7 +17,7 @@ Conventions, everywhere in this package:
 """
 
 from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, visibility
-from jaxprt.relit import RelitScene, plan, precompute
+from jaxprt.relit import RelitScene, plan, precompute, refine
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
@@ -48,6 +48,7 @@ __all__ = [
     "precompute",
     "radiance",
     "reference",
+    "refine",
     "relit",
     "scene",
     "separable",

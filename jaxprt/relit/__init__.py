@@ -1,9 +1,10 @@
 """Scenes made ready to be relit, by any of the systems."""
 
-from jaxprt.relit import build, channels, measuring, planning, recipes, scene
+from jaxprt.relit import build, channels, measuring, planning, recipes, refinement, scene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
+from jaxprt.relit.refinement import refine
 from jaxprt.relit.scene import RelitScene
 
 __all__ = [
@@ -20,5 +21,7 @@ __all__ = [
     "planning",
     "precompute",
     "recipes",
+    "refine",
+    "refinement",
     "scene",
 ]

@@ -1,0 +1,80 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.brdf.varying import PerVertex
+from jaxprt.scene import Part, Scene, TexturedMaterial
+from jaxprt.scene.mesh import make_mesh
+from jaxprt.scene.shapes import assemble, patch
+
+
+def square(low, high, height):
+    return assemble(
+        [patch([[[low, height, -1], [high, height, -1]], [[low, height, 1], [high, height, 1]]], rows=1, columns=1)]
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A ground of two parts, the first with colors, and a lid above the border between them."""
+    left = square(-1, 0, 0)
+    red = Part("left", left, TexturedMaterial(), color=1 + left.position)
+    parts = [
+        red,
+        Part("right", square(0, 1, 0), prt.brdf.Lambert(0.5)),
+        Part("lid", square(-0.3, 0.3, 0.3), prt.brdf.Lambert(0.2)),
+    ]
+    camera = prt.Camera([0, 3, 0.1], [0, 0, 0], [0, 0, -1], 0.6, 16, 16)
+    return Scene(parts, [camera])
+
+
+@pytest.fixture(scope="module")
+def light() -> prt.Environment:
+    return prt.scene.builtin.daylight(size=8)
+
+
+def test_parts_cast_shadows_on_each_other_and_are_divided_alike_at_their_border(scene, light, close):
+    fine = prt.refine(scene, error=0.05, vertices=2000, environments=[light], progress=False)
+    assert [part.name for part in fine.parts] == ["left", "right", "lid"]
+    assert [part.material for part in fine.parts] == [part.material for part in scene.parts]
+    assert fine.cameras == scene.cameras
+    counts = [len(part.mesh.position) for part in fine.parts]
+    assert min(counts[:2]) > 10
+    assert sum(counts) < 2000
+    border = [np.asarray(fine[name].mesh.position) for name in ("left", "right")]
+    border = [set(map(tuple, each[each[:, 0] == 0])) for each in border]
+    assert border[0] == border[1]
+    assert len(border[0]) > 4
+    close(np.asarray(fine["left"].color), 1 + np.asarray(fine["left"].mesh.position))
+
+
+def test_a_refined_scene_can_be_relit_as_any_other(scene, light):
+    fine = prt.refine(scene, error=0.1, environments=[light], progress=False)
+    recipe = prt.relit.Harmonics(degree=1)
+    relit = prt.precompute(fine, system=recipe, size=8, progress=False)
+    color = relit.radiance(light, eye=relit.camera.eye)
+    assert len(color) == len(fine.mesh.position) > len(scene.mesh.position)
+    assert np.isfinite(np.asarray(color)).all()
+
+
+def test_without_lights_any_light_counts(scene):
+    fine = prt.refine(scene, error=0.02, vertices=1000, progress=False)
+    assert len(fine.mesh.position) > len(scene.mesh.position) + 10
+
+
+def test_an_open_scene_stays_as_it_is(light):
+    alone = Scene([Part("ground", square(-1, 1, 0), prt.brdf.Lambert(0.5))])
+    assert prt.refine(alone, error=0.0, vertices=50, environments=[light], progress=False) is alone
+
+
+def test_what_is_no_scene_is_refused(scene, light, unchecked):
+    with pytest.raises(TypeError, match="the scene must be of class Scene"):
+        prt.refine(scene.mesh)
+    with pytest.raises(TypeError, match="environments must be a list of lights, got one Environment"):
+        prt.refine(scene, environments=light)
+    varying = Part(
+        "varying", make_mesh(np.eye(3), np.array([[0, 1, 2]])), PerVertex(prt.brdf.Lambert(jnp.full((3,), 0.5)))
+    )
+    with pytest.raises(TypeError, match="part 'varying' must be one BRDF for all vertices"):
+        prt.refine(Scene([varying]), error=1.0, progress=False)
