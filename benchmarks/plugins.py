@@ -1,11 +1,15 @@
 """Materials of jaxprt as plugins of Mitsuba 3: the formulas in the docstrings of `jaxprt.brdf`, with none of its code.
 
-Directions are drawn half by the cosine, half as mirrored at a half vector of the model's own distribution. Parameters
-are Mitsuba's, so that `mitsuba.traverse` finds them and its gradients reach them. Those of metallic-roughness materials
-are Mitsuba's textures: constants, or attributes of the vertices.
+Directions are drawn by the cosine, or as mirrored at a half vector of the model's own distribution (of GGX: at a normal
+that is visible from the eye), in about the shares of the light that both reflect. Denoisers get the color of all that
+is reflected as albedo.
+
+Parameters are Mitsuba's, so that `mitsuba.traverse` finds them and its gradients reach them. Those of
+metallic-roughness materials are Mitsuba's textures: constants, or attributes of the vertices.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,7 @@ from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughne
 from jaxprt.brdf.varying import PerVertex
 
 _SMOOTHEST = 1e-3  # least roughness, and least alpha of GGX, as jaxprt.brdf has it
+_GLOSSY = 0.5  # least share of samples by half vectors: a faint highlight is bright where it is
 TANGENT = "vertex_tangent"  # attribute of shapes
 
 
@@ -73,18 +78,33 @@ def _constant(value: np.ndarray) -> dict[str, Any]:
     return {"type": "srgb", "color": [float(each) for each in value]}
 
 
-def _modules() -> tuple[Any, Any]:
-    """Imported when used: not every machine has them, and what they contain depends on the variant."""
+def modules() -> tuple[Any, Any]:
+    """Dr.Jit and Mitsuba, imported when used: not every machine has them, and the variant decides what they hold."""
     import drjit
     import mitsuba
 
     return drjit, mitsuba
 
 
-@functools.cache
+def per_variant(make: Callable[[], Any]) -> Callable[[], Any]:
+    """Has a function make a class when it is first used, once for each variant of Mitsuba, of which it inherits."""
+    made: dict[str, Any] = {}
+
+    @functools.wraps(make)
+    def get() -> Any:
+        _, mitsuba = modules()
+        variant = mitsuba.variant()
+        if variant not in made:
+            made[variant] = make()
+        return made[variant]
+
+    return get
+
+
+@per_variant
 def _glossy() -> Any:
-    """The class of both models: made once, and only when a variant is set, of which it inherits."""
-    drjit, mitsuba = _modules()
+    """The class of all models."""
+    drjit, mitsuba = modules()
 
     class Glossy(mitsuba.BSDF):
         colors: tuple[str, ...]
@@ -104,14 +124,18 @@ def _glossy() -> Any:
             self.m_flags = self.m_components[0]
 
         def at(self, si) -> Any:
-            """The material at a point: an object with `half`, `density` and `value`."""
+            """The material at a point: an object with the methods below, up to `value`."""
             return self
 
-        def half(self, u):
+        def albedos(self, wi):
+            """Colors of the gloss and of the matte base seen from a direction, about."""
+            raise NotImplementedError
+
+        def half(self, u, wi):
             """A half vector of its distribution."""
             raise NotImplementedError
 
-        def density(self, half):
+        def density(self, half, wi, cos_d):
             """Of half vectors, by solid angle."""
             raise NotImplementedError
 
@@ -125,10 +149,10 @@ def _glossy() -> Any:
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             to, back = self.frame(si)
-            wi, half = to(si.wi), self.at(si).half(sample2)
-            matte = mitsuba.warp.square_to_cosine_hemisphere(sample2)
+            wi, here = to(si.wi), self.at(si)
+            half, matte = here.half(sample2, wi), mitsuba.warp.square_to_cosine_hemisphere(sample2)
             result = drjit.zeros(mitsuba.BSDFSample3f)
-            result.wo = back(drjit.select(sample1 < 0.5, matte, 2 * drjit.dot(half, wi) * half - wi))
+            result.wo = back(drjit.select(sample1 < chance(here, wi), 2 * drjit.dot(half, wi) * half - wi, matte))
             result.eta, result.sampled_component = 1.0, 0
             result.sampled_type = mitsuba.UInt32(+mitsuba.BSDFFlags.GlossyReflection)
             value, result.pdf = self.eval_pdf(ctx, si, result.wo, active)
@@ -142,7 +166,7 @@ def _glossy() -> Any:
             half = drjit.normalize(wi + wo)
             cos_d = drjit.dot(half, wo)
             value = here.value(wi, wo, half, cos_d) * wo.z
-            pdf = (wo.z / drjit.pi + here.density(half) / (4 * cos_d)) / 2
+            pdf = drjit.lerp(wo.z / drjit.pi, here.density(half, wi, cos_d) / (4 * cos_d), chance(here, wi))
             return drjit.select(lit, value, 0), drjit.select(lit, pdf, 0)
 
         def eval(self, ctx, si, wo, active=True):
@@ -151,6 +175,10 @@ def _glossy() -> Any:
         def pdf(self, ctx, si, wo, active=True):
             return self.eval_pdf(ctx, si, wo, active)[1]
 
+        def eval_diffuse_reflectance(self, si, active=True):
+            gloss, base = self.at(si).albedos(mitsuba.Vector3f(0, 0, 1))
+            return drjit.minimum(gloss + base, 1)
+
         def traverse(self, callback):
             for name in self.colors + self.scalars:
                 callback.put(name, getattr(self, name), mitsuba.ParamFlags.Differentiable)
@@ -158,12 +186,23 @@ def _glossy() -> Any:
         def to_string(self):
             return type(self).__name__
 
+    def chance(here, wi):
+        """Share of samples by half vectors."""
+        gloss, base = (drjit.mean(each) for each in here.albedos(wi))
+        return drjit.maximum(gloss / drjit.maximum(gloss + base, 1e-6), _GLOSSY)
+
     return Glossy
+
+
+def _schlick(f0, cosine):
+    """Fresnel reflectance towards 1 at grazing angles."""
+    drjit, _ = modules()
+    return f0 + (1 - f0) * (1 - drjit.clip(cosine, 0, 1)) ** 5
 
 
 def _tangent_frame(si, rotation=0.0) -> tuple[Any, Any]:
     """Directions from the shading frame to that of the tangent, turned counterclockwise about the normal, and back."""
-    drjit, mitsuba = _modules()
+    drjit, mitsuba = modules()
     # Interpolated as the attribute of vertices is, and square to the normal.
     tangent = si.shape.eval_attribute_3(TANGENT, si)
     x = si.to_local(mitsuba.Vector3f(tangent.x, tangent.y, tangent.z))
@@ -179,9 +218,9 @@ def _tangent_frame(si, rotation=0.0) -> tuple[Any, Any]:
     )
 
 
-@functools.cache
+@per_variant
 def _cook_torrance() -> Any:
-    drjit, mitsuba = _modules()
+    drjit, mitsuba = modules()
 
     class Model(_glossy()):
         colors, scalars = ("diffuse", "specular", "f0"), ("roughness",)
@@ -191,7 +230,10 @@ def _cook_torrance() -> Any:
             self.roughness = drjit.maximum(self.roughness, _SMOOTHEST)
             drjit.make_opaque(self.roughness)
 
-        def half(self, u):
+        def albedos(self, wi):
+            return self.specular * _schlick(self.f0, wi.z), self.diffuse
+
+        def half(self, u, wi):
             # Half vectors with tan^2 = -m^2 log(u) have the density D times their cosine.
             tangent = self.roughness * drjit.safe_sqrt(-drjit.log(1 - u.x))
             sine, cosine = drjit.sincos(2 * drjit.pi * u.y)
@@ -201,20 +243,20 @@ def _cook_torrance() -> Any:
             tilt = (half.x**2 + half.y**2) / (self.roughness * half.z) ** 2
             return drjit.exp(-tilt) / (drjit.pi * self.roughness**2 * half.z**4)
 
-        def density(self, half):
+        def density(self, half, wi, cos_d):
             return self.distribution(half) * half.z
 
         def value(self, wi, wo, half, cos_d):
             g = drjit.minimum(1, 2 * half.z * drjit.minimum(wi.z, wo.z) / cos_d)
-            f = self.f0 + (1 - self.f0) * (1 - cos_d) ** 5
-            return (self.diffuse + self.specular * (self.distribution(half) * g / (wi.z * wo.z)) * f) / drjit.pi
+            lobe = self.distribution(half) * g / (wi.z * wo.z) * _schlick(self.f0, cos_d)
+            return (self.diffuse + self.specular * lobe) / drjit.pi
 
     return Model
 
 
-@functools.cache
+@per_variant
 def _ashikhmin_shirley() -> Any:
-    drjit, mitsuba = _modules()
+    drjit, mitsuba = modules()
 
     class Model(_glossy()):
         colors, scalars = ("diffuse", "specular"), ("nu", "nv")
@@ -222,7 +264,10 @@ def _ashikhmin_shirley() -> Any:
         def frame(self, si):
             return _tangent_frame(si)
 
-        def half(self, u):
+        def albedos(self, wi):
+            return _schlick(self.specular, wi.z), self.diffuse * (1 - self.specular)
+
+        def half(self, u, wi):
             # Equations 9 and 10, over all four quadrants at once.
             sine, cosine = drjit.sincos(2 * drjit.pi * u.x)
             x, y = cosine * drjit.sqrt(self.nv + 1), sine * drjit.sqrt(self.nu + 1)
@@ -232,7 +277,10 @@ def _ashikhmin_shirley() -> Any:
             flat = drjit.safe_sqrt(1 - z**2)
             return mitsuba.Vector3f(flat * x, flat * y, z)
 
-        def density(self, half):
+        def density(self, half, wi, cos_d):
+            return self.distribution(half)
+
+        def distribution(self, half):
             slope = half.x**2 + half.y**2
             exponent = (self.nu * half.x**2 + self.nv * half.y**2) / drjit.maximum(slope, 1e-12)
             peak = drjit.sqrt((self.nu + 1) * (self.nv + 1)) / (2 * drjit.pi)
@@ -241,17 +289,16 @@ def _ashikhmin_shirley() -> Any:
             return peak * drjit.exp(exponent * log)
 
         def value(self, wi, wo, half, cos_d):
-            f = self.specular + (1 - self.specular) * (1 - cos_d) ** 5
-            lobe = self.density(half) / (4 * cos_d * drjit.maximum(wi.z, wo.z)) * f
+            lobe = self.distribution(half) / (4 * cos_d * drjit.maximum(wi.z, wo.z)) * _schlick(self.specular, cos_d)
             base = (1 - (1 - wi.z / 2) ** 5) * (1 - (1 - wo.z / 2) ** 5)
             return lobe + 28 / (23 * drjit.pi) * self.diffuse * (1 - self.specular) * base
 
     return Model
 
 
-@functools.cache
+@per_variant
 def _metallic_roughness() -> Any:
-    drjit, mitsuba = _modules()
+    drjit, mitsuba = modules()
 
     class Point:
         """The material at the points of a surface interaction."""
@@ -262,31 +309,38 @@ def _metallic_roughness() -> Any:
             self.across = drjit.maximum(parameter["roughness"].eval_1(si) ** 2, _SMOOTHEST)
             self.along = self.across + (1 - self.across) * parameter["anisotropy"].eval_1(si) ** 2
 
-        def half(self, u):
-            # Walter et al. 2007, equation 35, of the unstretched distribution.
-            slope = drjit.sqrt(u.x / drjit.maximum(1 - u.x, 1e-7))
-            sine, cosine = drjit.sincos(2 * drjit.pi * u.y)
-            return drjit.normalize(mitsuba.Vector3f(self.along * slope * cosine, self.across * slope * sine, 1))
+        def albedos(self, wi):
+            layer = _schlick(self.f0, wi.z)
+            under = (1 - self.specular * drjit.max(layer)) * self.base
+            gloss = drjit.lerp(self.specular * layer, _schlick(self.base, wi.z), self.metallic)
+            return gloss, (1 - self.metallic) * under
+
+        def half(self, u, wi):
+            # Dupuy and Benyoub 2023, "Sampling visible GGX normals with spherical caps".
+            eye = drjit.normalize(mitsuba.Vector3f(self.along * wi.x, self.across * wi.y, wi.z))
+            z = drjit.fma(1 - u.y, 1 + eye.z, -eye.z)
+            flat = drjit.safe_sqrt(1 - z**2)
+            sine, cosine = drjit.sincos(2 * drjit.pi * u.x)
+            x, y, z = flat * cosine + eye.x, flat * sine + eye.y, z + eye.z
+            return drjit.normalize(mitsuba.Vector3f(self.along * x, self.across * y, drjit.maximum(z, 1e-7)))
 
         def distribution(self, half):
             tilt = (half.x / self.along) ** 2 + (half.y / self.across) ** 2 + half.z**2
             return 1 / (drjit.pi * self.along * self.across * tilt**2)
 
-        def density(self, half):
-            return self.distribution(half) * half.z
+        def stretched(self, w):
+            return drjit.sqrt((self.along * w.x) ** 2 + (self.across * w.y) ** 2 + w.z**2)
+
+        def density(self, half, wi, cos_d):
+            return 2 * cos_d * self.distribution(half) / (wi.z + self.stretched(wi))
 
         def value(self, wi, wo, half, cos_d):
-            def stretched(w):
-                return drjit.sqrt((self.along * w.x) ** 2 + (self.across * w.y) ** 2 + w.z**2)
-
-            w = (1 - drjit.minimum(cos_d, 1)) ** 5
-            visible = 0.5 / (wo.z * stretched(wi) + wi.z * stretched(wo))
+            visible = 0.5 / (wo.z * self.stretched(wi) + wi.z * self.stretched(wo))
             lobe = self.distribution(half) * visible
-            layer = self.f0 + (1 - self.f0) * w
+            layer = _schlick(self.f0, cos_d)
             under = 1 - self.specular * drjit.max(layer)
             dielectric = self.specular * layer * lobe + under * self.base / drjit.pi
-            metal = (self.base + (1 - self.base) * w) * lobe
-            return (1 - self.metallic) * dielectric + self.metallic * metal
+            return (1 - self.metallic) * dielectric + self.metallic * _schlick(self.base, cos_d) * lobe
 
     class Model(_glossy()):
         colors, scalars = (), ()

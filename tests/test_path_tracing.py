@@ -26,6 +26,7 @@ SHARP = (
     *(AshikhminShirley([0.4, 0.2, 0.1], [0.1, 0.3, 0.2], nu, nv) for nu, nv in ((20.0, 150.0), (8.0, 2.0))),
     MetallicRoughness([0.8, 0.4, 0.2], 0.5, 0.4),
     MetallicRoughness([0.8, 0.4, 0.2], 0.2, 0.5, 1.7, 0.6, [1.0, 0.5, 0.3], anisotropy=0.6, rotation=0.4),
+    MetallicRoughness([0.8, 0.4, 0.2], 1.0, 0.35),
 )
 
 
@@ -106,6 +107,31 @@ def test_samples_follow_their_density_and_weigh_the_albedo(plugin, material, ang
     assert abs(density @ area - above.mean()) < 2e-3
     np.testing.assert_allclose((direction * above).mean(1), wo.T @ (density * area), atol=4e-3)
     np.testing.assert_allclose(weight.mean(1), value @ area, rtol=6e-3)
+
+
+def test_no_sample_of_a_metal_weighs_more_than_its_color_at_grazing_angles(plugin):
+    # A visible normal leaves only the masking of the other direction, however sharp the metal and low the eye.
+    material = MetallicRoughness([1.0, 0.6, 0.2], 1.0, 0.1, anisotropy=0.5)
+    for angle in (0.02, 1.0, 1.4, 1.55):
+        mitsuba, bsdf, seen = plugin(material, inclined(angle))
+        random = np.random.default_rng(0).random((3, 1 << 12), np.float32)
+        _, weight = bsdf.sample(mitsuba.BSDFContext(), seen, mitsuba.Float(random[0]), mitsuba.Point2f(random[1:]))
+        assert np.array(weight).max() < 1 + 1e-4
+        assert np.array(weight)[0].mean() > 0.85
+
+
+@pytest.mark.parametrize(
+    ("material", "expected"),
+    [
+        (MATERIALS[0], [0.4 + 0.5 * 0.1, 0.2 + 0.6 * 0.3, 0.1 + 0.7 * 0.2]),
+        (MATERIALS[1], [0.5 + 0.3 * 0.5] * 3),
+        (MetallicRoughness([0.8, 0.4, 0.2], 1.0, 0.4), [0.8, 0.4, 0.2]),
+        (MetallicRoughness([0.8, 0.4, 0.2], 0.0, 0.4), 0.04 + 0.96 * np.array([0.8, 0.4, 0.2])),
+    ],
+)
+def test_denoisers_get_the_color_of_all_that_is_reflected(plugin, material, expected):
+    _, bsdf, seen = plugin(material, inclined(1.0))
+    np.testing.assert_allclose(np.array(bsdf.eval_diffuse_reflectance(seen)).ravel(), expected, rtol=1e-5)
 
 
 def test_back_of_material_is_black(plugin):
