@@ -12,6 +12,7 @@ Lines of Mitsuba have its picture by `samples` samples per pixel, bare and denoi
 normals, a larger network), compiling left out. Lines of ours name it as their peer: `peer_seconds` is the time at which
 the denoised pictures have the error of ours, so that `ratio` is at equal error. `peer_time` says how it was found:
 "interpolated" on the curve, "extrapolated" past its end, or "cheapest" where the fastest picture is no worse.
+`light_seconds` are of a new light for a view that stays.
 
 Meshes and lights are those of JAXPRT_DATA. What is precomputed and the converged pictures are kept in the store.
 """
@@ -24,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import denoised, harness
-from benchmarks.scenes import averaged, file_name, finer
+from benchmarks.scenes import file_name
 from jaxprt import RelitScene, files, image, memory, precompute
 from jaxprt.brdf import AshikhminShirley, Lambert, MetallicRoughness
-from jaxprt.relit import Harmonics, Lobes, Terms
+from jaxprt.relit import Harmonics, Lobes, Terms, refine
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, builtin, load_environment, load_mesh
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import ground_plane
@@ -37,6 +38,7 @@ SAMPLES = (1, 4, 16, 64, 256)
 # Of the converged picture: relative L2, a third of the largest error that ours should have; and the most samples.
 NOISE, NOISE_ELSEWHERE, MOST = {"grace": 0.01, "eucalyptus": 0.01}, 0.0066, 8192
 GROUND = 10000  # vertices
+REFINED = 0.01  # error of shadows on meshes that are refined
 MESHES = {"spot": ("spot.obj", 2.6), "rocker arm": ("rocker_arm.ply", 0.5), "bunny": ("stanford_bunny.ply", 0.35)}
 LIGHTS = {
     "grace": "grace_cross.hdr",
@@ -129,10 +131,16 @@ def systems(quick: bool) -> dict[str, Any]:
 
 
 def relit(case: Case, recipe: Any, path: pathlib.Path | None) -> Iterator[tuple[str, RelitScene, Callable]]:
-    """Where radiance is computed, the relit scene, and the function of no arguments that makes its picture."""
-    size = case.light.radiance.shape[-2]
+    """Where radiance is made, the relit scene, and the function of no arguments that makes its picture."""
+    size, light, camera = case.light.radiance.shape[-2], case.light, case.camera
     made = precompute(case.scene, system=recipe, size=size, path=path, progress=False)
-    yield "vertices", made, lambda: averaged(made.picture(case.light, finer(case.camera)))
+    yield "vertices", made, lambda: image.render(made.mesh, made.radiance(light, eye=camera.eye), camera)
+    yield "pixels", made, lambda: made.picture(light, camera)
+    if isinstance(recipe, Lobes):
+        finer = refine(case.scene, environments=[light], error=REFINED, progress=False)
+        divided = path and path.with_name(f"{path.name}_refined")
+        shadows = precompute(finer, system=recipe, size=size, path=divided, progress=False)
+        yield "pixels, refined", shadows, lambda: shadows.picture(light, camera)
 
 
 def measure(case: Case, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None) -> Iterator[dict]:
@@ -154,18 +162,25 @@ def measure(case: Case, quick: bool, store: pathlib.Path | None, pictures: pathl
         path = store and store / file_name(*case.names, system)
         for where, made, draw in relit(case, recipe, path):
             timing, drawn = harness.measure(draw, repeats=3 if quick else 9), np.asarray(draw())
+            more = {} if where == "vertices" else {"light_seconds": new_light(case, made, 3 if quick else 9)}
             error = truth.error(drawn)
             seconds, how = denoised.seconds_at(max(error, 1e-6), smooth)
             yield {
                 **line(case, system, f"{system} at {where}", timing, truth, drawn, memory(made)),
                 **{"where": where, "peer": "mitsuba, denoised", "peer_seconds": seconds, "peer_error": error},
-                **{"peer_time": how, "variant": seen.variant},
+                **{"peer_time": how, "variant": seen.variant, "vertices": made.vertices, **more},
             }
             if pictures is not None:
                 write(pictures / f"{file_name(*case.names, system, where)}.png", drawn, truth)
     if pictures is not None:
         for point in curve:
             write(pictures / f"{file_name(*case.names, point.method, str(point.samples))}.png", point.picture, truth)
+
+
+def new_light(case: Case, made: RelitScene, repeats: int) -> float:
+    """Seconds of a picture in a new light, of a view that stays."""
+    kept = made.picture_view(case.camera)
+    return harness.measure(lambda: kept.picture(case.light), repeats=repeats).seconds
 
 
 def line(

@@ -6,10 +6,11 @@ Scenes are glTF files of JAXPRT_DATA, one of them also with its triangles divide
 `seconds` are of a picture: light, view and materials redone, and drawing. `bytes` are what the system holds.
 
 Mitsuba gets the same surfaces, and the same materials as a plugin, with their parameters interpolated between the
-vertices; triangles with textures are divided for it until they are as small as pixels. Direct light alone. `peer_error` is the noise of one of its pictures, relative L2, from two of unlike seeds;
-`peer_seconds` is the time of one. `error` is the relative L2 of ours against both, in whose product their noise has no
-part. `bias` is the error of the sums over all pixels, with its sign. The pixels are those that the object fills.
-Pixels are means over their squares on both sides.
+vertices; triangles with textures are divided for it until they are as small as pixels. Direct light alone.
+`peer_error` is the noise of one of its pictures, relative L2, from two of unlike seeds; `peer_seconds` is the time of
+one. `error` is the relative L2 of ours against both, in whose product their noise has no part. `bias` is the error of
+the sums over all pixels, with its sign. The pixels are those that the object fills. Pixels are means over their squares
+on both sides.
 
 Lines of `lobe, 2 bounces` are held to Mitsuba's pictures of as many bounces, and so are those of `lobe, no bounces`,
 which tell what bounces bring.
