@@ -47,7 +47,9 @@ class Pixels(eqx.Module):
     background: Float[Array, "h w"]
 
 
-def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
+def shading_points(
+    fragments: Fragments, mesh: Mesh, camera: Camera, *, uneven: Bool[Array, " f"] | None = None
+) -> Pixels:
     """One point for each pixel and each surface that it shows.
 
     Samples of one triangle share a point. So do samples of different triangles that are plainly one smooth surface:
@@ -64,6 +66,7 @@ def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
         fragments: What `rasterize` found.
         mesh: The mesh that it was given.
         camera: The camera that it was given.
+        uneven: Triangles whose radiance varies so much within a pixel that each sample is a point; none if None.
 
     Raises:
         ValueError: The fragments are of a picture of another size, or of triangles that the mesh does not have.
@@ -79,9 +82,10 @@ def shading_points(fragments: Fragments, mesh: Mesh, camera: Camera) -> Pixels:
         raise ValueError(f"the fragments must be of the mesh's {len(mesh.face)} triangles, got triangle {highest}")
     projected, block = _projected(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
-    members, mixed, background = _uniform(fragments, facing)
+    uneven = jnp.zeros(len(mesh.face), bool) if uneven is None else uneven
+    members, mixed, background = _uniform(fragments, facing, uneven)
     if len(shape) == 3:
-        face = facing, *_faces(mesh, projected)
+        face = facing, *_faces(mesh, projected), uneven
         for row in _numbers(mixed, block):
             shown, samples = _samples(row, fragments, face)
             members = _merge(row, members, shown, _same(samples))
@@ -208,8 +212,8 @@ def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
 
 
 @jax.jit
-def _uniform(fragments: Fragments, facing: Bool[Array, " f"]):
-    """Pixels that show one triangle, pixels that show several, and the share of each pixel that shows none.
+def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array, " f"]):
+    """Pixels that show one triangle, pixels that need several points, and the share of each pixel that shows none.
 
     Of the samples that see one surface, the first stands for it: its member has a bit for each of them, and theirs
     have none. Only the pixels that show one triangle have members yet.
@@ -218,6 +222,7 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"]):
     triangle = fragments.triangle.reshape(height * width, -1).T
     shown = facing[triangle] & (triangle >= 0)
     same = functools.reduce(jnp.logical_and, [each == triangle[0] for each in triangle])
+    same &= ~uneven[triangle[0]] | (len(triangle) == 1)
     mixed = ~same & functools.reduce(jnp.logical_or, list(shown))
     whole = jnp.where(same & shown[0], (1 << len(triangle)) - 1, 0).astype(jnp.uint8)
     members = jnp.pad(whole[:, None], ((0, 0), (0, len(triangle) - 1)))
@@ -263,7 +268,7 @@ def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]
 
     Where two triangles meet between the samples, the inverse depth changes by a mean of what each explains.
     """
-    triangle, inverse, region, x, y, z, right, down = samples
+    triangle, inverse, region, x, y, z, right, down, uneven = samples
     offset = SAMPLES[len(triangle)]
     same = {}
     for j in range(len(triangle)):
@@ -273,7 +278,8 @@ def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]
             near = jump <= (jnp.abs(step[0]) + jnp.abs(step[1])) / 2 + SAME_DEPTH * inverse[i]
             dot, *square = (x[a] * x[b] + y[a] * y[b] + z[a] * z[b] for a, b in ((i, j), (i, i), (j, j)))
             alike = (dot >= 0) & (dot**2 >= SMOOTH**2 * square[0] * square[1])
-            same[i, j] = (triangle[i] == triangle[j]) | (near & alike & (region[i] == region[j]))
+            one = (triangle[i] == triangle[j]) | (near & alike & (region[i] == region[j]))
+            same[i, j] = one & ~uneven[i] & ~uneven[j]
     return same
 
 

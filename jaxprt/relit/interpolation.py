@@ -9,10 +9,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import grid
+from jaxprt.image import raster
 from jaxprt.relit.channels import Shading
+from jaxprt.scene import Camera, Mesh
 from jaxprt.sphere import directions, hemisphere
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import HarmonicSystem
@@ -23,6 +25,10 @@ _RINGS, _SECTORS = 96, 64
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
 # Of an isotropic field 3/8 of the squared Laplacian is the square of a second derivative.
 _ALONG = np.sqrt(3 / 8) / 12
+_WITHIN = 24 * 0.02  # share of the radiance by which a pixel's mean may differ from its middle, times 24
+_RIM = 0.15  # change of the cosine within a pixel, over itself and this
+_MATTE = 0.83  # curvature up to which a surface is about diffuse
+_EDGE_ON = 1e-6  # square pixels
 
 
 def curvature(shading: Shading, system: System) -> float:
@@ -81,3 +87,41 @@ def error(
     a, b, c = (mirror[face[:, k]] for k in range(3))
     square = jnp.stack([jnp.sum((x - y) ** 2, -1) for x, y in ((a, b), (b, c), (c, a))])
     return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[face[:, 0]], 1)
+
+
+@jax.jit
+def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Array, " f"]:
+    """Triangles whose radiance varies within a pixel by more than one point of it can stand for.
+
+    The mean over a pixel differs from the middle by 1/24 of the Laplacian, of which the mirror direction has its share;
+    and towards the rim of a surface radiance goes with the cosine of the view, which then must not vary much.
+
+    Args:
+        mesh: The triangles.
+        camera: The camera.
+        curvature: From `curvature`, of each vertex.
+    """
+    mesh, camera = jax.lax.stop_gradient((mesh, camera))
+    x, y, q = raster.project(mesh.position, camera)
+    toward = directions.normalize(camera.eye - mesh.position)
+    cosine = jnp.sum(mesh.normal * toward, -1)
+    mirror = 2 * cosine[:, None] * mesh.normal - toward
+    a, b, c = mesh.face.T
+    across, down = (each * jnp.sign(q) for each in (x, y))
+    first, second = (across[b] - across[a], down[b] - down[a]), (across[c] - across[a], down[c] - down[a])
+    area = first[0] * second[1] - first[1] * second[0]
+    scale = 1 / jnp.where(jnp.abs(area) > _EDGE_ON, area, _EDGE_ON)
+
+    def square(value: Array) -> Array:
+        """Squared change per pixel, to the right and down together."""
+        value = value.reshape(len(value), -1)
+        one, other = (value[each] - value[a] for each in (b, c))
+        right = (one * second[1][:, None] - other * first[1][:, None]) * scale[:, None]
+        below = (other * first[0][:, None] - one * second[0][:, None]) * scale[:, None]
+        return jnp.sum(right**2 + below**2, -1)
+
+    wide = square(mirror) * curvature[a] > _WITHIN
+    mean = jnp.maximum((cosine[a] + cosine[b] + cosine[c]) / 3, 0)
+    # What is ideally diffuse does not change with the view.
+    rim = (square(cosine) > (_RIM * (mean + _RIM)) ** 2) & (curvature[a] > _MATTE)
+    return wide | rim

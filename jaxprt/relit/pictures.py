@@ -143,9 +143,10 @@ def make(
         samples: Of each pixel's coverage, 4 or 1.
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
     """
+    bend = jnp.stack([each.curvature for each in surfaces])[mesh.region]
     fragments = rasterize(mesh, camera, samples=samples)
-    pixels = shading_points(fragments, mesh, camera)
-    owner, wrong = _judged(mesh, surfaces, pixels, camera)
+    pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
+    owner, wrong = _judged(mesh, bend, pixels, camera)
     parts = []
     for number, surface in enumerate(surfaces):
         index = _rows_of(owner == number)
@@ -161,10 +162,9 @@ def make(
 
 @jax.jit
 def _judged(
-    mesh: Mesh, surfaces: Sequence[Surface], pixels: Pixels, camera: Camera
+    mesh: Mesh, bend: Float[Array, " v"], pixels: Pixels, camera: Camera
 ) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
     """The part of each point, -1 in padding, and the error that interpolating radiance makes there."""
-    bend = jnp.stack([each.curvature for each in surfaces])[mesh.region]
     wrong = interpolation.error(mesh.position, mesh.normal, mesh.face, camera.eye, bend)
     own = jnp.maximum(pixels.triangle, 0)
     return jnp.where(pixels.triangle >= 0, mesh.region[mesh.face[:, 0]][own], -1), wrong[own]
