@@ -25,6 +25,7 @@ from jaxprt.visibility import StoredVisibility
 _HARMONIC_SIZE = 32  # texels along an edge of the visibility: as many as low degrees need
 _STEPS = 4  # of harmonics for one of lobes, from knot to knot
 _VARYING = 0.02  # error of tables of harmonics of which roughness varies
+_DIFFUSE = 32  # times as many single texels for what is ideally diffuse
 
 
 class Known:
@@ -98,7 +99,8 @@ class Lobes(eqx.Module):
 
     Attributes:
         lobes: Lobes of the BRDF.
-        texels: Brightest texels that are summed one by one; 0 for none.
+        texels: Brightest texels that are summed one by one; 0 for none. What is ideally diffuse, for which a texel costs
+            a thirtieth, has 32 times as many: shadows of all lamps.
     """
 
     lobes: int = 12
@@ -114,7 +116,8 @@ class Lobes(eqx.Module):
             table = lobe.diffuse(shading.brdf.albedo)
         else:
             table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
-        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
+        texels = self.texels * (_DIFFUSE if isinstance(shading.brdf, Lambert) else 1)
+        return _bright(lobe.LobeSystem(transport, table), transport, shading, texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Bytes of the pyramids."""

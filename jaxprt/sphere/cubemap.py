@@ -140,6 +140,18 @@ def project(
     return face, s / length, t / length
 
 
+def unproject(
+    face: Int[Array, "*b"], s: Float[Array, "*b"], t: Float[Array, "*b"]
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+    """Directions of any length from places on faces, or beyond their edges, by components: the inverse of `project`."""
+    along_x, along_y = face < 2, (face >= 2) & (face < 4)
+    side = jnp.where(face % 2 == 1, -1, 1).astype(s.dtype)
+    x = jnp.where(along_x, side, jnp.where(along_y, s, side * s))
+    y = jnp.where(along_y, side, -t)
+    z = jnp.where(along_x, -side * s, jnp.where(along_y, side * t, side))
+    return x, y, z
+
+
 @functools.partial(jax.jit, static_argnames="sharpness")
 def lookup(
     cubemap: Float[Array, "6 n n *c"], direction: Float[Array, "*b 3"], *, sharpness: int = 1

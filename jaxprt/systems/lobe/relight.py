@@ -4,9 +4,11 @@
 lobes into places in the blurred light and what is seen there, once per change of view or BRDF. `combine` reads the
 light.
 
-Light and visibility vary together over a lobe. For a normal distribution of variance k about a direction,
-E[L V] = E[L] E[V] + k grad E[L] . grad E[V] + ..., and both slopes come with the bilinear lookups, so the second term
-costs nothing.
+Light and visibility vary together over a lobe: what is seen of it is a narrower lobe beside its middle. For a normal
+distribution of variance k about a direction the mean of what is seen lies off by k grad E[V] / E[V] (Stein's lemma),
+and the slope comes with the bilinear lookups. Where a straight edge cuts the lobe, that shift tells the variance that is
+left across the edge too. So E[L V] is E[V] times the light blurred about the mean of what is seen, to that width: exact
+for light that is linear over the lobe, and never negative.
 """
 
 import math
@@ -35,6 +37,9 @@ _WIDEST = 1.3  # radians
 _COARSE = 0.75  # largest texel in widths
 _REACH = 3.0  # widths that a blur sums over
 _TILE = 4  # edge of what is blurred at once, in texels
+_LEAST = 1e-3  # part of a lobe that counts as seen
+_FARTHEST = 2.5  # standard deviations by which the middle of what is seen may be off
+_TINY = 1e-12
 
 
 class LobeLight(eqx.Module):
@@ -169,21 +174,35 @@ def _places(
 @partial(isolated, static=("size",))
 def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Texels of the blurred light, and what each counts."""
-    seen, by_s, by_t = visible
-    # Slopes on the face as a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
-    variance = (1 + s**2 + t**2) / (concentration * (1 - spread))
-    along_s = variance * (by_s * (1 + s**2) + by_t * s * t)
-    along_t = variance * (by_t * (1 + t**2) + by_s * s * t)
+    seen, face, s, t, spread = _seen_part(visible, face, s, t, spread, concentration)
     scale = scales(size)
     number, upper = between(scale, spread)
     place, result = [], []
     for step, part in ((0, 1 - upper), (1, upper)):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
         row, column, weights = corners(edge, s, t)
-        for (down, right), (value, slope_s, slope_t) in weights:
+        for (down, right), (value, _, _) in weights:
             place.append(start + (face * (edge + 2) + row + down) * (edge + 2) + column + right)
-            result.append((seen * value + along_s * slope_s + along_t * slope_t) * part)
+            result.append(seen * value * part)
     return tuple(place), tuple(result)
+
+
+def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array, Array, Array, Array]:
+    """How much of each lobe is seen, and face, place and spread of that part."""
+    seen, by_s, by_t = visible
+    # Slopes on the face as a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
+    variance = (1 + s**2 + t**2) / (concentration * (1 - spread))
+    along_s = variance * (by_s * (1 + s**2) + by_t * s * t)
+    along_t = variance * (by_t * (1 + t**2) + by_s * s * t)
+    part = jnp.maximum(seen, _LEAST)
+    # In standard deviations of the lobe; hardly more where next to nothing is seen.
+    shift = jnp.sqrt((along_s * by_s + along_t * by_t) / part**2 + _TINY)
+    reach = 1 / (part * jnp.maximum(shift / _FARTHEST, 1))
+    shift = jnp.minimum(shift, _FARTHEST)
+    # Beyond an edge at a, the variance is 1 - m (m + a) with the mean m = phi(a) / Phi(a); fitted over m.
+    across = 1 / (1 + shift * (2 + 0.42 * shift))
+    face, s, t = cubemap.project(*cubemap.unproject(face, s + along_s * reach, t + along_t * reach))
+    return seen, face, s, t, spread * (1 + across) / 2
 
 
 @isolated
