@@ -33,7 +33,7 @@ MOST_ERROR = {
     "relight_harmonic": 0.7,
     "relight_separable": 5e-3,
     "rotation": 1e-5,
-    "scenes": 0.3,
+    "scenes": 0.45,
     "tables": 1.0,
     "tucker": 0.52,
 }
