@@ -3,7 +3,7 @@
 The scene has the same triangles, normals and materials as ours (`benchmarks.plugins`) in the same light, constant over
 each texel (`benchmarks.cubemap_light`). Pixels are means over their squares. A path takes one sample of the light and
 one of the material, weighed against each other. `available` of `benchmarks.path_tracing` says whether drjit finds LLVM;
-without, Mitsuba runs in its variant scalar_rgb, thousands of times slower since the plugins are Python.
+without, Mitsuba runs in its variant scalar_rgb, hundreds of times slower since the plugins are Python.
 
 The denoiser is Intel's Open Image Denoise by the package pyoidn. It gets the albedo and the normal of what is seen
 first, which a few samples tell well enough for the edges; `clean` has it take them as free of noise.
@@ -24,7 +24,7 @@ from jaxprt.scene import Camera, Environment, Mesh
 from jaxprt.visibility import blocks
 
 BLOCK = 1024  # samples of the converged picture at once
-_FEATURES = 4  # samples of albedo and normal: more improved no picture by more than 1 % of its error
+_FEATURES = 4  # samples of albedo and normal: more improve no picture by more than 2 % of its error
 _COVERED = 0.999  # rays through edges of triangles may miss both
 _CONVERGENCE = 0.5  # of Monte Carlo: error falls as this power of time
 
