@@ -115,7 +115,6 @@ HOST = {
     "systems.separable.factorization.factor": "checks values, and chooses the number of terms by them",
     "systems.lobe.table.tabulate": "checks values, and chooses the number of lobes by them",
     "systems.lobe.table.sampled": "checks values",
-    "systems.lobe.table.diffuse": "puts arrays side by side",
     "systems.lobe.knots": "takes indices; tested through tables over parameters",
     "systems.lobe.table.is_isotropic": "compares values",
     "systems.dynamic.brdf_set.separate": "checks values",

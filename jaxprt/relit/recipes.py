@@ -99,8 +99,8 @@ class Lobes(eqx.Module):
 
     Attributes:
         lobes: Lobes of the BRDF.
-        texels: Brightest texels that are summed one by one; 0 for none. What is ideally diffuse, for which a texel costs
-            a thirtieth, has 32 times as many: shadows of all lamps.
+        texels: Brightest texels that are summed one by one; 0 for none. What is ideally diffuse, for which a texel
+            costs a thirtieth, has 32 times as many: shadows of all lamps.
     """
 
     lobes: int = 12
@@ -113,11 +113,11 @@ class Lobes(eqx.Module):
         else:
             transport = target.known.pyramid
         if isinstance(shading.brdf, Lambert):
-            table = lobe.diffuse(shading.brdf.albedo)
-        else:
-            table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
-        texels = self.texels * (_DIFFUSE if isinstance(shading.brdf, Lambert) else 1)
-        return _bright(lobe.LobeSystem(transport, table), transport, shading, texels, transport.size)
+            vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
+            matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
+            return _bright(matte, lobe.bits(transport), shading, _DIFFUSE * self.texels, transport.size)
+        table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
+        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Bytes of the pyramids."""

@@ -6,7 +6,7 @@ from jaxprt.systems.lobe.pyramid import LobeTransport, bits, compress, precomput
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, radiance, view_lobes
 from jaxprt.systems.lobe.remainder import Remainder
 from jaxprt.systems.lobe.system import LobeSystem
-from jaxprt.systems.lobe.table import LobeBrdf, Lobes, diffuse, tabulate
+from jaxprt.systems.lobe.table import LobeBrdf, Lobes, tabulate
 
 __all__ = [
     "LobeBrdf",
@@ -19,7 +19,6 @@ __all__ = [
     "bits",
     "combine",
     "compress",
-    "diffuse",
     "em",
     "knots",
     "mirror_lobes",

@@ -6,9 +6,9 @@ light.
 
 Light and visibility vary together over a lobe: what is seen of it is a narrower lobe beside its middle. For a normal
 distribution of variance k about a direction the mean of what is seen lies off by k grad E[V] / E[V] (Stein's lemma),
-and the slope comes with the bilinear lookups. Where a straight edge cuts the lobe, that shift tells the variance that is
-left across the edge too. So E[L V] is E[V] times the light blurred about the mean of what is seen, to that width: exact
-for light that is linear over the lobe, and never negative.
+and the slope comes with the bilinear lookups. Where a straight edge cuts the lobe, that shift tells the variance that
+is left across the edge too. So E[L V] is E[V] times the light blurred about the mean of what is seen, to that width:
+exact for light that is linear over the lobe, and never negative.
 """
 
 import math

@@ -181,14 +181,6 @@ def mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
     return LobeBrdf(place, scale, strength, diffuse, table.knot[1:], table.error)
 
 
-def diffuse(albedo: Float[Array, " c"]) -> LobeBrdf:
-    """The table of an ideal diffuse BRDF: one lobe without weight beside the diffuse part."""
-    rows = albedo[:, None]
-    none = jnp.zeros((1, 2), rows.dtype)
-    up = jnp.stack([none, none, none + 1])
-    return LobeBrdf(up, none, 0 * rows[..., None] + none, rows + none, (), jnp.zeros((), rows.dtype))
-
-
 def tabulate(
     brdf: Callable,
     *,
