@@ -67,6 +67,7 @@ HOST = {
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",
     "systems.lobe.pyramid.bits": "cuts bytes",
+    "systems.lobe.pyramid.texel_bits": "the same",
     "systems.lobe.pyramid.pyramid": "gives bytes",
     "systems.lobe.pyramid.scales": "NumPy tables",
     "systems.lobe.pyramid.between": "indices, of a NumPy table",

@@ -115,12 +115,14 @@ class Lobes(eqx.Module):
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
             matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
-            return _bright(matte, lobe.bits(transport), shading, _DIFFUSE * self.texels, transport.size)
+            return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
         table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Bytes of the pyramids."""
+        """Bytes of the pyramids, or of bits and vectors."""
+        if isinstance(shading.brdf, Lambert):
+            return vertices * (6 * size**2 // 8 + 4 * (lobe.pyramid.DEGREE + 1) ** 2)
         return vertices * lobe.pyramid.scales(size).total
 
 

@@ -2,7 +2,7 @@
 
 from jaxprt.systems.lobe import em, knots, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes
-from jaxprt.systems.lobe.pyramid import LobeTransport, bits, compress, precompute
+from jaxprt.systems.lobe.pyramid import LobeTransport, TexelBits, bits, compress, precompute, texel_bits
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, radiance, view_lobes
 from jaxprt.systems.lobe.remainder import Remainder
 from jaxprt.systems.lobe.system import LobeSystem
@@ -16,6 +16,7 @@ __all__ = [
     "LobeView",
     "Lobes",
     "Remainder",
+    "TexelBits",
     "bits",
     "combine",
     "compress",
@@ -32,5 +33,6 @@ __all__ = [
     "system",
     "table",
     "tabulate",
+    "texel_bits",
     "view_lobes",
 ]

@@ -271,6 +271,40 @@ def bits(transport: LobeTransport) -> LobeTransport:
     return LobeTransport(finest, transport.vector[:0], transport.position, transport.frame, transport.size)
 
 
+class TexelBits(eqx.Module):
+    """Visibility of single texels, one bit each, texel by texel: what many texels of a light are read from.
+
+    Attributes:
+        bit: Those of eight texels in each byte, as `LobeTransport` has them.
+        position: Vertex positions in world units.
+        frame: Rows are tangent, bitangent, normal.
+        size: Edge of the cubemap's faces in texels.
+    """
+
+    bit: UInt8[Array, "n v"]
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    size: int = eqx.field(static=True)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the bits."""
+        return self.bit.nbytes
+
+    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
+        """Whether each vertex sees some texels, 1 or 0: whether it sees at least half of each."""
+        byte, bit = _bit(*_split(texel, self.size), self.size)
+        value = self.bit.at[byte].get(mode="promise_in_bounds")
+        return ((value >> bit.astype(jnp.uint8)[:, None]) & 1).astype(self.position.dtype)
+
+
+def texel_bits(transport: LobeTransport) -> TexelBits:
+    """The bits alone, turned so that those of one texel lie side by side."""
+    finest = np.asarray(transport.pyramid)[:, : 6 * transport.size**2 // 8]
+    turned = jax.device_put(np.ascontiguousarray(finest.T))
+    return TexelBits(turned, transport.position, transport.frame, transport.size)
+
+
 @jax.jit
 def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     """Bits and means of visibility, as `LobeTransport` has them.

@@ -62,7 +62,9 @@ def test_every_texel_is_its_own_bit(seen):
     blank = lobe.LobeTransport(
         pyramid, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
     )
-    np.testing.assert_array_equal(np.asarray(blank.visible(jnp.arange(seen.shape[1]))), (seen >= 8).T)
+    every = jnp.arange(seen.shape[1])
+    for each in (blank, lobe.texel_bits(blank)):
+        np.testing.assert_array_equal(np.asarray(each.visible(every)), (seen >= 8).T)
 
 
 def test_a_pyramid_takes_six_kilobytes():
