@@ -23,7 +23,7 @@ from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.protocol import Blend, System
 
-CHUNK = 1 << 14  # points that are shaded at once
+CHUNK = 1 << 13  # points that are shaded at once
 _FEWEST = 1 << 10
 _ERROR = 0.01  # of radiance interpolated between vertices, from where it is made at the pixels
 
