@@ -2,7 +2,8 @@
 
     python -m benchmarks.scenes [--quick] [--pictures FOLDER] [--store FOLDER] [--output FILE]
 
-Scenes are glTF files of JAXPRT_DATA, one of them also with its triangles divided, and spheres with sharper materials.
+Scenes are glTF files of JAXPRT_DATA, one of them also with all of its triangles divided and with those at shadows
+refined, and spheres with sharper materials.
 `seconds` are of a picture: light, view and materials redone, and drawing. `bytes` are what the system holds.
 
 Mitsuba gets the same surfaces, and the same materials as a plugin, with their parameters interpolated between the
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness, path_tracing
-from jaxprt import RelitScene, files, image, memory, precompute, reference
+from jaxprt import RelitScene, files, image, memory, precompute, reference, refine
 from jaxprt.image import raster, render
 from jaxprt.relit import Harmonics, Lobes, Terms
 from jaxprt.relit.channels import of_part
@@ -43,6 +44,7 @@ from jaxprt.scene import (
     builtin,
     load_environment,
     load_scene,
+    subdivision,
 )
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import background
@@ -56,7 +58,7 @@ LIGHTS = {
     "eucalyptus": "eucalyptus_rnl_cross.hdr",
     "courtyard": "polyhaven_courtyard_1k.exr",
 }
-AZIMUTH = {"duck": 0.5, "truck": 0.9, "truck, divided": 0.9, "spheres": 0.25}
+AZIMUTH = {"duck": 0.5, "truck": 0.9, "truck, divided": 0.9, "truck, refined": 0.9, "spheres": 0.25}
 LONGEST = 0.03  # edge of divided triangles, over the diagonal of the scene
 FINEST = 0.004  # edge of triangles whose materials Mitsuba interpolates
 REFLECTING = ("duck", "spheres")  # scenes that are relit with bounces too
@@ -85,6 +87,7 @@ def scenes(quick: bool) -> dict[str, Scene]:
     found = {name: load_scene(path) for name, path in paths.items() if path.is_file()}
     if "truck" in found:
         found["truck, divided"] = divided(found["truck"], LONGEST)
+        found["truck, refined"] = refine(found["truck"], environments=list(lights(quick).values()))
     return found | {"spheres": spheres(sectors=112, ground=6400)}
 
 
@@ -299,46 +302,7 @@ def ball(sectors: int, center: np.ndarray) -> Mesh:
 def divided(scene: Scene, longest: float) -> Scene:
     """The same surfaces in triangles whose edges are at most so long, over the diagonal of the scene."""
     low, high = np.asarray(scene.mesh.position).min(0), np.asarray(scene.mesh.position).max(0)
-    return Scene([halved(part, longest * float(np.linalg.norm(high - low))) for part in scene.parts], scene.cameras)
-
-
-def halved(part: Part, longest: float) -> Part:
-    """A part whose longer edges are halved until none is left; what its vertices have is interpolated."""
-    mesh = part.mesh
-    face = np.asarray(mesh.face)
-    given = {name: getattr(mesh, name) for name in ("position", "normal", "tangent", "texture")} | {"color": part.color}
-    row = {name: np.asarray(value, np.float64) for name, value in given.items() if value is not None}
-    while True:
-        edge = np.sort(np.stack([face, np.roll(face, -1, 1)], -1), -1)
-        long = np.linalg.norm(row["position"][edge[..., 0]] - row["position"][edge[..., 1]], axis=-1) > longest
-        if not long.any():
-            break
-        unique, number = np.unique(edge[long], axis=0, return_inverse=True)
-        middle = np.full(face.shape, -1)
-        middle[long] = len(row["position"]) + number.ravel()
-        row = {name: np.concatenate([each, each[unique].mean(1)]) for name, each in row.items()}
-        row["normal"] /= np.linalg.norm(row["normal"], axis=1, keepdims=True)
-        face = np.concatenate([cut(a, b) for a, b in zip(face, middle, strict=True)])
-    extra = {name: row[name] for name in ("normal", "tangent", "texture") if name in row}
-    color = jnp.asarray(row["color"], jnp.float32) if "color" in row else None
-    return Part(part.name, make_mesh(row["position"], face, **extra, name=part.name), part.material, color)
-
-
-def cut(corner: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """A triangle cut at the middles of some of its edges, -1 for those that stay."""
-    count = int(np.sum(middle >= 0))
-    if count == 0:
-        return corner[None]
-    # Turned so that the first edge is cut, and the last is not unless all are.
-    first = (middle >= 0) & (np.roll(middle, 1) < 0)
-    turn = int(np.argmax(first))
-    a, b, c = np.roll(corner, -turn)
-    ab, bc, ca = np.roll(middle, -turn)
-    if count == 1:
-        return np.array([[a, ab, c], [ab, b, c]])
-    if count == 2:
-        return np.array([[a, ab, c], [ab, bc, c], [ab, b, bc]])
-    return np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+    return subdivision.divide(scene, edge=longest * float(np.linalg.norm(high - low)))
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ MOST_ERROR = {
     "pictures": 0.6,
     "precompute_separable": 3e-3,
     "rasterize": 0.03,  # of the coverage at edges
+    "refinement": 0.4,
     "relight_dynamic": 0.08,
     "relight_harmonic": 0.7,
     "relight_separable": 5e-3,

@@ -117,7 +117,7 @@ class Plan(eqx.Module):
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
             rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
-            advice = "; `jaxprt.relit.refine` divides its triangles" if part.mesh_error > self.asked else ""
+            advice = "; `jaxprt.refine` divides its triangles" if part.mesh_error > self.asked else ""
             rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
         for part, (once, twice) in zip(self.part, self.reflected.T, strict=True):
             rows.append(f"{part.name}: {100 * once:.1f} % of its light is reflected, {100 * twice:.1f} % twice or more")

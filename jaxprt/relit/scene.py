@@ -49,6 +49,7 @@ class RelitScene(System):
         camera: The scene's first camera; one around it, a little from above, where it has none.
         curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
         points: Where on each part radiance is asked for; None for the vertices.
+        mipmapped: Materials of the parts with mip maps of their textures; None for BRDFs.
     """
 
     scene: Scene
@@ -59,6 +60,7 @@ class RelitScene(System):
     camera: Camera
     curvature: Float[Array, " n"]
     points: tuple[Points, ...] | None
+    mipmapped: tuple[TexturedMaterial | None, ...]
 
     def __init__(self, scene: Scene, direct: Joined, shading: Sequence[Shading], bounces: PartBounces | None = None):
         """Joins the parts' meshes.
@@ -71,7 +73,7 @@ class RelitScene(System):
         """
         # What is no array cannot be an argument of a jitted function.
         parts = [
-            dataclasses.replace(part, material=part.material.mipmapped())
+            part
             if isinstance(part.material, TexturedMaterial)
             else dataclasses.replace(part, material=grid.as_argument(part.material))
             for part in scene.parts
@@ -79,6 +81,9 @@ class RelitScene(System):
         self.scene = dataclasses.replace(scene, parts=parts)
         self.direct, self.shading, self.bounces, self.mesh = direct, tuple(shading), bounces, scene.mesh
         self.points = None
+        self.mipmapped = tuple(
+            part.material.mipmapped() if isinstance(part.material, TexturedMaterial) else None for part in scene.parts
+        )
         pairs = zip(shading, direct.part, strict=True)
         self.curvature = jnp.asarray([interpolation.curvature(*each) for each in pairs], self.mesh.position.dtype)
         self.camera = scene.cameras[0] if scene.cameras else orbit(self.mesh, azimuth=0.5, elevation=0.3)
@@ -178,7 +183,7 @@ class RelitScene(System):
             zip(self.scene.parts, self.shading, self.direct.part, strict=True)
         ):
             own = given.get(part.name, Appearance(shading.blend, shading.emitted))
-            material = None if materials is None else materials.get(part.name)
+            material = (materials or {}).get(part.name, self.mipmapped[number])
             material = own if isinstance(material, Blend) else material
             reflecting = None if self.bounces is None else self.bounces.part[number]
             surfaces.append(Surface(part, first, shading, system, reflecting, own, material, self.curvature[number]))
