@@ -102,14 +102,9 @@ class PictureView(eqx.Module):
         arriving = self.system.shade(self.system.light(environment), blends)
         if self.surface[0].reflecting is None:
             arriving = arriving, [None] * len(self.surface)
-        rows = [self._rows(own, (arriving[0][own.number], arriving[1][own.number])) for own in self.part]
-        colors = max((each.shape[-1] for each in rows), default=environment.radiance.shape[-1])
-        color = jnp.zeros((len(self.pixels.triangle), colors), self.mesh.position.dtype)
-        for own, row in zip(self.part, rows, strict=True):
-            place = jnp.where(own.index < 0, len(color), own.index).ravel()
-            color = color.at[place].set(row.reshape(-1, row.shape[-1]), mode="drop")
-        sky = background(environment, raster.ray_direction(self.camera))
-        return resolve(self.pixels, color, background=sky)
+        direct, reflected = arriving
+        rows = [self._rows(own, (direct[own.number], reflected[own.number])) for own in self.part]
+        return _resolved(self.pixels, [own.index for own in self.part], rows, environment, self.camera)
 
     def _rows(self, own: PartPixels, arriving: tuple[PyTree, PyTree]) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
@@ -117,17 +112,56 @@ class PictureView(eqx.Module):
         vertices = None if own.at_pixels else _at_vertices(surface, arriving, eye)
         if own.kept is not None:
             return jnp.stack([_lit(surface, arriving, vertices, view) for view in own.kept])
-        given = surface, arriving, vertices, self.pixels, self.mesh.face
-        shaded = partial(_shaded, *given, eye=eye, at_pixels=own.at_pixels)
+
+        def shaded(index):
+            points = _points_of(self.pixels, self.mesh.face, surface.first, index)
+            return _shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels)
+
         if not isinstance(own.index, Tracer):
-            return jnp.stack([shaded(index=index) for index in own.index])
-        shape = jax.eval_shape(shaded, index=own.index[0])
+            return jnp.stack([shaded(index) for index in own.index])
+        shape = jax.eval_shape(shaded, own.index[0])
 
         def some(index):
             none = jnp.zeros(shape.shape, shape.dtype)
-            return jax.lax.cond(jnp.any(index >= 0), lambda: shaded(index=index), lambda: none)
+            return jax.lax.cond(jnp.any(index >= 0), lambda: shaded(index), lambda: none)
 
         return jax.lax.map(some, own.index)
+
+
+class RegionsView(eqx.Module):
+    """All of a picture but its light, of a system whose parts are the regions of a mesh: `of_regions` makes it.
+
+    Attributes:
+        system: The system.
+        materials: Its materials.
+        camera: From where.
+        pixels: What is shaded.
+        index: Numbers of the points of each region r, in rows m that are shaded at once; -1 in padding.
+        points: The points of each row, of each region.
+        kept: What the system makes of the view of each row; None where that is made anew for each light.
+    """
+
+    system: System
+    materials: PyTree
+    camera: Camera
+    pixels: Pixels
+    index: Int[Array, "m r p"]
+    points: tuple[tuple[Points, ...], ...]
+    kept: tuple[PyTree, ...] | None
+
+    def picture(self, environment: Environment) -> Float[Array, "h w c"]:
+        """The picture in a light, in linear radiance.
+
+        Raises:
+            TypeError: The light is no Environment.
+            ValueError: The light is a batch, or of another size.
+        """
+        arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
+        for number, points in enumerate(self.points):
+            system = self.system.at(points)
+            view = system.view(self.camera.eye, self.materials) if self.kept is None else self.kept[number]
+            rows.append(system.combine(arriving, view))
+        return _resolved(self.pixels, list(self.index), rows, environment, self.camera)
 
 
 def make(
@@ -155,9 +189,55 @@ def make(
         at_pixels = _pays(surface, wrong, index)
         kept = None
         if keep and not isinstance(index, Tracer):
-            kept = tuple(_viewed(surface, pixels, mesh.face, each, camera.eye, at_pixels=at_pixels) for each in index)
+            points = (_points_of(pixels, mesh.face, surface.first, each) for each in index)
+            kept = tuple(_viewed(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
         parts.append(PartPixels(number, at_pixels, index, kept))
     return PictureView(mesh, system, camera, tuple(surfaces), pixels, tuple(parts))
+
+
+def of_regions(
+    system: System, mesh: Mesh, camera: Camera, *, materials: PyTree = None, samples: int = 4, keep: bool = False
+) -> RegionsView:
+    """The view of a mesh by a system that takes points of its regions: the dynamic system, alone or with bounces.
+
+    Radiance is made at all pixels. Not for `jax.jit`.
+
+    Args:
+        system: The system of the mesh.
+        mesh: The mesh.
+        camera: From where.
+        materials: As the system takes them.
+        samples: Of each pixel's coverage, 4 or 1.
+        keep: Whether what the system makes of the view is kept for other lights: about a kilobyte for each point.
+    """
+    pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
+    region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
+    owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
+    every = [np.flatnonzero(owner == number) for number in range(region.max() + 1)]
+    rows, width = _rows_of(owner == np.argmax([len(each) for each in every])).shape
+    index = np.stack([np.pad(each, (0, rows * width - len(each)), constant_values=-1) for each in every])
+    index = jnp.asarray(index.reshape(len(every), rows, width).swapaxes(0, 1))
+    # Numbers of the vertices in their regions.
+    place = np.zeros(len(region), np.int32)
+    for number in range(len(every)):
+        own = np.flatnonzero(region == number)
+        place[own] = np.arange(len(own))
+    corner = jnp.asarray(place[face])
+    points = tuple(tuple(_points_of(pixels, corner, 0, each) for each in row) for row in index)
+    kept = tuple(system.at(each).view(camera.eye, materials) for each in points) if keep else None
+    return RegionsView(system, materials, camera, pixels, index, points, kept)
+
+
+def _resolved(
+    pixels: Pixels, index: Sequence[Array], rows: Sequence[Array], environment: Environment, camera: Camera
+) -> Float[Array, "h w c"]:
+    """The picture of points whose colors come in rows, numbered by their indices, before a light."""
+    colors = max((each.shape[-1] for each in rows), default=environment.radiance.shape[-1])
+    color = jnp.zeros((len(pixels.triangle), colors), pixels.coverage.dtype)
+    for own, row in zip(index, rows, strict=True):
+        place = jnp.where(own < 0, len(color), own).ravel()
+        color = color.at[place].set(row.reshape(-1, row.shape[-1]), mode="drop")
+    return resolve(pixels, color, background=background(environment, raster.ray_direction(camera)))
 
 
 @jax.jit
@@ -196,18 +276,24 @@ def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
     return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
 
 
-@partial(jax.jit, static_argnames="at_pixels")
-def _viewed(
-    surface: Surface, pixels: Pixels, face: Array, index: Array, eye: Array, *, at_pixels: bool
-) -> tuple[Points, Appearance, PyTree]:
-    """Some points of a part, the material there, and what systems make of the view of them."""
+@jax.jit
+def _points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, index: Int[Array, " p"]) -> Points:
+    """Some points of a part of a picture, whose first vertex has a number in the mesh; padding lies on that vertex.
+
+    A program by itself, so that those that shade do not know how many points the picture has, and serve all pictures.
+    """
     own = jnp.maximum(index, 0)
     padding = index < 0
-    corner = face[jnp.maximum(pixels.triangle[own], 0)].T - surface.first
-    # Padding lies on the first vertex, so that its colors are finite.
+    corner = face[jnp.maximum(pixels.triangle[own], 0)].T - first
+    # On a vertex, so that its colors are finite.
     weight = jnp.where(padding, jnp.asarray([[1.0], [0], [0]], pixels.barycentric.dtype), pixels.barycentric[own].T)
     slope = jnp.where(padding, 0, jnp.moveaxis(pixels.slope[own], 0, -1))
-    points = Points(jnp.where(padding, 0, corner), weight, slope)
+    return Points(jnp.where(padding, 0, corner), weight, slope)
+
+
+@partial(jax.jit, static_argnames="at_pixels")
+def _viewed(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
+    """Some points of a part, the material there, and what systems make of the view of them."""
     appearance = at_points(surface.part, surface.shading, surface.material, points)
     return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
 
@@ -226,17 +312,17 @@ def _lit(
     elif appearance.blend is None:
         color = points.carry(vertices[0])
     else:
-        rows = (points.carry(own) * appearance.blend.weight[:, k] for k, own in enumerate(vertices))
-        color = reduce(jnp.add, rows)
+        weight = jnp.moveaxis(appearance.blend.weight, 1, 0)
+        color = reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True)))
     return color if appearance.emitted is None else color + appearance.emitted
 
 
 @partial(jax.jit, static_argnames="at_pixels")
-def _shaded(surface, arriving, vertices, pixels, face, index, eye, *, at_pixels: bool) -> Array:
+def _shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
     """Colors of some points of a part. For derivatives what is between is made again, not kept."""
 
     def both(surface, arriving, vertices, eye):
-        viewed = _viewed(surface, pixels, face, index, eye, at_pixels=at_pixels)
+        viewed = _viewed(surface, points, eye, at_pixels=at_pixels)
         return _lit(surface, arriving, vertices, viewed)
 
     return jax.checkpoint(both)(surface, arriving, vertices, eye)
