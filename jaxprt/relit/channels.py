@@ -169,10 +169,13 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | None]:
-    """The BRDF of points of a part for the exact sum, and what they emit; textures are read, not averaged."""
+    """The BRDF of points of a part for the exact sum, and what they emit.
+
+    Textures are averaged over the points' pixels, and read at points of no picture.
+    """
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None
-    surface = part.surface(Points(points.corner, points.weight))
+    surface = part.surface(points)
     return PerVertex(_material(surface)), surface.emissive
 
 

@@ -1,21 +1,26 @@
-"""Pixels of the exact picture: the sum over all texels at several points of each, with rays of their own."""
+"""The exact picture, from the sum over all texels: some of its pixels, to measure by, and one to look at."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
-from jaxprt.image import front, raster, rasterize
-from jaxprt.relit.channels import Shading, exact_at
+from jaxprt.brdf import Lambert
+from jaxprt.image import Pixels, front, raster, rasterize, relative_l2, resolve, shading_points
+from jaxprt.relit.channels import Shading, at_points, exact_at
 from jaxprt.scene import Camera, Environment, Scene
 from jaxprt.scene.environment import background
-from jaxprt.scene.points import on_triangles
+from jaxprt.scene.points import Points, on_triangles
 from jaxprt.systems import reference
 
 _SIDE = 4  # places along the edge of a pixel
+_MOST = 1 << 14  # points of a picture to look at: half a minute of two cores
+_COARSE = 64  # points of a picture for each vertex, from which on vertices are too few to be interpolated between
 
 
 class ExactPixels(NamedTuple):
@@ -25,13 +30,33 @@ class ExactPixels(NamedTuple):
         pixel: Numbers of the pixels, row * width + column.
         part: Number of the part in its middle.
         color: Linear radiance under each light.
+        weight: Pixels of the picture that each stands for.
         error: Relative L2 under each light that the number of points may leave, by halves of them.
     """
 
     pixel: Int[np.ndarray, " n"]
     part: Int[np.ndarray, " n"]
     color: Float[np.ndarray, "l n c"]
+    weight: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " l"]
+
+    def relative_l2(self, pictures: Sequence[Float[ArrayLike, "h w c"]]) -> list[float]:
+        """Relative L2 errors of pictures, one under each light, by these pixels."""
+        rows = (np.reshape(each, (-1, self.color.shape[-1]))[self.pixel] for each in pictures)
+        scale = np.sqrt(self.weight)[:, None]
+        return [float(relative_l2(scale * a, scale * b)) for a, b in zip(rows, self.color, strict=True)]
+
+
+class ExactPicture(NamedTuple):
+    """An exact picture in direct light, to look at.
+
+    Attributes:
+        camera: From where: the camera that was asked for, or one of fewer pixels.
+        color: Linear radiance under each light.
+    """
+
+    camera: Camera
+    color: Float[np.ndarray, "l h w c"]
 
 
 def exact_pixels(
@@ -67,8 +92,8 @@ def exact_pixels(
     shown = owner[:, owner.shape[1] // 2 + _SIDE // 2]
     pixel = _chosen(shown, len(scene.parts), pixels)
     triangle, weight, seen, owner = triangle[pixel], weight[pixel], seen[pixel], owner[pixel]
-    way = raster.ray_direction(fine)
-    sky = np.stack([_squares(np.asarray(background(each, way)))[pixel] for each in environments])
+    way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
+    sky = np.stack([background(each, way) for each in environments])
     mean = np.where((owner < 0)[..., None], sky, 0).mean(2)
     half = np.zeros_like(mean)
     first = 0
@@ -85,15 +110,102 @@ def exact_pixels(
         value = np.asarray(reference.radiance(shading.mesh, brdf, lights, **options), np.float64)
         value = value if emitted is None else value + np.asarray(emitted)
         share = own.mean(1)[:, None]
-        rank = np.arange(len(row)) - np.searchsorted(row, row)
-        both = [share * _mean(value[:, rank % 2 == side], row[rank % 2 == side], len(pixel)) for side in (0, 1)]
+        half_of = _halves(row, place)
+        both = [share * _mean(value[:, half_of == side], row[half_of == side], len(pixel)) for side in (0, 1)]
         whole = share * _mean(value, row, len(pixel))
         mean = mean + whole
         alone = np.bincount(row, minlength=len(pixel))[:, None] < 2
         half = half + np.where(alone, whole * (own.sum(1) > 1)[:, None], (both[0] - both[1]) / 2)
-    norm = np.sqrt(np.sum(mean**2, (1, 2)))
-    error = np.sqrt(np.sum(half**2, (1, 2))) / np.where(norm > 0, norm, 1)
-    return ExactPixels(pixel, shown[pixel], mean, error)
+    share = np.bincount(shown[shown >= 0]) / np.maximum(np.bincount(shown[pixel]), 1)
+    weight = share[shown[pixel]]
+    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, weight)) for each in (mean, half))
+    return ExactPixels(pixel, shown[pixel], mean, weight, error / np.where(norm > 0, norm, 1))
+
+
+def exact_picture(
+    scene: Scene,
+    shadings: Sequence[Shading],
+    environments: Sequence[Environment],
+    camera: Camera,
+    *,
+    progress: bool = False,
+) -> ExactPicture:
+    """The picture by the exact sum at each of its shading points, with rays of their own.
+
+    Parts that are ideally diffuse have the sum at their vertices, interpolated, as systems' pictures have; unless
+    these are more than points, or fewer than one for each 8 x 8 pixels. Where other parts have more than 16,384
+    points, the picture has half the pixels along its edges, or a third, and so on.
+
+    Args:
+        scene: The scene.
+        shadings: What its parts are to systems.
+        environments: Lights of one size.
+        camera: From where.
+        progress: Whether to show progress bars.
+    """
+    shown = _Shown.of(scene, camera)
+    smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
+    count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
+    if count > _MOST:
+        step = math.ceil(math.sqrt(count / _MOST))
+        size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
+        camera = dataclasses.replace(camera, **size)
+        shown = _Shown.of(scene, camera)
+    lights = Environment(jnp.stack([each.radiance for each in environments]))
+    color = np.zeros((len(environments), len(shown.owner), lights.radiance.shape[-1]), np.float32)
+    options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress}
+    for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
+        index = np.flatnonzero(shown.owner == number)
+        if not len(index):
+            continue
+        points = shown.points(index, number)
+        if smooth[number]:
+            vertex = np.unique(points.corner)
+            every = jnp.zeros((len(color), len(part.mesh.position), color.shape[-1]))
+            every = every.at[:, vertex].set(
+                reference.radiance(shading.mesh, shading.brdf, lights, vertex=vertex, **options)
+            )
+            look = at_points(part, shading, None, points)
+            value, emitted = points.carry(every, axis=1), look.emitted
+            value = value if look.blend is None else value * look.blend.weight[:, 0]
+        else:
+            brdf, emitted = exact_at(part, shading, points)
+            value = reference.radiance(shading.mesh, brdf, lights, points=points, **options)
+        color[:, index] = value if emitted is None else value + emitted
+    way = raster.ray_direction(camera)
+    skies = [background(each, way) for each in environments]
+    pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, skies, strict=True)]
+    return ExactPicture(camera, np.stack(pictures))
+
+
+class _Shown(NamedTuple):
+    """What a picture shows: its points, the part of each, -1 in padding, triangles, and the parts' first vertices."""
+
+    pixels: Pixels
+    owner: Int[np.ndarray, " p"]
+    face: Int[np.ndarray, "f 3"]
+    first: Int[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera) -> "_Shown":
+        mesh = scene.mesh
+        pixels = shading_points(rasterize(mesh, camera, samples=4), mesh, camera)
+        region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
+        owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
+        return cls(pixels, owner, face, np.cumsum([0, *(len(part.mesh.position) for part in scene.parts)])[:-1])
+
+    def points(self, index: Int[np.ndarray, " m"], part: int) -> Points:
+        """Some points, all of one part."""
+        corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
+        slope = jnp.moveaxis(self.pixels.slope[index], 0, -1)
+        return Points(jnp.asarray(corner.T), self.pixels.barycentric[index].T, slope)
+
+
+def _is_smooth(shading: Shading, shown: _Shown, part: int) -> bool:
+    """Whether the radiance of a part is summed at its vertices: it is ideally diffuse, and they are fine enough."""
+    index = np.flatnonzero(shown.owner == part)
+    vertices = len(np.unique(shown.face[np.asarray(shown.pixels.triangle)[index]]))
+    return isinstance(shading.brdf, Lambert) and vertices <= len(index) <= _COARSE * vertices
 
 
 def _some(own: np.ndarray, count: int) -> np.ndarray:
@@ -107,12 +219,19 @@ def _some(own: np.ndarray, count: int) -> np.ndarray:
     return own & (order <= least[:, None])
 
 
+def _halves(row: Int[np.ndarray, " m"], place: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+    """Cuts the points of each row in two: by diagonals of the pixel, which changes across it do not tell apart."""
+    half = _SIDE // 2
+    side = (place // _SIDE // half + place % _SIDE // half) % 2
+    apart = np.bincount(row, side) * np.bincount(row, 1 - side) > 0
+    return np.where(apart[row], side, (np.arange(len(row)) - np.searchsorted(row, row)) % 2)
+
+
 def _mean(value: Float[np.ndarray, "l m c"], row: np.ndarray, rows: int) -> Float[np.ndarray, "l n c"]:
     """Means of values that belong to the same row; zero of none."""
-    total = np.stack(
-        [np.stack([np.bincount(row, each, rows) for each in light.T], -1) for light in np.asarray(value, np.float64)]
-    )
-    return total / np.maximum(np.bincount(row, minlength=rows), 1)[:, None]
+    total = np.zeros((rows, value.shape[0], value.shape[2]))
+    np.add.at(total, row, value.swapaxes(0, 1))
+    return total.swapaxes(0, 1) / np.maximum(np.bincount(row, minlength=rows), 1)[:, None]
 
 
 def _squares(fine: np.ndarray) -> np.ndarray:
