@@ -14,8 +14,9 @@ from jaxprt import files, image
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.brdf.navigation import Family
 from jaxprt.cli.report import Made, View
+from jaxprt.relit import pictures
 from jaxprt.scene import Camera, TexturedMaterial
-from jaxprt.scene.environment import background, rotate
+from jaxprt.scene.environment import rotate
 from jaxprt.systems import bounces, dynamic, protocol, separable
 from jaxprt.systems.bounces import BouncesSystem
 from jaxprt.systems.dynamic import DynamicSystem, Material
@@ -108,7 +109,7 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
 
 def made(ready: Ready, view: View) -> Made:
     """The scene as the report takes it."""
-    return Made(ready.direct, ready.system, materials(ready, view), {"scene": ready.cost})
+    return Made(ready.direct, ready.system, view.scene.mesh, materials(ready, view), {"scene": ready.cost})
 
 
 def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bool = True) -> list[Path]:
@@ -125,9 +126,7 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
         camera = _swung(view.camera, _ORBIT * np.sin(2 * np.pi * turn))
         lamp = rotate(light, _about(2 * np.pi * turn))
         now = materials(ready, view, turn=turn)
-        color = protocol.radiance(system, lamp, eye=camera.eye, materials=now)
-        sky = background(lamp, image.ray_direction(camera))
-        picture = image.render(mesh, color, camera, background=sky)
+        picture = pictures.of_regions(system, mesh, camera, materials=now).picture(lamp)
         stops = image.automatic_exposure(picture) if stops is None else stops
         result.append(folder / f"frame_{number:04d}.png")
         files.write_png(result[-1], np.asarray(image.display(image.expose(picture, stops=stops))))

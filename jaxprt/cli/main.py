@@ -7,7 +7,6 @@ import os
 import platform
 import resource
 import sys
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -162,25 +161,27 @@ def _run(options: argparse.Namespace) -> None:
         else:
             made[system] = _made(system, view, options)
     found["precompute"] = {system: each.cost for system, each in made.items()}
-    start, seen = time.perf_counter(), report.seen(view)
-    exact = report.exact(view, seen)
-    found["reference_seconds"] = time.perf_counter() - start
-    found["lights"] = {
-        name: report.compare(view, name, made, [each[number] for each in exact], seen, options.output)
-        for number, name in enumerate(view.lights)
+    truth = report.exact(view)
+    found["exact"] = {
+        "seconds": truth.seconds,
+        "pixels": len(truth.pixels.pixel),
+        "picture_width": truth.picture.camera.width,
+        "vertices": {part.name: len(each) for part, each in zip(view.scene.parts, truth.vertex, strict=True)},
     }
-    for (name, light), (system, each) in itertools.product(found["lights"].items(), made.items()):
+    found["lights"] = report.compare(view, made, truth, options.output)
+    stops = {name: light["exposure_stops"] for name, light in found["lights"].items()}
+    for system, each in made.items():
         if each.system is not each.direct:
-            fraction = report.reflect(view, name, system, each, light["exposure_stops"], options.output)
-            light[system]["reflected_fraction"] = fraction
+            for name, fraction in report.reflect(view, system, each, stops, options.output).items():
+                found["lights"][name][system]["reflected_fraction"] = fraction
     if changing is not None and options.animate:
         animation.animate(changing, view, options.output, frames=options.animate)
     found["times"] = {system: report.times(view, each) for system, each in made.items()}
     if options.table:
         vertex = report.sample(view, options.table)
-        truth = report.exact(view, [vertex])[0]
+        right = report.exact_vertices(view, [vertex])[0]
         chosen = [system for system in systems if system in report.TABLES]
-        found["table"] = [row for system in chosen for row in report.table(system, view, vertex, truth)]
+        found["table"] = [row for system in chosen for row in report.table(system, view, vertex, right)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
     path = options.output / "report.json"
@@ -335,21 +336,27 @@ def _warn_of_backs(view: View) -> None:
 
 
 def _tell(found: dict[str, Any], path: Path) -> None:
+    exact = found["exact"]
+    print(
+        f"relative L2 errors of pictures, by {exact['pixels']} exact pixels and as far as these are exact; of vertices:"
+    )
     for name, light in found["lights"].items():
         for system in found["times"]:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
-            error = light[system]["image_error"]
-            print(f"{name}, {system}: relative L2 error of the picture {error:.1%}; of vertex radiance: {parts}")
+            error, least = (light[system][key] for key in ("picture_error", "exact_pixels_error"))
+            print(f"{name}, {system}: picture {error:.1%} (exact pixels: {least:.1%}); vertices: {parts}")
             if "reflected_fraction" in light[system]:
                 fraction = light[system]["reflected_fraction"]
                 print(f"{name}, {system}: {fraction:.1%} of the picture's light comes from other surfaces")
     for system, times in found["times"].items():
         milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
-        print(f"{system}: {milliseconds.replace('_', ' ')}")
+        print(f"{system}: a picture after a {milliseconds.replace('_', ' ')}")
     for row in found.get("table", []):
         print(
             "  ".join(
                 f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
             )
         )
+    if exact["picture_width"] < found["camera"]["width"]:
+        print(f"the exact picture and the differences are {exact['picture_width']} pixels wide")
     print(f"pictures and {path.name} are in {path.parent}")

@@ -1,6 +1,8 @@
 """Holds a scene that systems have made ready beside the exact sum: pictures, errors, times and sizes."""
 
+import dataclasses
 import itertools
+import math
 import statistics
 import timeit
 from collections.abc import Callable
@@ -14,9 +16,12 @@ from jaxtyping import Array
 
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
+from jaxprt.relit import pictures
 from jaxprt.relit.channels import Shading, of_part
+from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
+from jaxprt.relit.pictures import PictureView, RegionsView
 from jaxprt.relit.recipes import Known, Recipe, Target
-from jaxprt.scene import Camera, Environment, Scene
+from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
@@ -29,7 +34,10 @@ TABLE_DEGREES = (2, 4, 6, 9)
 TABLE_LAPLACIAN = (1.0, 0.4)
 TABLE_LOBES = (4, 12, 24)
 TABLE_TEXELS = (0, 16, 64)
+PIXELS = 1200  # by which pictures are measured
+VERTICES = 300  # of each part, by which radiance of vertices is
 _AMPLIFY = 4.0  # brightness of the difference picture beside the others
+_KEPT = 1 << 20  # pixels of the largest picture whose view is kept: a gigabyte
 
 
 class View(NamedTuple):
@@ -50,20 +58,57 @@ class Made(NamedTuple):
     """A scene that one system has made ready.
 
     Attributes:
-        direct: The system of all vertices under direct light alone, as exact pictures have it.
+        direct: The system of all vertices under direct light alone, as exact pictures have it: a `RelitScene`, or one
+            that takes points of the regions of the mesh.
         system: The same with bounces, or `direct` without any.
+        mesh: The mesh of all parts.
         materials: What they are relit with.
         cost: What they took, for the report.
     """
 
     direct: System
     system: System
+    mesh: Mesh
     materials: Any
     cost: dict[str, Any]
 
     def color(self, light: Environment, eye: Array) -> Array:
         """Radiance of direct light of all vertices."""
         return protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
+
+    def view(self, camera: Camera, *, reflected: bool = False) -> PictureView | RegionsView:
+        """All of a picture but its light: direct light, or with bounces."""
+        system = self.system if reflected else self.direct
+        if isinstance(system, relit.RelitScene):
+            return system.picture_view(camera)
+        keep = camera.width * camera.height <= _KEPT
+        return pictures.of_regions(system, self.mesh, camera, materials=self.materials, keep=keep)
+
+    def pictures(self, lights: list[Environment], camera: Camera, *, reflected: bool = False) -> list[Array]:
+        """Pictures of direct light, or with bounces, in several lights."""
+        system = self.system if reflected else self.direct
+        if isinstance(system, relit.RelitScene) and camera.width * camera.height > _KEPT:
+            return [system.picture(each, camera) for each in lights]
+        seen = self.view(camera, reflected=reflected)
+        return [seen.picture(each) for each in lights]
+
+
+class Truth(NamedTuple):
+    """Exact radiance of direct light, under each of the lights.
+
+    Attributes:
+        pixels: Some pixels of the picture, to measure by.
+        picture: A picture to look at.
+        vertex: Of each part some vertices that the picture shows.
+        radiance: What they send to the eye.
+        seconds: What all this took.
+    """
+
+    pixels: ExactPixels
+    picture: ExactPicture
+    vertex: list[np.ndarray]
+    radiance: list[np.ndarray]
+    seconds: dict[str, float]
 
 
 def plan(view: View, output: Path, *, error: float, bounces: int | None) -> Made:
@@ -100,10 +145,25 @@ def _made(view: View, output: Path, **options: Any) -> Made:
         raise ValueError(f"{error}; here: name another --output" if found else str(error)) from error
     direct = relit.RelitScene(ready.scene, ready.direct, ready.shading)
     cost = {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)}
-    return Made(direct, direct if ready.bounces is None else ready, None, cost)
+    return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
-def exact(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
+def exact(view: View) -> Truth:
+    """Exact pixels, pictures and vertices of a view."""
+    shadings, lights = [of_part(part) for part in view.scene.parts], list(view.lights.values())
+    seconds, start = {}, timeit.default_timer()
+    pixels = exact_pixels(view.scene, shadings, lights, view.camera, pixels=PIXELS, progress=True)
+    seconds["pixels"], start = timeit.default_timer() - start, timeit.default_timer()
+    picture = exact_picture(view.scene, shadings, lights, view.camera, progress=True)
+    seconds["picture"], start = timeit.default_timer() - start, timeit.default_timer()
+    random = np.random.default_rng(0)
+    vertex = [random.permutation(each)[:VERTICES] for each in seen(view)]
+    radiance = exact_vertices(view, vertex)
+    seconds["vertices"] = timeit.default_timer() - start
+    return Truth(pixels, picture, vertex, radiance, seconds)
+
+
+def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
     """Radiance by the exact sum of some vertices of the first parts, [light v c]."""
     lights = Environment(jnp.stack([each.radiance for each in view.lights.values()]))
     options = {"eye": view.camera.eye, "occluder": view.scene.mesh, "progress": True}
@@ -133,65 +193,69 @@ def _counts(scene: Scene) -> list[int]:
     return [len(part.mesh.position) for part in scene.parts]
 
 
-def compare(
-    view: View, name: str, made: dict[str, Made], truth: list[np.ndarray], vertices: list[np.ndarray], output: Path
-) -> dict[str, Any]:
-    """Writes the pictures of one light, and returns each system's errors.
+def compare(view: View, made: dict[str, Made], truth: Truth, output: Path) -> dict[str, dict[str, Any]]:
+    """Writes the pictures, and returns each system's errors under each light.
 
     Args:
         view: The scene, its lights and the camera.
-        name: Name of the light.
         made: The systems.
-        truth: Exact radiance of some vertices of every part.
-        vertices: Those vertices: all that the picture shows.
+        truth: Exact radiance of the view.
         output: Folder of the pictures.
     """
-    light, scene, mesh = view.lights[name], view.scene, view.scene.mesh
-    sky = background(light, image.ray_direction(view.camera))
-
-    def draw(color: Array) -> Array:
-        return image.render(mesh, color, view.camera, background=sky)
-
-    full = [
-        jnp.zeros((count, values.shape[-1])).at[vertex].set(values)
-        for count, values, vertex in zip(_counts(scene), truth, vertices, strict=True)
-    ]
-    surface = image.render(mesh, jnp.ones((len(mesh.position), 1)), view.camera, background=None)
-    right = draw(jnp.concatenate(full))
-    stops = image.automatic_exposure(right * surface)
-    errors: dict[str, Any] = {"exposure_stops": float(stops)}
-    pictures = {}
+    lights, mesh, camera = list(view.lights.values()), view.scene.mesh, truth.picture.camera
+    surface = image.render(mesh, jnp.ones((len(mesh.position), 1)), camera, background=None)
+    result: dict[str, dict[str, Any]] = {name: {} for name in view.lights}
+    rows: dict[str, list[Array]] = {name: [] for name in view.lights}
+    right = dict(zip(view.lights, map(jnp.asarray, truth.picture.color), strict=True))
+    stops = {name: image.automatic_exposure(each * surface) for name, each in right.items()}
     for system, each in made.items():
-        color = each.color(light, view.camera.eye)
-        pictures[system] = draw(color)
-        parts = jnp.split(color, np.cumsum(_counts(scene))[:-1])
-        errors[system] = {
-            "image_error": float(image.relative_l2(pictures[system] * surface, right * surface)),
-            "vertex_error": {
-                part.name: float(image.relative_l2(mine[vertex], values))
-                for part, mine, values, vertex in zip(scene.parts, parts, truth, vertices, strict=True)
-            },
-            "negative_vertices": int(jnp.sum(jnp.any(color < 0, -1))),
-        }
-        _write(output, f"{name}_{system}_difference", jnp.abs(pictures[system] - right), stops, _AMPLIFY)
-    for kind, picture in (pictures | {"reference": right}).items():
-        _write(output, f"{name}_{kind}", picture, stops, 1.0)
-    row = jnp.concatenate([*pictures.values(), right], 1)
-    files.write_png(output / f"{name}.png", np.asarray(image.display(image.expose(row, stops=stops))))
-    return errors
+        drawn = each.pictures(lights, view.camera)
+        alike = drawn if camera.width == view.camera.width else each.pictures(lights, camera)
+        for number, name in enumerate(view.lights):
+            result[name][system] = _errors(view, name, each, drawn[number], truth)
+            _write(output, f"{name}_{system}", drawn[number], stops[name], 1.0)
+            _write(output, f"{name}_{system}_difference", jnp.abs(alike[number] - right[name]), stops[name], _AMPLIFY)
+            rows[name].append(drawn[number])
+    for name, each in right.items():
+        result[name]["exposure_stops"] = float(stops[name])
+        _write(output, f"{name}_reference", each, stops[name], 1.0)
+        row = jnp.concatenate([*rows[name], _enlarged(each, view.camera)], 1)
+        files.write_png(output / f"{name}.png", np.asarray(image.display(image.expose(row, stops=stops[name]))))
+    return result
 
 
-def reflect(view: View, name: str, system: str, made: Made, stops: float, output: Path) -> float:
-    """Writes the picture of one light with reflected light too; returns what fraction of the light that is."""
-    light, mesh, eye = view.lights[name], view.scene.mesh, view.camera.eye
-    direct = made.color(light, eye)
-    color = protocol.radiance(made.system, light, eye=eye, materials=made.materials)
-    sky = background(light, image.ray_direction(view.camera))
-    picture = image.render(mesh, color, view.camera, background=sky)
-    _write(output, f"{name}_{system}_bounces", picture, jnp.asarray(stops, picture.dtype), 1.0)
-    first, both = (image.render(mesh, each, view.camera, background=None) for each in (direct, color))
-    total = float(jnp.sum(both))
-    return float(jnp.sum(both - first)) / total if total > 0 else 0.0
+def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> dict[str, Any]:
+    """Relative L2 errors of a picture and of vertices, and how many vertices are negative somewhere."""
+    number, color = list(view.lights).index(name), made.color(view.lights[name], view.camera.eye)
+    parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
+    rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
+    return {
+        "picture_error": truth.pixels.relative_l2(picture, light=number),
+        "exact_pixels_error": float(truth.pixels.error[number]),
+        "vertex_error": {
+            part.name: float(image.relative_l2(mine[vertex], right[number])) for part, mine, vertex, right in rows
+        },
+        "negative_vertices": int(jnp.sum(jnp.any(color < 0, -1))),
+    }
+
+
+def reflect(view: View, system: str, made: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
+    """Writes the pictures with reflected light too; returns what fraction of each one's light that is."""
+    lights, camera, mesh = list(view.lights.values()), view.camera, view.scene.mesh
+    direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
+    pixels = image.shading_points(image.rasterize(mesh, camera, samples=4), mesh, camera)
+    way, result = image.ray_direction(camera), {}
+    for name, light, first, both in zip(view.lights, lights, direct, whole, strict=True):
+        _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), 1.0)
+        total = float(jnp.sum(both - background(light, way) * pixels.background[..., None]))
+        result[name] = float(jnp.sum(both - first)) / total if total > 0 else 0.0
+    return result
+
+
+def _enlarged(picture: Array, camera: Camera) -> Array:
+    """A picture with as many pixels as a camera has: the nearest of its own."""
+    row, column = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), picture.shape, strict=False))
+    return picture[row][:, column]
 
 
 def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -> None:
@@ -201,19 +265,18 @@ def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -
 
 
 def times(view: View, made: Made) -> dict[str, float]:
-    """Median seconds of what a frame needs."""
-    system, materials = made.system, made.materials
-    light, eye, mesh = next(iter(view.lights.values())), view.camera.eye, view.scene.mesh
+    """Median seconds of a picture: in a new light from a kept view, and from a new view with all that is to do."""
+    light, camera = next(iter(view.lights.values())), view.camera
+    edge = math.isqrt(_KEPT)
+    camera = dataclasses.replace(camera, width=min(camera.width, edge), height=min(camera.height, edge))
+    kept, away, number = made.view(camera, reflected=True), camera.eye - camera.target, itertools.count(1)
 
-    def arriving():
-        return system.shade(system.light(light), materials)
+    def moved():
+        return dataclasses.replace(camera, eye=camera.target + away * (1 + 0.01 * next(number)))
 
-    lit, seen = arriving(), system.view(eye, materials)
-    color = system.combine(lit, seen)
     return {
-        "light_change_seconds": _median(lambda: system.combine(arriving(), seen)),
-        "view_change_seconds": _median(lambda: system.combine(lit, system.view(eye, materials))),
-        "render_seconds": _median(lambda: image.render(mesh, color, view.camera, background=None)),
+        "light_change_seconds": _median(lambda: kept.picture(light)),
+        "view_change_seconds": _median(lambda: made.view(moved(), reflected=True).picture(light)),
     }
 
 

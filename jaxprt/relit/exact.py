@@ -40,11 +40,11 @@ class ExactPixels(NamedTuple):
     weight: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " l"]
 
-    def relative_l2(self, pictures: Sequence[Float[ArrayLike, "h w c"]]) -> list[float]:
-        """Relative L2 errors of pictures, one under each light, by these pixels."""
-        rows = (np.reshape(each, (-1, self.color.shape[-1]))[self.pixel] for each in pictures)
+    def relative_l2(self, picture: Float[ArrayLike, "h w c"], *, light: int = 0) -> float:
+        """Relative L2 error of a picture, by these pixels under one of the lights."""
+        row = np.reshape(picture, (-1, self.color.shape[-1]))[self.pixel]
         scale = np.sqrt(self.weight)[:, None]
-        return [float(relative_l2(scale * a, scale * b)) for a, b in zip(rows, self.color, strict=True)]
+        return float(relative_l2(scale * row, scale * self.color[light]))
 
 
 class ExactPicture(NamedTuple):

@@ -250,7 +250,7 @@ def _judged(
     return jnp.where(pixels.triangle >= 0, mesh.region[mesh.face[:, 0]][own], -1), wrong[own]
 
 
-def _rows_of(chosen: Array) -> Int[Array, "m p"]:
+def _rows_of(chosen: Array | np.ndarray) -> Int[Array, "m p"]:
     """Numbers of the points that are chosen, in rows of few lengths, so that programs serve many pictures."""
     if isinstance(chosen, Tracer):
         count = len(chosen)
@@ -260,7 +260,9 @@ def _rows_of(chosen: Array) -> Int[Array, "m p"]:
         count = len(index)
     row = CHUNK if count > CHUNK else max(_FEWEST, 1 << max(count - 1, 0).bit_length())
     rows = -(-count // row)
-    return jnp.pad(index, (0, rows * row - count), constant_values=-1).reshape(rows, row)
+    # Not by JAX where the number of points is known: that would compile for each number.
+    pad = jnp.pad if isinstance(index, Tracer) else np.pad
+    return jnp.asarray(pad(index, (0, rows * row - count), constant_values=-1).reshape(rows, row))
 
 
 def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
@@ -272,7 +274,8 @@ def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
         return False
     if isinstance(index, Tracer) or isinstance(wrong, Tracer):
         return True
-    used = np.asarray(index[index >= 0])
+    used = np.asarray(index)
+    used = used[used >= 0]
     return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
 
 

@@ -130,7 +130,7 @@ def test_the_report_is_json_of_finite_numbers(output):
     assert set(told["lights"]) == {"sky", "dusk"}
     for light in told["lights"].values():
         for system in SYSTEMS:
-            assert 0 < light[system]["image_error"] < 0.5
+            assert 0 < light[system]["picture_error"] < 0.5
             assert set(light[system]["vertex_error"]) == {"mesh", "ground"}
     assert told["precompute"]["separable"]["mesh"]["keep"] == 8
     assert told["precompute"]["harmonic"]["mesh"]["degree"] == 4
@@ -169,7 +169,7 @@ def test_a_second_run_takes_the_transport_from_the_first(place, output, capsys):
     assert "error" not in told.err.lower()
     assert stored == {path: path.stat().st_mtime_ns for path in stored}
     for system in SYSTEMS:
-        errors = (found["lights"]["sky"][system]["image_error"] for found in (before, report(output)))
+        errors = (found["lights"]["sky"][system]["picture_error"] for found in (before, report(output)))
         assert len(set(errors)) == 1
 
 
@@ -354,7 +354,7 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     told = report(output)
     for system in ("dynamic", "lobe"):
         assert 0.03 < told["lights"]["sky"][system]["reflected_fraction"] < 0.2
-    assert told["lights"]["sky"]["dynamic"]["image_error"] < 0.3
+    assert told["lights"]["sky"]["dynamic"]["picture_error"] < 0.3
     assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
     frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
     assert np.abs(frames[0] - frames[1]).max() > 0.05

@@ -12,12 +12,13 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, pictures
-from jaxprt.relit.exact import exact_pixels
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, channels, exact, pictures
+from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.scene.points import Points, on_triangles
+from jaxprt.systems import protocol
 
 SIZE = 8
 CAMERA = Camera([0.6, 2.2, 2.6], [0.0, 0.4, 0.0], [0.0, 1.0, 0.0], 0.9, 20, 16)
@@ -167,6 +168,133 @@ def test_exact_pixels_of_a_bare_square_are_closed_forms():
     assert inside.mean() > 0.5
     assert np.all((exact.color[0] > 0.5 - 1e-3) & (exact.color[0] < 1 + 1e-3))
     np.testing.assert_allclose(exact.color[1], 3 * exact.color[0], rtol=1e-5)
+
+
+def test_exact_pixels_count_for_the_pixels_of_their_part():
+    ready = relit()
+    found = exact_pixels(ready.scene, ready.shading, [light()], CAMERA, pixels=30)
+    # The middle of a pixel is a corner of four places; the one below and to the right of it is looked at.
+    fine = dataclasses.replace(CAMERA, width=4 * CAMERA.width, height=4 * CAMERA.height)
+    triangle = np.asarray(rasterize(ready.mesh, fine).triangle)[2::4, 2::4].ravel()
+    part = np.where(triangle < 0, -1, triangle >= 2)
+    np.testing.assert_array_equal(found.part, part[found.pixel])
+    for number in (0, 1):
+        assert np.isclose(found.weight[found.part == number].sum(), np.sum(part == number))
+    picture = np.zeros((len(part), 3))
+    picture[found.pixel] = found.color[0]
+    assert found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3)) < 1e-6
+    picture[part == 1] = 0
+    square = found.weight * np.sum(found.color[0] ** 2, 1)
+    expected = np.sqrt(square[found.part == 1].sum() / square.sum())
+    np.testing.assert_allclose(found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3)), expected, rtol=1e-5)
+
+
+def test_exact_pixels_know_how_exact_they_are():
+    ready = relit()
+    few, many = (exact_pixels(ready.scene, ready.shading, [light()], CAMERA, pixels=80, points=n) for n in (4, 16))
+    off = np.sqrt(few.weight @ np.sum((few.color[0] - many.color[0]) ** 2, 1))
+    off = off / np.sqrt(many.weight @ np.sum(many.color[0] ** 2, 1))
+    assert 0.7 < few.error[0] / off < 2
+
+
+def whites(count: int = 1) -> list[Environment]:
+    return [Environment(jnp.full((6, SIZE, SIZE, 3), float(k))) for k in range(1, count + 1)]
+
+
+@pytest.mark.parametrize("width", [8, 24])
+def test_the_exact_picture_of_a_texture_in_a_white_light_is_the_texture(width):
+    # By its four vertices where the picture is small, else by points.
+    square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS), matte())
+    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), width, width)
+    found = exact_picture(Scene([square]), [channels.of_part(square)], whites(2), above)
+    edge = np.linspace(0, 1, 16 * width, endpoint=False) + 0.5 / (16 * width)
+    fine = Texture(image()).at(jnp.asarray(np.stack(np.meshgrid(edge, 1 - edge), -1), jnp.float32))
+    mean = np.asarray(fine).reshape(width, 16, width, 16, 3).mean((1, 3))
+    assert found.camera is above
+    assert np.linalg.norm(found.color[0] - mean) < 0.08 * np.linalg.norm(mean)
+    np.testing.assert_allclose(found.color[1], 2 * found.color[0], rtol=1e-4)
+
+
+def test_the_exact_picture_has_rays_from_its_own_points(monkeypatch):
+    monkeypatch.setattr(exact, "_MOST", 150)  # of 640 pixels
+    glossy = scene(floor=SHARP)
+    shadings = [channels.of_part(part) for part in glossy.parts]
+    camera = dataclasses.replace(CAMERA, width=32, height=20)
+    found = exact_picture(glossy, shadings, [light()], camera)
+    height, width = found.color.shape[1:3]
+    assert (found.camera.width, found.camera.height) == (width, height)
+    assert width in (10, 16)
+    # A pixel in the shadow of the ball, where its ray meets the floor.
+    pixel = height - 2, width // 2
+    way = np.asarray(prt.image.ray_direction(found.camera), np.float64)[pixel]
+    place = np.asarray(camera.eye) - way * (float(camera.eye[1]) / way[1])
+    weight = np.linalg.solve(np.vstack([1.5 * SQUARE[[0, 1, 2]].T[[0, 2]], np.ones(3)]), [place[0], place[2], 1])
+    triangle, corner = (0, [0, 1, 2]) if weight.min() >= 0 else (1, [0, 2, 3])
+    weight = np.linalg.solve(np.vstack([1.5 * SQUARE[corner].T[[0, 2]], np.ones(3)]), [place[0], place[2], 1])
+    points = on_triangles(glossy.parts[0].mesh.face, np.array([triangle]), weight[None].astype(np.float32))
+    expected = prt.reference.radiance(
+        glossy.parts[0].mesh, SHARP, light(), eye=camera.eye, occluder=glossy.mesh, points=points
+    )
+    np.testing.assert_allclose(found.color[0][pixel], expected[0], rtol=0.01)
+
+
+class Where(protocol.System):
+    """Radiance that is the position, of a mesh of two regions whose vertices alternate, beside the number of each."""
+
+    place: tuple[jax.Array, ...]
+
+    def light(self, environment):
+        return environment
+
+    def view(self, eye, materials=None):
+        return materials
+
+    def combine(self, light, view):
+        return jnp.concatenate([each * scale for each, scale in zip(self.place, view, strict=True)])
+
+    def at(self, points):
+        return Where(tuple(own.carry(each) for own, each in zip(points, self.place, strict=True)))
+
+    @property
+    def vertices(self):
+        return sum(map(len, self.place))
+
+
+def test_pictures_of_regions_are_shaded_where_their_pixels_are():
+    # A wall of squares, each of either region, before the eye.
+    edge = np.arange(5) / 2 - 1
+    place = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2)
+    quad = np.array([[0, 1, 6], [0, 6, 5]])
+    face = np.concatenate([quad + 5 * row + column for row in range(4) for column in range(4)])
+    side = np.repeat((np.arange(16) // 4 + np.arange(16)) % 2, 2)
+    # Two sets of the same vertices, one for each region, in turns.
+    position = np.repeat(np.pad(place, ((0, 0), (0, 1))), 2, 0)
+    mesh = make_mesh(position, 2 * face + side[:, None], region=np.arange(50) % 2)
+    system = Where(tuple(jnp.asarray(position[number::2], jnp.float32) for number in (0, 1)))
+    camera = Camera([0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2 * np.arctan(1 / 3), 16, 16)
+    black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
+    for keep in (False, True):
+        view = pictures.of_regions(system, mesh, camera, materials=(1.0, 10.0), keep=keep)
+        assert len(view.points) > 1
+        picture = np.asarray(view.picture(black))
+        x = (np.arange(16) + 0.5) / 8 - 1
+        expected = np.stack([*np.meshgrid(x, -x), np.zeros((16, 16))], -1)
+        cell = np.arange(16) // 4
+        expected = expected * np.where((cell[::-1, None] + cell) % 2, 10.0, 1.0)[..., None]
+        np.testing.assert_allclose(picture, expected, atol=1e-4)
+
+
+def test_moving_the_camera_compiles_nothing_anew(caplog):
+    ready = relit()
+    count = set()
+    for k in range(3):
+        camera = dataclasses.replace(CAMERA, eye=CAMERA.eye * (1 + 0.02 * k))
+        if k == 2:
+            jax.config.update("jax_log_compiles", True)
+        count.add(int((ready.picture_view(camera).pixels.triangle >= 0).sum()))
+    jax.config.update("jax_log_compiles", False)
+    assert len(count) == 3
+    assert not [each for each in caplog.messages if "Compiling" in each]
 
 
 @pytest.mark.usefixtures("unchecked")
