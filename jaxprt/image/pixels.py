@@ -95,7 +95,8 @@ def shading_points(
         linear = _linear(*corner)
         weight, rate = _weights(*linear, *step)
         parts.append((triangle, *_packed(triangle, weight, rate, *linear[1:]), pixel, coverage))
-    return Pixels(*_joined(parts), background)
+    triangle, barycentric, slope, pixel, coverage = _joined(parts)
+    return Pixels(triangle, barycentric, slope, pixel, coverage, background)
 
 
 @jax.jit

@@ -34,6 +34,8 @@ def small(coarse, bound):
         patch.setattr(planning, "_HARMONIC", (Harmonics(degree=2),))
         patch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)  # No plan reads it.
         bound(patch, lobe.tabulate, resolution=8)
+        patch.setattr(measuring, "_PICTURE", 32)
+        patch.setattr(measuring, "_PIXELS", 30)
         yield
 
 

@@ -17,7 +17,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import raster
-from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, reflection
+from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -42,6 +42,8 @@ def small(coarse, bound):
         bound(patch, lobe.tabulate, resolution=12)
         bound(patch, separable.factor, terms=6, resolution=16)
         bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
+        patch.setattr(measuring, "_PICTURE", 24)
+        patch.setattr(measuring, "_PIXELS", 12)
         yield
 
 

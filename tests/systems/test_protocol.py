@@ -389,7 +389,7 @@ def test_radiance_at_points_is_the_exact_sum_there(name, close):
     close(color[facing], exact[facing], tolerance=MADE[name].error + 0.05)
 
 
-@each_system
+@pytest.mark.parametrize("name", ["separable, clustered", "harmonic", "lobe, bright texels", "dynamic and bounces"])
 def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
     case, random = made(name), np.random.default_rng(1)
     triangle = random.integers(len(case.mesh.face), size=12)
