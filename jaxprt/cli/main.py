@@ -161,14 +161,15 @@ def _run(options: argparse.Namespace) -> None:
         else:
             made[system] = _made(system, view, options)
     found["precompute"] = {system: each.cost for system, each in made.items()}
-    truth = report.exact(view)
+    drawn = report.draw(view, made)
+    truth = report.exact(view, drawn)
     found["exact"] = {
         "seconds": truth.seconds,
         "pixels": len(truth.pixels.pixel),
         "picture_width": truth.picture.camera.width,
         "vertices": {part.name: len(each) for part, each in zip(view.scene.parts, truth.vertex, strict=True)},
     }
-    found["lights"] = report.compare(view, made, truth, options.output)
+    found["lights"] = report.compare(view, made, drawn, truth, options.output)
     stops = {name: light["exposure_stops"] for name, light in found["lights"].items()}
     for system, each in made.items():
         if each.system is not each.direct:
@@ -337,14 +338,15 @@ def _warn_of_backs(view: View) -> None:
 
 def _tell(found: dict[str, Any], path: Path) -> None:
     exact = found["exact"]
-    print(
-        f"relative L2 errors of pictures, by {exact['pixels']} exact pixels and as far as these are exact; of vertices:"
-    )
     for name, light in found["lights"].items():
+        least = light["exact_pixels_error"]
+        print(f"{name}: errors of pictures are measured by {exact['pixels']} exact pixels, which are {least:.1%} off")
         for system in found["times"]:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
-            error, least = (light[system][key] for key in ("picture_error", "exact_pixels_error"))
-            print(f"{name}, {system}: picture {error:.1%} (exact pixels: {least:.1%}); vertices: {parts}")
+            error, spread = (100 * light[system][key] for key in ("picture_error", "picture_error_spread"))
+            print(
+                f"{name}, {system}: relative L2 error of the picture {error:.1f} ± {spread:.1f} %; of vertices: {parts}"
+            )
             if "reflected_fraction" in light[system]:
                 fraction = light[system]["reflected_fraction"]
                 print(f"{name}, {system}: {fraction:.1%} of the picture's light comes from other surfaces")

@@ -5,7 +5,7 @@ import itertools
 import math
 import statistics
 import timeit
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ TABLE_DEGREES = (2, 4, 6, 9)
 TABLE_LAPLACIAN = (1.0, 0.4)
 TABLE_LOBES = (4, 12, 24)
 TABLE_TEXELS = (0, 16, 64)
-PIXELS = 1200  # by which pictures are measured
+PIXELS = 1000  # by which pictures are measured
 VERTICES = 300  # of each part, by which radiance of vertices is
 _AMPLIFY = 4.0  # brightness of the difference picture beside the others
 _KEPT = 1 << 20  # pixels of the largest picture whose view is kept: a gigabyte
@@ -148,11 +148,17 @@ def _made(view: View, output: Path, **options: Any) -> Made:
     return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
-def exact(view: View) -> Truth:
-    """Exact pixels, pictures and vertices of a view."""
+def draw(view: View, made: dict[str, Made]) -> dict[str, list[Array]]:
+    """Pictures of direct light by each system, in all lights."""
+    return {system: each.pictures(list(view.lights.values()), view.camera) for system, each in made.items()}
+
+
+def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
+    """Exact pixels, pictures and vertices of a view; pixels mostly where the pictures that are drawn may be wrong."""
     shadings, lights = [of_part(part) for part in view.scene.parts], list(view.lights.values())
     seconds, start = {}, timeit.default_timer()
-    pixels = exact_pixels(view.scene, shadings, lights, view.camera, pixels=PIXELS, progress=True)
+    options = {"pixels": PIXELS, "importance": _importance(itertools.chain(*drawn.values())), "progress": True}
+    pixels = exact_pixels(view.scene, shadings, lights, view.camera, **options)
     seconds["pixels"], start = timeit.default_timer() - start, timeit.default_timer()
     picture = exact_picture(view.scene, shadings, lights, view.camera, progress=True)
     seconds["picture"], start = timeit.default_timer() - start, timeit.default_timer()
@@ -161,6 +167,16 @@ def exact(view: View) -> Truth:
     radiance = exact_vertices(view, vertex)
     seconds["vertices"] = timeit.default_timer() - start
     return Truth(pixels, picture, vertex, radiance, seconds)
+
+
+def _importance(drawn: Iterable[Array]) -> np.ndarray:
+    """How likely pixels are wrong: pictures are where they are bright, and more so where they are uneven."""
+    total: Any = 0
+    for picture in drawn:
+        gray = np.asarray(picture, np.float64).mean(-1)
+        around = np.stack([np.roll(gray, step, (0, 1)) for step in itertools.product((-1, 0, 1), repeat=2)])
+        total = total + (around.var(0) + 0.01 * gray**2) / max(np.mean(gray**2), 1e-30)
+    return np.sqrt(total) + 0.02
 
 
 def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
@@ -193,12 +209,15 @@ def _counts(scene: Scene) -> list[int]:
     return [len(part.mesh.position) for part in scene.parts]
 
 
-def compare(view: View, made: dict[str, Made], truth: Truth, output: Path) -> dict[str, dict[str, Any]]:
+def compare(
+    view: View, made: dict[str, Made], drawn: dict[str, list[Array]], truth: Truth, output: Path
+) -> dict[str, dict[str, Any]]:
     """Writes the pictures, and returns each system's errors under each light.
 
     Args:
         view: The scene, its lights and the camera.
         made: The systems.
+        drawn: Their pictures.
         truth: Exact radiance of the view.
         output: Folder of the pictures.
     """
@@ -209,15 +228,15 @@ def compare(view: View, made: dict[str, Made], truth: Truth, output: Path) -> di
     right = dict(zip(view.lights, map(jnp.asarray, truth.picture.color), strict=True))
     stops = {name: image.automatic_exposure(each * surface) for name, each in right.items()}
     for system, each in made.items():
-        drawn = each.pictures(lights, view.camera)
-        alike = drawn if camera.width == view.camera.width else each.pictures(lights, camera)
-        for number, name in enumerate(view.lights):
-            result[name][system] = _errors(view, name, each, drawn[number], truth)
-            _write(output, f"{name}_{system}", drawn[number], stops[name], 1.0)
+        alike = drawn[system] if camera.width == view.camera.width else each.pictures(lights, camera)
+        for number, (name, picture) in enumerate(zip(view.lights, drawn[system], strict=True)):
+            result[name][system] = _errors(view, name, each, picture, truth)
+            _write(output, f"{name}_{system}", picture, stops[name], 1.0)
             _write(output, f"{name}_{system}_difference", jnp.abs(alike[number] - right[name]), stops[name], _AMPLIFY)
-            rows[name].append(drawn[number])
-    for name, each in right.items():
+            rows[name].append(picture)
+    for number, (name, each) in enumerate(right.items()):
         result[name]["exposure_stops"] = float(stops[name])
+        result[name]["exact_pixels_error"] = float(truth.pixels.error[number])
         _write(output, f"{name}_reference", each, stops[name], 1.0)
         row = jnp.concatenate([*rows[name], _enlarged(each, view.camera)], 1)
         files.write_png(output / f"{name}.png", np.asarray(image.display(image.expose(row, stops=stops[name]))))
@@ -229,9 +248,10 @@ def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> 
     number, color = list(view.lights).index(name), made.color(view.lights[name], view.camera.eye)
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
     rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
+    error, spread = truth.pixels.relative_l2(picture, light=number)
     return {
-        "picture_error": truth.pixels.relative_l2(picture, light=number),
-        "exact_pixels_error": float(truth.pixels.error[number]),
+        "picture_error": error,
+        "picture_error_spread": spread,
         "vertex_error": {
             part.name: float(image.relative_l2(mine[vertex], right[number])) for part, mine, vertex, right in rows
         },

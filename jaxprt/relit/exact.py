@@ -2,18 +2,23 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from jaxprt.brdf import Lambert
+from jaxprt.brdf.varying import PerVertex
 from jaxprt.image import Pixels, front, raster, rasterize, relative_l2, resolve, shading_points
 from jaxprt.relit.channels import Shading, at_points, exact_at
-from jaxprt.scene import Camera, Environment, Scene
+from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.systems import reference
@@ -40,11 +45,17 @@ class ExactPixels(NamedTuple):
     weight: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " l"]
 
-    def relative_l2(self, picture: Float[ArrayLike, "h w c"], *, light: int = 0) -> float:
-        """Relative L2 error of a picture, by these pixels under one of the lights."""
+    def relative_l2(self, picture: Float[ArrayLike, "h w c"], *, light: int = 0) -> tuple[float, float]:
+        """Relative L2 error of a picture under one of the lights, and its standard error by the choice of pixels."""
         row = np.reshape(picture, (-1, self.color.shape[-1]))[self.pixel]
+        right = self.color[light]
         scale = np.sqrt(self.weight)[:, None]
-        return float(relative_l2(scale * row, scale * self.color[light]))
+        error = float(relative_l2(scale * row, scale * right))
+        if not 0 < error < np.inf:
+            return error, 0.0
+        off, size = (np.sum(each**2, 1) for each in (row - right, right))
+        spread = np.sqrt(np.sum(self.weight * (self.weight - 1) * (off - error**2 * size) ** 2))
+        return error, float(spread / np.sum(self.weight * size) / (2 * error))
 
 
 class ExactPicture(NamedTuple):
@@ -66,6 +77,7 @@ def exact_pixels(
     camera: Camera,
     *,
     pixels: int | None = None,
+    importance: Float[ArrayLike, "h w"] | None = None,
     points: int = 4,
     progress: bool = False,
 ) -> ExactPixels:
@@ -78,7 +90,8 @@ def exact_pixels(
         shadings: What its parts are to systems.
         environments: Lights of one size.
         camera: From where.
-        pixels: How many of those that show the scene, by chance and of each part alike; all if None.
+        pixels: How many of those that show the scene, by chance; all if None.
+        importance: How likely each of them is one, up to a factor; of each part alike many if None.
         points: Of each pixel and part that are shaded, by chance. One costs some milliseconds.
         progress: Whether to show progress bars.
     """
@@ -90,7 +103,7 @@ def exact_pixels(
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
     owner = np.where(triangle >= 0, region[triangle], -1)
     shown = owner[:, owner.shape[1] // 2 + _SIDE // 2]
-    pixel = _chosen(shown, len(scene.parts), pixels)
+    pixel, number_of = _chosen(shown, len(scene.parts), pixels, importance)
     triangle, weight, seen, owner = triangle[pixel], weight[pixel], seen[pixel], owner[pixel]
     way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
     sky = np.stack([background(each, way) for each in environments])
@@ -106,8 +119,8 @@ def exact_pixels(
             continue
         where = on_triangles(face, triangle[row, place], weight[row, place])
         brdf, emitted = exact_at(part, shading, where)
-        options = {"eye": camera.eye, "occluder": mesh, "points": where, "progress": progress}
-        value = np.asarray(reference.radiance(shading.mesh, brdf, lights, **options), np.float64)
+        options = {"eye": camera.eye, "occluder": mesh, "progress": progress}
+        value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
         value = value if emitted is None else value + np.asarray(emitted)
         share = own.mean(1)[:, None]
         half_of = _halves(row, place)
@@ -116,10 +129,8 @@ def exact_pixels(
         mean = mean + whole
         alone = np.bincount(row, minlength=len(pixel))[:, None] < 2
         half = half + np.where(alone, whole * (own.sum(1) > 1)[:, None], (both[0] - both[1]) / 2)
-    share = np.bincount(shown[shown >= 0]) / np.maximum(np.bincount(shown[pixel]), 1)
-    weight = share[shown[pixel]]
-    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, weight)) for each in (mean, half))
-    return ExactPixels(pixel, shown[pixel], mean, weight, error / np.where(norm > 0, norm, 1))
+    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, number_of)) for each in (mean, half))
+    return ExactPixels(pixel, shown[pixel], mean, number_of, error / np.where(norm > 0, norm, 1))
 
 
 def exact_picture(
@@ -162,20 +173,46 @@ def exact_picture(
         if smooth[number]:
             vertex = np.unique(points.corner)
             every = jnp.zeros((len(color), len(part.mesh.position), color.shape[-1]))
-            every = every.at[:, vertex].set(
-                reference.radiance(shading.mesh, shading.brdf, lights, vertex=vertex, **options)
-            )
+            every = every.at[:, vertex].set(_sum(shading.mesh, shading.brdf, lights, vertex, **options))
             look = at_points(part, shading, None, points)
             value, emitted = points.carry(every, axis=1), look.emitted
             value = value if look.blend is None else value * look.blend.weight[:, 0]
         else:
             brdf, emitted = exact_at(part, shading, points)
-            value = reference.radiance(shading.mesh, brdf, lights, points=points, **options)
+            value = _sum(shading.mesh, brdf, lights, points, **options)
         color[:, index] = value if emitted is None else value + emitted
     way = raster.ray_direction(camera)
     skies = [background(each, way) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, skies, strict=True)]
     return ExactPicture(camera, np.stack(pictures))
+
+
+def _sum(
+    mesh: Mesh,
+    brdf: Callable,
+    lights: Environment,
+    place: Points | Int[np.ndarray, " n"],
+    *,
+    progress: bool,
+    **options: Any,
+) -> np.ndarray:
+    """`reference.radiance` of points or of vertices of some numbers, on all cores."""
+
+    def some(number: int, own: np.ndarray) -> np.ndarray:
+        told, model = progress and number == 0, brdf
+        if isinstance(place, Points):
+            where: dict[str, Any] = {"points": jax.tree.map(lambda each: each[..., own], place)}
+            model = PerVertex(brdf.of(jnp.asarray(own))) if isinstance(brdf, PerVertex) else brdf
+        else:
+            where = {"vertex": place[own]}
+        return np.asarray(reference.radiance(mesh, model, lights, progress=told, **where, **options))
+
+    count = len(place)
+    cores = os.cpu_count() or 1
+    parts = np.array_split(np.arange(count), min(cores, max(count // 64, 1)))
+    # The threads of numpy's products would wait by spinning.
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
+        return np.concatenate(list(pool.map(some, range(len(parts)), parts)), 1)
 
 
 class _Shown(NamedTuple):
@@ -241,10 +278,23 @@ def _squares(fine: np.ndarray) -> np.ndarray:
     return each.reshape(rows * columns, _SIDE**2, *fine.shape[2:])
 
 
-def _chosen(shown: np.ndarray, parts: int, count: int | None) -> np.ndarray:
-    """Pixels of each part, alike many as far as it has them."""
-    if count is None:
-        return np.flatnonzero(shown >= 0)
+def _chosen(
+    shown: Int[np.ndarray, " p"], parts: int, count: int | None, importance: ArrayLike | None
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Some of the pixels that show parts, and how many each stands for."""
+    every = np.flatnonzero(shown >= 0)
+    if count is None or count >= len(every):
+        return every, np.ones(len(every))
     random = np.random.default_rng(0)
-    each = [random.permutation(np.flatnonzero(shown == number))[: -(-count // parts)] for number in range(parts)]
-    return np.sort(np.concatenate(each))
+    if importance is None:
+        each = [random.permutation(np.flatnonzero(shown == number))[: -(-count // parts)] for number in range(parts)]
+        pixel = np.sort(np.concatenate(each))
+        share = np.bincount(shown[every], minlength=parts) / np.maximum(np.bincount(shown[pixel], minlength=parts), 1)
+        return pixel, share[shown[pixel]]
+    chance = np.ravel(importance).astype(np.float64)[every]
+    chance = chance * count / chance.sum()
+    while np.any(chance > 1):
+        sure = chance >= 1
+        chance = np.where(sure, 1, chance * (count - sure.sum()) / chance[~sure].sum())
+    taken = random.random(len(every)) < chance
+    return every[taken], 1 / chance[taken]

@@ -14,6 +14,8 @@ import pytest
 import jaxprt as prt
 from jaxprt.__main__ import main
 from jaxprt.cli import animation
+from jaxprt.cli import report as cli_report
+from jaxprt.relit import exact
 
 OBJ = """
 v 0 1 0
@@ -50,6 +52,7 @@ def small(coarse, bound):
             bound(patch, function, **limits)
         for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
             patch.setattr(animation, name, value)
+        patch.setattr(cli_report, "PIXELS", 200)
         yield
 
 
@@ -131,7 +134,12 @@ def test_the_report_is_json_of_finite_numbers(output):
     for light in told["lights"].values():
         for system in SYSTEMS:
             assert 0 < light[system]["picture_error"] < 0.5
+            assert 0 < light[system]["picture_error_spread"] < 0.3 * light[system]["picture_error"]
             assert set(light[system]["vertex_error"]) == {"mesh", "ground"}
+        assert 0 < light["exact_pixels_error"] < 0.2
+    assert 100 < told["exact"]["pixels"] < 300
+    assert told["exact"]["picture_width"] == 32
+    assert told["exact"]["vertices"] == {"mesh": 4, "ground": 39}
     assert told["precompute"]["separable"]["mesh"]["keep"] == 8
     assert told["precompute"]["harmonic"]["mesh"]["degree"] == 4
     assert told["precompute"]["lobe"]["mesh"]["texels"] == 16
@@ -184,7 +192,8 @@ def glossy(place):
     options += ["--brdf", "ashikhmin-shirley"]
     with pytest.MonkeyPatch.context() as patch:
         for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("DEGREES", (1, 3)), ("LOBES", (1,))):
-            patch.setattr(f"jaxprt.cli.report.TABLE_{name}", values)
+            patch.setattr(cli_report, f"TABLE_{name}", values)
+        patch.setattr(exact, "_MOST", 80)
         assert run(place, *options, sky=("sky.exr", "glossy/other/sky.exr"), output=folder) == 0
     return folder
 
@@ -198,6 +207,20 @@ def test_glossy_brdfs_and_the_error_table(glossy):
     assert all(0 < row[f"error {sky}"] < 2 for row in table for sky in ("sky", "sky_2"))
     made = report(glossy)["precompute"]
     assert (made["harmonic"]["mesh"]["degree"], made["lobe"]["mesh"]["lobes"]) == (3, 1)
+
+
+def test_the_exact_picture_of_many_points_has_fewer_pixels_and_so_have_differences(glossy):
+    assert report(glossy)["exact"]["picture_width"] == 16
+    picture, right, off = (
+        prt.files.read_image(glossy / f"sky_{kind}.exr")[0] for kind in ("lobe", "reference", "lobe_difference")
+    )
+    assert picture.shape == (32, 32, 3)
+    assert right.shape == off.shape == (16, 16, 3)
+    coarse = picture.reshape(16, 2, 16, 2, 3).mean((1, 3))
+    assert np.linalg.norm(off - np.abs(coarse - right)) < 0.1 * np.linalg.norm(right)
+    row, _ = prt.files.read_image(glossy / "sky.png")
+    shown, _ = prt.files.read_image(glossy / "sky_reference.png")
+    np.testing.assert_array_equal(row[:, -32:], np.kron(shown, np.ones((2, 2, 1))))
 
 
 # The command prints warnings itself; here they would be errors before they reach it.

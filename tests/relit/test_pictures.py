@@ -182,11 +182,29 @@ def test_exact_pixels_count_for_the_pixels_of_their_part():
         assert np.isclose(found.weight[found.part == number].sum(), np.sum(part == number))
     picture = np.zeros((len(part), 3))
     picture[found.pixel] = found.color[0]
-    assert found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3)) < 1e-6
+    assert found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3))[0] < 1e-6
     picture[part == 1] = 0
     square = found.weight * np.sum(found.color[0] ** 2, 1)
     expected = np.sqrt(square[found.part == 1].sum() / square.sum())
-    np.testing.assert_allclose(found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3)), expected, rtol=1e-5)
+    measured, spread = found.relative_l2(picture.reshape(CAMERA.height, CAMERA.width, 3))
+    np.testing.assert_allclose(measured, expected, rtol=1e-5)
+    assert 0 < spread < 0.3 * measured
+
+
+def test_important_pixels_are_measured_more_often_and_count_for_less():
+    ready = relit()
+    random = np.random.default_rng(3)
+    importance = random.uniform(0.1, 1, (CAMERA.height, CAMERA.width))
+    importance[8, 10] = 100  # More often than always.
+    found = exact_pixels(ready.scene, ready.shading, [light()], CAMERA, pixels=100, importance=importance, points=1)
+    every = exact_pixels(ready.scene, ready.shading, [light()], CAMERA, points=1)
+    assert found.weight.min() == 1
+    assert 8 * CAMERA.width + 10 in found.pixel
+    rest = found.weight > 1
+    product = (found.weight * importance.ravel()[found.pixel])[rest]
+    np.testing.assert_allclose(product, product[0], rtol=1e-6)
+    assert abs(found.weight.sum() / len(every.pixel) - 1) < 0.2
+    np.testing.assert_array_equal(every.weight, 1)
 
 
 def test_exact_pixels_know_how_exact_they_are():
@@ -201,7 +219,7 @@ def whites(count: int = 1) -> list[Environment]:
     return [Environment(jnp.full((6, SIZE, SIZE, 3), float(k))) for k in range(1, count + 1)]
 
 
-@pytest.mark.parametrize("width", [8, 24])
+@pytest.mark.parametrize("width", [16, 24])
 def test_the_exact_picture_of_a_texture_in_a_white_light_is_the_texture(width):
     # By its four vertices where the picture is small, else by points.
     square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS), matte())
