@@ -158,7 +158,7 @@ def precompute(
     mesh: Mesh,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     *,
-    weights: Sequence[Float[Array, "k c"] | None] | None = None,
+    weights: Sequence[Float[Array, "_ _"] | None] | None = None,
     bounces: int = 2,
     least: float = 0.0,
     components: int = 32,

@@ -71,7 +71,7 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
     return Reflected(tensor, _to_map(direction, _dual()), direction, area, whole)
 
 
-def check_values(least: Sequence[Float[Array, " m"]]) -> None:
+def check_values(least: Sequence[Float[Array, " _"]]) -> None:
     """Refuses BRDFs by their least values, which are not a number where any is not finite."""
     value = np.concatenate([np.asarray(each) for each in least])
     wrong = np.flatnonzero(~(value >= 0))
