@@ -69,6 +69,21 @@ class PartPixels(eqx.Module):
     kept: tuple[PyTree, ...] | None
 
 
+class Canvas(eqx.Module):
+    """What is shaded in a picture, and where it goes.
+
+    Attributes:
+        pixels: The points that are shaded.
+        order: Number of each point's color in the list of all colors, row after row.
+        ray: Unit directions in the world from the eye through the centers of the pixels; the light behind the scene is
+            read along them.
+    """
+
+    pixels: Pixels
+    order: Int[Array, " p"]
+    ray: Float[Array, "h w 3"]
+
+
 class PictureView(eqx.Module):
     """All of a picture but its light: what `RelitScene.picture_view` makes of a scene, a camera and materials.
 
@@ -77,15 +92,15 @@ class PictureView(eqx.Module):
         system: The system of all parts.
         camera: From where.
         surface: The parts.
-        pixels: What is shaded.
-        part: The same, by parts.
+        canvas: What is shaded, and where it goes.
+        part: What is shaded, by parts.
     """
 
     mesh: Mesh
     system: System
     camera: Camera
     surface: tuple[Surface, ...]
-    pixels: Pixels
+    canvas: Canvas
     part: tuple[PartPixels, ...]
 
     def picture(self, environment: Environment) -> Float[Array, "h w c"]:
@@ -104,7 +119,7 @@ class PictureView(eqx.Module):
             arriving = arriving, [None] * len(self.surface)
         direct, reflected = arriving
         rows = [self._rows(own, (direct[own.number], reflected[own.number])) for own in self.part]
-        return _resolved(self.pixels, [own.index for own in self.part], rows, environment, self.camera)
+        return _drawn(self.canvas, rows, environment)
 
     def _rows(self, own: PartPixels, arriving: tuple[PyTree, PyTree]) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
@@ -114,7 +129,7 @@ class PictureView(eqx.Module):
             return jnp.stack([_lit(surface, arriving, vertices, view) for view in own.kept])
 
         def shaded(index):
-            points = _points_of(self.pixels, self.mesh.face, surface.first, index)
+            points = _points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
             return _shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels)
 
         if not isinstance(own.index, Tracer):
@@ -133,19 +148,17 @@ class RegionsView(eqx.Module):
 
     Attributes:
         system: The system.
-        materials: Its materials.
+        materials: The materials of the regions, as `System.view` takes them.
         camera: From where.
-        pixels: What is shaded.
-        index: Numbers of the points of each region r, in rows m that are shaded at once; -1 in padding.
-        points: The points of each row, of each region.
+        canvas: What is shaded, and where it goes.
+        points: The points of each row that is shaded at once, of each region.
         kept: What the system makes of the view of each row; None where that is made anew for each light.
     """
 
     system: System
     materials: PyTree
     camera: Camera
-    pixels: Pixels
-    index: Int[Array, "m r p"]
+    canvas: Canvas
     points: tuple[tuple[Points, ...], ...]
     kept: tuple[PyTree, ...] | None
 
@@ -161,7 +174,7 @@ class RegionsView(eqx.Module):
             system = self.system.at(points)
             view = system.view(self.camera.eye, self.materials) if self.kept is None else self.kept[number]
             rows.append(system.combine(arriving, view))
-        return _resolved(self.pixels, list(self.index), rows, environment, self.camera)
+        return _drawn(self.canvas, rows, environment)
 
 
 def make(
@@ -174,7 +187,7 @@ def make(
         system: The system of all parts.
         surfaces: The parts.
         camera: From where.
-        samples: Of each pixel's coverage, 4 or 1.
+        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
     """
     bend = jnp.stack([each.curvature for each in surfaces])[mesh.region]
@@ -192,7 +205,8 @@ def make(
             points = (_points_of(pixels, mesh.face, surface.first, each) for each in index)
             kept = tuple(_viewed(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
         parts.append(PartPixels(number, at_pixels, index, kept))
-    return PictureView(mesh, system, camera, tuple(surfaces), pixels, tuple(parts))
+    canvas = _canvas(pixels, [each.index for each in parts], camera)
+    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts))
 
 
 def of_regions(
@@ -207,7 +221,7 @@ def of_regions(
         mesh: The mesh.
         camera: From where.
         materials: As the system takes them.
-        samples: Of each pixel's coverage, 4 or 1.
+        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
         keep: Whether what the system makes of the view is kept for other lights: about a kilobyte for each point.
     """
     pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
@@ -225,19 +239,32 @@ def of_regions(
     corner = jnp.asarray(place[face])
     points = tuple(tuple(_points_of(pixels, corner, 0, each) for each in row) for row in index)
     kept = tuple(system.at(each).view(camera.eye, materials) for each in points) if keep else None
-    return RegionsView(system, materials, camera, pixels, index, points, kept)
+    return RegionsView(system, materials, camera, _canvas(pixels, list(index), camera), points, kept)
 
 
-def _resolved(
-    pixels: Pixels, index: Sequence[Array], rows: Sequence[Array], environment: Environment, camera: Camera
-) -> Float[Array, "h w c"]:
-    """The picture of points whose colors come in rows, numbered by their indices, before a light."""
-    colors = max((each.shape[-1] for each in rows), default=environment.radiance.shape[-1])
-    color = jnp.zeros((len(pixels.triangle), colors), pixels.coverage.dtype)
-    for own, row in zip(index, rows, strict=True):
-        place = jnp.where(own < 0, len(color), own).ravel()
-        color = color.at[place].set(row.reshape(-1, row.shape[-1]), mode="drop")
-    return resolve(pixels, color, background=background(environment, raster.ray_direction(camera)))
+def _canvas(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
+    """The canvas of some points. `index` has their numbers in the order in which they are shaded, -1 in padding."""
+    every = [each.ravel() for each in index]
+    count = len(pixels.triangle)
+    if any(isinstance(each, Tracer) for each in every):
+        row = jnp.concatenate(every)
+        place = jnp.where(row < 0, count, row)
+        order = jnp.zeros(count, jnp.int32).at[place].set(jnp.arange(len(row), dtype=jnp.int32), mode="drop")
+    else:
+        row = np.concatenate([np.zeros(0, np.int32), *every])
+        order = np.zeros(count, np.int32)
+        order[row[row >= 0]] = np.flatnonzero(row >= 0)
+    return Canvas(pixels, jnp.asarray(order), raster.ray_direction(camera))
+
+
+@jax.jit
+def _drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Float[Array, "h w c"]:
+    """The picture of the points with these colors, in rows as they were shaded, in front of the light."""
+    sky = background(environment, canvas.ray)
+    colors = max([sky.shape[-1], *(each.shape[-1] for each in rows)])
+    flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
+    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])  # Not empty where nothing is seen.
+    return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)
 
 
 @jax.jit

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.brdf import grid
@@ -17,12 +17,11 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.protocol import Blend, System, VertexSystem
-from jaxprt.visibility.points import PointVisibility
+from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels of which the brightest is looked at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _FINE = 32
-_GROUP = 16  # texels at once: what is held for each vertex meanwhile
 
 
 @runtime_checkable
@@ -56,11 +55,13 @@ class BrightLight(eqx.Module):
         rest: The light without them, as the other system has it.
         texel: Numbers of the texels.
         excess: Radiance by which each stands out.
+        seen: How much of each texel each vertex sees, in sixteenths; None before `BrightTexels.shade`.
     """
 
     rest: PyTree
     texel: Int[Array, " t"]
     excess: Float[Array, "t c"]
+    seen: UInt8[Array, "t v"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -68,12 +69,14 @@ class BrightView(eqx.Module):
 
     Attributes:
         rest: The view, as the other system has it.
-        eye: Position of the viewer in world units.
+        frame: Shading frames of the vertices or points; rows are tangent, bitangent, normal.
+        wo: Unit directions to the viewer, in these frames.
         blend: What the vertices are made of, where that is free.
     """
 
     rest: PyTree
-    eye: Float[Array, "3"]
+    frame: Float[Array, "v 3 3"]
+    wo: Float[Array, "v 3"]
     blend: Blend | None
 
 
@@ -108,25 +111,31 @@ class BrightTexels(VertexSystem):
         return BrightLight(self.system.light(rest), texel, excess)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
-        """What arrives of the rest."""
-        return BrightLight(self.system.shade(light.rest, materials), light.texel, light.excess)
+        """What arrives of the rest, and how much of each texel the vertices see."""
+        rest = self.system.shade(light.rest, materials)
+        return BrightLight(rest, light.texel, light.excess, _seen(self.visibility, light.texel))
 
     def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> BrightView:
-        """The view, as the system has it."""
-        return BrightView(self.system.view(eye, materials), jnp.asarray(eye), materials)
+        """The view, as the system has it, and the frames and directions in which the texels are summed."""
+        position, frame = self.place(self.visibility)
+        return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
 
     def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
         """Radiance: that of the system, and that of the texels."""
         require.kind("the light", light, BrightLight, source="BrightTexels.light")
         require.kind("the view", view, BrightView, source="BrightTexels.view")
-        rest = self.system.combine(light.rest, view.rest)
-        options = {"eye": view.eye, "samples": self.samples, "blend": view.blend}
-        visible = self.visibility if self.points is None else PointVisibility(self.visibility, self.points)
-        return rest + radiance(visible, self.brdf, light.texel, light.excess, **options)
+        seen = _seen(self.visibility, light.texel) if light.seen is None else light.seen
+        texels = light.texel, light.excess / LEVELS, seen
+        options = {"size": self.visibility.size, "samples": self.samples}
+        brdf = grid.as_argument(self.brdf)
+        sent = _sent(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
+        return self.system.combine(light.rest, view.rest) + sent
 
     def at(self, points: Points) -> "BrightTexels":
         """The same at points: `System.at`."""
-        return eqx.tree_at(lambda each: each.system, super().at(points), self.system.at(points))
+        return eqx.tree_at(
+            lambda each: (each.points, each.system), self, (points, self.system.at(points)), is_leaf=lambda x: x is None
+        )
 
     @property
     def vertices(self) -> int:
@@ -213,7 +222,9 @@ def radiance(
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)
     require.position("the eye", eye)
-    return _radiance(transport, brdf, texel, excess, eye, blend, samples=samples)
+    wo = directions.view(transport.frame, transport.position, eye)
+    light = texel, excess, transport.visible(texel)
+    return _sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
 
 
 def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -224,47 +235,68 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
     return jnp.asarray(excess, jnp.result_type(excess, transport.position))
 
 
-@partial(jax.jit, static_argnames=("samples",))
-def _radiance(
-    transport: Visibility,
+@partial(jax.jit, static_argnames=("size", "samples"))
+def _sent(
     brdf: Callable,
-    texel: Array,
-    excess: Array,
-    eye: Array,
+    frame: Float[Array, "p 3 3"],
+    wo: Float[Array, "p 3"],
+    light: tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t v"] | Float[Array, "t v"]],
+    points: Points | None,
     blend: Blend | None,
     *,
+    size: int,
     samples: int,
-) -> Array:
-    frame = jnp.moveaxis(transport.frame, 0, 2)
-    wo = directions.view(transport.frame, transport.position, eye).T
+) -> Float[Array, "p e"]:
+    """Radiance that vertices, or points, send: the sum over texels of light x BRDF x cosine x visibility.
+
+    Args:
+        brdf: The BRDF, in 1/sr.
+        frame: Rows are tangent, bitangent, normal.
+        wo: Directions to the viewer in it.
+        light: Numbers of the texels; their radiance; and how much of each the vertices see. Only the product of the
+            last two counts, so that the second may be in sixteenths and the first divided by 16.
+        points: The points; None for the vertices.
+        blend: As in `radiance`.
+        size: Edge of the cubemap's faces in texels.
+        samples: Points along the edge of each texel.
+    """
+    texel, excess, visible = light
+    # Vertices last, which XLA's CPU code turns into vectors of them.
+    frame, wo = jnp.moveaxis(frame, 0, 2), wo.T
     parameter = () if blend is None else blend.parameter
+    weight = None if blend is None else jnp.moveaxis(blend.weight, 0, 2)
 
     def one(wi, wo, *parameter):
         return brdf(*parameter)(wi, wo) if parameter else brdf(wi, wo)
 
-    # Vertices last, which XLA's CPU code turns into vectors of them.
-    own = (0,) * len(parameter)
-    by_vertex = jax.vmap(one, in_axes=(1, 1, *own), out_axes=1)
-    value = jax.vmap(by_vertex, in_axes=(1, None, *(None for _ in own)), out_axes=1)
+    value = jax.vmap(one, in_axes=(1, 1, *(0 for _ in parameter)), out_axes=1)
 
-    def group(argument):
+    def add(total, argument):
         direction, area, excess, visible = argument
-        wi = jnp.stack([_along(axis, direction[:, None]) for axis in frame])
-        sent = value(wi, wo, *parameter) * (jnp.maximum(_along(frame[2], area[:, None]), 0) * visible)
-        if blend is not None:
-            return jnp.einsum("ktv,tc,vkc->cv", sent, *_weighted(excess, blend.weight))
-        return excess.T @ sent[0] if len(sent) == 1 else jnp.einsum("ctv,tc->cv", *_alike(sent, excess))
+        share = visible.astype(wo.dtype) if points is None else points.carry(visible)
+        sent = jax.lax.scan(point, dark, (direction, area))[0] * share
+        if weight is not None:
+            sent = jnp.sum(sent[:, None] * weight, 0)
+        return total + sent * excess[:, None], None
 
-    direction, area = (each.reshape(-1, 3).astype(excess.dtype) for each in _points(texel, transport.size, samples))
-    texel, excess = (jnp.repeat(each, samples**2, axis=0) for each in (texel, excess))
-    count = max(1, min(_GROUP, len(texel)))
-    spare = -len(texel) % count
-    texel = jnp.pad(texel, (0, spare))
-    direction, area, excess = (jnp.pad(each, ((0, spare), (0, 0))) for each in (direction, area, excess))
-    groups = jax.tree.map(
-        lambda x: x.reshape(len(x) // count, count, *x.shape[1:]), (direction, area, excess, transport.visible(texel))
-    )
-    return jnp.sum(jax.lax.map(group, groups), 0).T
+    def point(total, argument):
+        direction, area = argument
+        wi = jnp.stack([_along(axis, direction) for axis in frame])
+        return total + value(wi, wo, *parameter) * jnp.maximum(_along(frame[2], area), 0), None
+
+    channel = jax.eval_shape(value, wo, wo, *parameter)
+    dark = jnp.zeros(channel.shape, jnp.result_type(channel, excess, wo))
+    colors = max(len(dark) if weight is None else weight.shape[1], excess.shape[1])
+    direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples))
+    # One after another, so that what is between stays in the processor's cache.
+    none = jnp.zeros((colors, wo.shape[1]), dark.dtype)
+    return jax.lax.scan(add, none, (direction, area, excess, visible))[0].T
+
+
+@jax.jit
+def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
+    """Share of some texels that each vertex sees, in sixteenths."""
+    return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
 
 
 def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
@@ -366,14 +398,3 @@ def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
 def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
     """Components along an axis of each vertex."""
     return axis[0] * direction[..., 0] + axis[1] * direction[..., 1] + axis[2] * direction[..., 2]
-
-
-def _weighted(excess: Array, weight: Array) -> tuple[Array, Array]:
-    """Light and weights in as many colors as either has."""
-    colors = max(excess.shape[1], weight.shape[2])
-    return jnp.broadcast_to(excess, (len(excess), colors)), jnp.broadcast_to(weight, (*weight.shape[:2], colors))
-
-
-def _alike(sent: Array, excess: Array) -> tuple[Array, Array]:
-    """A gray light in as many colors as the BRDF."""
-    return sent, jnp.broadcast_to(excess, (len(excess), len(sent)))

@@ -309,7 +309,7 @@ def test_moving_the_camera_compiles_nothing_anew(caplog):
         camera = dataclasses.replace(CAMERA, eye=CAMERA.eye * (1 + 0.02 * k))
         if k == 2:
             jax.config.update("jax_log_compiles", True)
-        count.add(int((ready.picture_view(camera).pixels.triangle >= 0).sum()))
+        count.add(int((ready.picture_view(camera).canvas.pixels.triangle >= 0).sum()))
     jax.config.update("jax_log_compiles", False)
     assert len(count) == 3
     assert not [each for each in caplog.messages if "Compiling" in each]

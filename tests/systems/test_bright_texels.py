@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import bright_texels, reference
+from jaxprt import bright_texels, harmonic, reference
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import join
@@ -220,6 +220,16 @@ def test_radiance_is_linear_in_the_excess(transport, sky, random, close):
     other = jnp.asarray(random.normal(size=excess.shape), jnp.float32)
     first, second = (bright_texels.radiance(transport, GLOSSY, texel, each, eye=EYE) for each in (excess, other))
     close(bright_texels.radiance(transport, GLOSSY, texel, 2 * excess - other, eye=EYE), 2 * first - second)
+
+
+def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_view(mesh, transport, sky, close):
+    nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE, progress=False), jnp.zeros(3))
+    system = bright_texels.BrightTexels(nothing, transport, GLOSSY, count=COUNT)
+    lit, seen = system.light(sky), system.view(EYE)
+    assert lit.seen is None
+    assert system.shade(lit).seen.shape == (COUNT, len(transport.position))
+    np.testing.assert_array_equal(system.combine(system.shade(lit), seen), system.combine(lit, seen))
+    close(system.combine(lit, seen), bright_texels.radiance(transport, GLOSSY, lit.texel, lit.excess, eye=EYE))
 
 
 def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):

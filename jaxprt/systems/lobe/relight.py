@@ -217,17 +217,19 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     irradiance = light.coefficient.T @ view.vector
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)
+    # Colors side by side, so that a tap reads them at once; lobes one after another, so that sums stay in the cache.
+    rows = light.pyramid.T
     colors = max(len(view.weight), len(light.pyramid))
 
-    def one(color):
-        row = light.pyramid[min(color, len(light.pyramid) - 1)]
-        weight = view.weight[min(color, len(view.weight) - 1)]
-        taps = zip(view.place, view.visible, strict=True)
-        lit = reduce(jnp.add, (row.at[place].get(mode="promise_in_bounds") * visible for place, visible in taps))
-        return reduce(jnp.add, (a * b for a, b in zip(lit, weight, strict=True)))
+    def add(total, lobe):
+        place, visible, weight = lobe
+        taps = zip(place, visible, strict=True)
+        lit = reduce(jnp.add, (rows.at[texel].get(mode="promise_in_bounds") * part[:, None] for texel, part in taps))
+        return total + lit * weight.T, None
 
-    glossy = jnp.stack([one(color) for color in range(colors)])
-    return (glossy + irradiance * view.diffuse).T
+    none = jnp.zeros((view.weight.shape[2], colors), jnp.result_type(rows, view.weight))
+    glossy, _ = jax.lax.scan(add, none, (view.place, view.visible, jnp.swapaxes(view.weight, 0, 1)))
+    return glossy + (irradiance * view.diffuse).T
 
 
 @lru_cache(maxsize=8)
