@@ -132,7 +132,7 @@ def fit(
     extent: Float[Array, " s"] | Float[Array, ""] | float = 0.0,
     fixed: Float[Array, "s m"] | None = None,
     weight: Float[Array, " m"] | None = None,
-    least: Float[Array, ""] | float = 1e-3,
+    least: Float[Array, "*l"] | float = 1e-3,
     most: Float[Array, ""] | float = 1e6,
     steps: int = 50,
 ) -> Fit:
@@ -149,7 +149,7 @@ def fit(
             finer than that.
         fixed: Logarithm of each fixed density at each sample; minus infinity where there is none.
         weight: Weights of the fixed densities to begin with.
-        least: Smallest concentration of a lobe.
+        least: Smallest concentration of a lobe, or of each.
         most: Largest concentration of a lobe: a sample alone would have an infinite one.
         steps: Number of steps.
 

@@ -14,6 +14,9 @@ from jaxprt.sphere import directions, hemisphere
 RINGS, SECTORS = 64, 96  # of the quadrature that EM's samples are
 FINEST = 2e5  # concentration: a width of an eighth of a degree
 _WIDEST = 2.0  # times the concentration of one lobe for all: what a lobe must have, or light and shadow decorrelate
+_TAIL = 4  # One lobe of so many may be wider, for tails:
+_RATIO = 4.0  # each by this factor in concentration than the one before it,
+_BROADEST = 8.0  # down to this concentration, a width of twenty degrees.
 _SHARP = 50.0  # concentration from where a lobe is as good as flat
 _CORE = 0.6  # share of the mass nearest to the mirror direction by which lobes are laid out
 _BATCH = 8  # views fitted at once
@@ -43,8 +46,12 @@ def samples(
 @partial(jax.jit, static_argnames=("lobes",))
 def start(
     wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
-) -> tuple[mixture.Mixture, Float[Array, " v"]]:
-    """Lobes on a spiral over half vectors, as dense as the BRDF's core is; and the least concentration of each view."""
+) -> tuple[mixture.Mixture, Float[Array, "v l"]]:
+    """Lobes on a spiral over half vectors, as dense as the BRDF's core is; and the least concentration of each.
+
+    The last quarter of the lobes have smaller bounds: they may widen to the tails of a sharp BRDF. Without them EM
+    gives the tails to the diffuse part.
+    """
     away = 1 - jnp.einsum("vsi,vi->vs", sample, mirror(wo))
     order = jnp.argsort(away, 1)
     portion = jnp.cumsum(jnp.take_along_axis(mass, order, 1), 1)
@@ -62,7 +69,9 @@ def start(
     drop = 2 * jnp.sum(near * away, 1)
     least = jnp.clip(_WIDEST * mixture.concentration_of(jnp.clip(drop, 1e-7, 0.8)), 1, FINEST / 2)
     mean = _reflected(wo, tilt, _LOWEST)
-    concentration = jnp.broadcast_to(1.5 * least[:, None], mean.shape[:2])
+    wider = _RATIO ** -jnp.maximum(number + 1 - (lobes - lobes // _TAIL), 0)
+    least = jnp.minimum(least[:, None], jnp.maximum(least[:, None] * wider, _BROADEST))
+    concentration = 1.5 * least
     weight = jnp.broadcast_to(portion[:, -1:] / lobes, mean.shape[:2])
     return mixture.Mixture(weight, mean, concentration), least
 
@@ -73,7 +82,7 @@ def improve(
     mass: Float[Array, "v s"],
     extent: Float[Array, "v s"],
     lobe: mixture.Mixture,
-    least: Float[Array, " v"],
+    least: Float[Array, "v l"],
     fixed: Float[Array, "v s k"],
     weight: Float[Array, "v k"],
     *,

@@ -193,9 +193,10 @@ def tabulate(
 
     Lobes are fitted at each node of the view to samples on arcs around the mirror direction. All nodes start alike, in
     terms of half vectors, and are drawn to their neighbors between the rounds, so that a lobe stays the same one from
-    node to node and can be interpolated. No lobe is wider than about 0.7 of what a single one would be: with wider ones
-    more lobes would bring nothing where light and visibility vary. The energy of each node's
-    view is kept; the last node of an isotropic table is half a degree above the horizon and read as if on it.
+    node to node and can be interpolated. Three quarters of the lobes are no wider than about 0.7 of what a single one
+    would be: with wider ones more lobes would bring nothing where light and visibility vary. The others may be, for the
+    tails of sharp BRDFs. The energy of each node's view is kept; the last node of an isotropic table is half a degree
+    above the horizon and read as if on it.
 
     Args:
         brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the

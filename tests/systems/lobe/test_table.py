@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from jaxprt import lobe
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.sphere import hemisphere
 from jaxprt.systems.lobe.published import mirror_lobes
 
@@ -151,6 +151,16 @@ def test_an_error_out_of_reach_is_refused_and_the_best_named(told, monkeypatch):
     best = f"{float(told(error=0.05).error):.3g}"
     with pytest.raises(ValueError, match=f"error must be at least {best}, which 2 lobes reach; got 1e-05"):
         lobe.tabulate(GLOSSY, error=1e-5, resolution=RESOLUTION)
+
+
+def test_the_tail_of_a_sharp_metal_is_not_diffuse():
+    metal = MetallicRoughness([0.8, 0.6, 0.4], metallic=1.0, roughness=0.05**0.5)  # GGX, alpha = .05
+    table = lobe.tabulate(metal, lobes=12)
+    tilt = np.radians([0.0, 30.0, 60.0])
+    wo = jnp.asarray(np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], -1), jnp.float32)
+    # Farther than 60 degrees from the mirror direction are .3 to .4 % of the light. With lobes of like widths alone the
+    # diffuse albedo is .04 to .06.
+    assert np.all(table.lookup(wo).diffuse[0] < 0.02)
 
 
 def test_diffuse_brdfs_have_nearly_no_error_and_the_albedo():
