@@ -252,8 +252,9 @@ class RelitScene(System):
 
         Raises:
             TypeError: They are no list of points for each part.
+            ValueError: Points are not on triangles of their part.
         """
-        given = tuple(protocol.check_points(points, self.scene.parts))
+        given = protocol.check_points(points, [len(part.mesh.position) for part in self.scene.parts])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
@@ -16,7 +17,10 @@ def _floating(value) -> Array:
 
 
 class Camera(eqx.Module):
-    """A pinhole camera. Lists and NumPy arrays become arrays. NaN and infinity raise ValueError outside `jax.jit`.
+    """A pinhole camera. Lists and NumPy arrays become arrays.
+
+    Values that are not finite, angles out of their range, an eye that is the target, and pictures without pixels raise
+    ValueError; inside `jax.jit` values are not known.
 
     Attributes:
         eye: Position in world units.
@@ -38,6 +42,16 @@ class Camera(eqx.Module):
         """Refuses places, directions and angles that are not finite."""
         for name in ("eye", "target", "up", "field_of_view"):
             require.finite(f"the camera's {name}", getattr(self, name))
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"the camera's {name} must be a whole number of pixels, at least 1, got {value!r}")
+        known = [None if isinstance(x, Tracer) else np.asarray(x) for x in (self.field_of_view, self.eye, self.target)]
+        angle, eye, target = known
+        if angle is not None and not np.all((angle > 0) & (angle < np.pi)):
+            raise ValueError(f"the camera's field_of_view must be between 0 and pi, in radians, got {angle}")
+        if eye is not None and target is not None and np.array_equal(eye, target):
+            raise ValueError(f"the camera's eye and target must be two places, got {eye} for both")
 
 
 def orbit(

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Integer
+from jaxtyping import Array, Float, Int, Integer, Num
 
+from jaxprt import require
 from jaxprt.sphere import directions
 
 _ROUNDED = 1e-4  # by which weights may miss the triangle
@@ -31,12 +32,14 @@ class Points(eqx.Module):
         """Number of points."""
         return self.corner.shape[1]
 
-    def carry(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
+    def carry(self, attribute: Num[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
         """An attribute of the vertices, along an axis, interpolated at the points: linear in it."""
         wide = [1] * attribute.ndim
         wide[axis] = len(self)
+        floating = jnp.issubdtype(attribute.dtype, jnp.inexact)
         parts = [
-            jnp.take(attribute, corner, axis, mode="clip") * weight.astype(attribute.dtype).reshape(wide)
+            jnp.take(attribute, corner, axis, mode="clip")
+            * (weight.astype(attribute.dtype) if floating else weight).reshape(wide)
             for corner, weight in zip(self.corner, self.weight, strict=True)
         ]
         return functools.reduce(jnp.add, parts)
@@ -45,6 +48,23 @@ class Points(eqx.Module):
         """Change of an attribute of the vertices from one pixel to the next, to the right and down."""
         assert self.slope is not None
         return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])
+
+    def check(self, vertices: int) -> None:
+        """Refuses points of other vertices, and outside of their triangles. Inside of `jax.jit` values are not known.
+
+        Raises:
+            ValueError: A corner is none of so many vertices, or weights are negative or do not sum to 1.
+        """
+        shapes = list(np.shape(self.corner)), list(np.shape(self.weight))
+        if len(shapes[0]) != 2 or shapes[0] != shapes[1]:
+            raise ValueError(f"points must have corners [k, p] and weights [k, p], got {shapes[0]} and {shapes[1]}")
+        require.within("the corners of points", self.corner, 0, vertices - 1)
+        require.at_least("the weights of points", self.weight, 0.0, slack=_ROUNDED)
+        if not isinstance(self.weight, Tracer):
+            total = np.sum(np.asarray(self.weight), 0)
+            if total.size and not np.all(np.abs(total - 1) <= _ROUNDED):
+                worst = int(np.argmax(np.abs(total - 1)))
+                raise ValueError(f"the weights of points must sum to 1, got {total[worst]:g} at point {worst}")
 
     def frame(self, frame: Float[Array, "v 3 3"]) -> Float[Array, "p 3 3"]:
         """Shading frames: the interpolated normal at unit length, and the interpolated tangent orthogonal to it.

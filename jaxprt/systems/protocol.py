@@ -101,8 +101,14 @@ class VertexSystem(System):
     points: Points | None = eqx.field(default=None, kw_only=True)
 
     def at(self, points: Points) -> "VertexSystem":
-        """The same system at points: `System.at`."""
+        """The same system at points: `System.at`.
+
+        Raises:
+            ValueError: Points are not on triangles of the mesh.
+        """
         require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
+        every = eqx.tree_at(lambda each: each.points, self, None, is_leaf=lambda each: each is None)
+        points.check(every.vertices)
         return eqx.tree_at(lambda each: each.points, self, points, is_leaf=lambda each: each is None)
 
     def carried(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
@@ -242,7 +248,8 @@ class Joined(System):
 
     def at(self, points: Sequence) -> "Joined":
         """Points of each system, one list after the other: `System.at`."""
-        return Joined(tuple(each.at(own) for each, own in zip(self.part, check_points(points, self.part), strict=True)))
+        check_list(points, len(self.part))
+        return Joined(tuple(each.at(own) for each, own in zip(self.part, points, strict=True)))
 
     def _given(self, materials: Sequence | None) -> Sequence:
         if materials is None:
@@ -263,15 +270,28 @@ class Joined(System):
         return None if None in keys else (Joined, *keys)
 
 
-def check_points(points: Any, part: Sequence) -> Sequence:
-    """Refuses what is no list of points for each part.
+def check_list(points: Any, parts: int) -> None:
+    """Refuses what is no list of points for each of so many parts.
 
     Raises:
         TypeError: It is none.
     """
-    if not isinstance(points, Sequence) or len(points) != len(part):
-        raise TypeError(f"the points must be a list, one for each of {len(part)} parts, got {type(points).__name__}")
-    return points
+    if not isinstance(points, Sequence) or len(points) != parts:
+        raise TypeError(f"the points must be a list, one for each of {parts} parts, got {type(points).__name__}")
+
+
+def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
+    """Refuses what is no list of points for each part, of so many vertices.
+
+    Raises:
+        TypeError: It is none.
+        ValueError: Points are not on triangles of their part.
+    """
+    check_list(points, len(vertices))
+    for each, count in zip(points, vertices, strict=True):
+        require.kind("the points", each, Points, source="jaxprt.scene.points.on_triangles")
+        each.check(count)
+    return tuple(points)
 
 
 def total(*systems: System) -> Total:

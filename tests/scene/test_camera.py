@@ -104,6 +104,32 @@ def test_places_and_angles_that_are_not_finite_are_refused_by_name_unless_they_a
 
 
 @pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"field_of_view": 0.0}, "field_of_view must be between 0 and pi, in radians, got 0"),
+        ({"field_of_view": 45.0}, "field_of_view must be between 0 and pi, in radians, got 45"),
+        ({"target": [1.0, 2, 3]}, "eye and target must be two places"),
+        ({"width": 0}, "width must be a whole number of pixels, at least 1, got 0"),
+        ({"height": -3}, "height must be a whole number of pixels, at least 1, got -3"),
+        ({"width": 32.0}, r"width must be a whole number of pixels, at least 1, got 32\.0"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_cameras_that_see_nothing_are_refused(changed, message):
+    value = {
+        "eye": [1.0, 2, 3],
+        "target": [0.0, 0, 0],
+        "up": [0.0, 1, 0],
+        "field_of_view": 0.6,
+        "width": 8,
+        "height": 6,
+    }
+    assert Camera(**value).height == 6
+    with pytest.raises(ValueError, match=f"the camera's {message}"):
+        Camera(**value | changed)
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"width": 0}, "width and height must be at least 1, got 0 x 512"),

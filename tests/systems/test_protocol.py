@@ -343,12 +343,13 @@ def test_a_system_laid_over_devices_by_vertices_has_the_same_radiance(name, clos
     close(laid, shown(case, light()), tolerance=2e-5)
 
 
+OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | bounces.PartBounces | protocol.Total
+
+
 def placed(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
     """A system at points of some triangles, and their order there: systems of regions take one list for each."""
     face, region = np.asarray(case.mesh.face)[triangle], np.asarray(case.mesh.region)
-    if not isinstance(
-        case.system, dynamic.DynamicSystem | bounces.BouncesSystem | bounces.PartBounces | protocol.Total
-    ):
+    if not isinstance(case.system, OF_REGIONS):
         return case.system.at(on_triangles(case.mesh.face, triangle, weight)), np.arange(len(triangle))
     lists, order = [], []
     for number in range(region.max() + 1):
@@ -408,6 +409,25 @@ def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
 def test_what_are_no_points_are_refused(name):
     with pytest.raises(TypeError, match="points must be"):
         made(name).system.at(np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("corner", "weight", "message"),
+    [
+        ([[99999], [1], [2]], [[1.0], [0.0], [0.0]], r"corners of points must be between 0 and \d+, got 1 of 3"),
+        ([[0], [1], [2]], [[np.nan], [1.0], [0.0]], "weights of points must be finite"),
+        ([[0], [1], [2]], [[2.0], [-1.0], [0.0]], "weights of points must be at least 0"),
+        ([[0], [1], [2]], [[1.0], [1.0], [1.0]], "weights of points must sum to 1, got 3 at point 0"),
+        ([[0], [1], [2]], [[1.0, 0.0, 0.0]], r"must have corners \[k, p\] and weights \[k, p\]"),
+    ],
+)
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_points_outside_of_triangles_are_refused(name, corner, weight, message):
+    system = made(name).system
+    wrong = Points(jnp.asarray(corner), jnp.asarray(weight))
+    with pytest.raises(ValueError, match=message):
+        system.at([wrong] * 2 if isinstance(system, OF_REGIONS) else wrong)
 
 
 @each_system

@@ -120,7 +120,7 @@ class PartBounces(protocol.System):
 
     def at(self, points: Sequence[Points]) -> "PartBounces":
         """Points on each part, one list after the other: `System.at`. What arrives is shaded at the vertices."""
-        given = tuple(protocol.check_points(points, self.part))
+        given = protocol.check_points(points, [len(each.position) for each in self.part])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property

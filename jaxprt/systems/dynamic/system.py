@@ -73,7 +73,7 @@ class DynamicSystem(protocol.System):
 
     def at(self, points: Sequence[Points]) -> "DynamicSystem":
         """Points of each region, numbered as its vertices are, one list after the other: `System.at`."""
-        given = tuple(protocol.check_points(points, self.transport.region))
+        given = protocol.check_points(points, [len(each.seen.position) for each in self.transport.region])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property
