@@ -1,6 +1,7 @@
 """What error has a picture after how many seconds? Relit scenes beside Mitsuba 3 and Intel's denoiser.
 
-    python -m benchmarks.pictures [--quick] [--only TEXT] [--edge N] [--store FOLDER] [--plot FILE] [--pictures FOLDER]
+    python -m benchmarks.pictures [--quick] [--only TEXT] [--system NAME] [--edge N] [--store FOLDER] [--plot FILE]
+        [--pictures FOLDER]
 
 Objects stand on a matte ground, in direct light. Judge is Mitsuba's converged picture of the same triangles, normals,
 materials and light: see `benchmarks.denoised`. `error` is relative L2 over the pixels that surfaces fill, without the
@@ -12,7 +13,8 @@ Lines of Mitsuba have its picture by `samples` samples per pixel, bare and denoi
 normals, a larger network), compiling left out. Lines of ours name it as their peer: `peer_seconds` is the time at which
 the denoised pictures have the error of ours, so that `ratio` is at equal error. `peer_time` says how it was found:
 "interpolated" on the curve, "extrapolated" past its end, or "cheapest" where the fastest picture is no worse.
-`light_seconds` are of a new light for a view that stays.
+`light_seconds` are of a new light for a view that stays. "Refined" scenes have twice the vertices, where shadows need
+them, and four times the single texels.
 
 Meshes and lights are those of JAXPRT_DATA. What is precomputed and the converged pictures are kept in the store.
 """
@@ -38,7 +40,8 @@ SAMPLES = (1, 4, 16, 64, 256)
 # Of the converged picture: relative L2, a third of the largest error that ours should have; and the most samples.
 NOISE, NOISE_ELSEWHERE, MOST = {"grace": 0.01, "eucalyptus": 0.01}, 0.0066, 8192
 GROUND = 10000  # vertices
-REFINED = 0.01  # error of shadows on meshes that are refined
+REFINED, TEXELS = 2, 64  # times the vertices, and single texels, of scenes that are refined
+COARSE = 25_000  # vertices up to which they are
 MESHES = {"spot": ("spot.obj", 2.6), "rocker arm": ("rocker_arm.ply", 0.5), "bunny": ("stanford_bunny.ply", 0.35)}
 LIGHTS = {
     "grace": "grace_cross.hdr",
@@ -79,6 +82,7 @@ class Case(NamedTuple):
 def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--only", metavar="TEXT", default="", help="cases whose names have TEXT, as 'spot, grace'")
+    parser.add_argument("--system", choices=tuple(systems(quick=False)), help="one system; all if not given")
     parser.add_argument(
         "--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given"
     )
@@ -88,7 +92,9 @@ def main(options: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(options)
     lines = []
     for case in cases(arguments.quick, arguments.only, arguments.edge):
-        for line in measure(case, arguments.quick, arguments.store, arguments.pictures):
+        recipes = systems(arguments.quick)
+        chosen = {name: each for name, each in recipes.items() if arguments.system in (None, name)}
+        for line in measure(case, chosen, arguments.quick, arguments.store, arguments.pictures):
             lines.append(harness.report(line, arguments.output))
     if arguments.plot is not None:
         plot(lines, arguments.plot)
@@ -136,14 +142,19 @@ def relit(case: Case, recipe: Any, path: pathlib.Path | None) -> Iterator[tuple[
     made = precompute(case.scene, system=recipe, size=size, path=path, progress=False)
     yield "vertices", made, lambda: image.render(made.mesh, made.radiance(light, eye=camera.eye), camera)
     yield "pixels", made, lambda: made.picture(light, camera)
-    if isinstance(recipe, Lobes):
-        finer = refine(case.scene, environments=[light], error=REFINED, progress=False)
-        divided = path and path.with_name(f"{path.name}_refined")
-        shadows = precompute(finer, system=recipe, size=size, path=divided, progress=False)
-        yield "pixels, refined", shadows, lambda: shadows.picture(light, camera)
+    if isinstance(recipe, Lobes) and made.vertices <= COARSE:
+        finer = refine(case.scene, environments=[light], error=0.0, vertices=REFINED * made.vertices, progress=False)
+        path, more = (
+            path and path.with_name(f"{path.name}_divided"),
+            Lobes(recipe.lobes, min(TEXELS, 4 * recipe.texels)),
+        )
+        divided = precompute(finer, system=more, size=size, path=path, progress=False)
+        yield "pixels, refined", divided, lambda: divided.picture(light, camera)
 
 
-def measure(case: Case, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None) -> Iterator[dict]:
+def measure(
+    case: Case, recipes: dict[str, Any], quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None
+) -> Iterator[dict]:
     """Lines of one case: Mitsuba's, then ours."""
     parts = [(part.mesh, part.material) for part in case.scene.parts]
     seen = denoised.View(parts, case.light, case.camera)
@@ -158,7 +169,7 @@ def measure(case: Case, quick: bool, store: pathlib.Path | None, pictures: pathl
         name = f"{point.method}, {point.samples} samples"
         yield line(case, point.method, name, point.timing, truth, point.picture, held) | more
     smooth = [(each.timing.seconds, each.error) for each in curve if "denoised" in each.method]
-    for system, recipe in systems(quick).items():
+    for system, recipe in recipes.items():
         path = store and store / file_name(*case.names, system)
         for where, made, draw in relit(case, recipe, path):
             timing, drawn = harness.measure(draw, repeats=3 if quick else 9), np.asarray(draw())

@@ -99,9 +99,9 @@ class Truth(NamedTuple):
     Attributes:
         pixels: Some pixels of the picture, to measure by.
         picture: A picture to look at.
-        vertex: Of each part some vertices that the picture shows.
-        radiance: What they send to the eye.
-        seconds: What all this took.
+        vertex: For each part, the numbers of some vertices that the picture shows.
+        radiance: The radiance that they send to the eye.
+        seconds: The time that each of these took.
     """
 
     pixels: ExactPixels

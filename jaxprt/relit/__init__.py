@@ -1,6 +1,6 @@
 """Scenes made ready to be relit, by any of the systems."""
 
-from jaxprt.relit import build, channels, measuring, planning, recipes, refinement, scene
+from jaxprt.relit import build, channels, exact, measuring, planning, recipes, refinement, scene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
@@ -16,6 +16,7 @@ __all__ = [
     "Terms",
     "build",
     "channels",
+    "exact",
     "measuring",
     "plan",
     "planning",

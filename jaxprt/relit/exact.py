@@ -99,12 +99,12 @@ def exact_pixels(
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
     fragments = rasterize(mesh, fine)
     every = fragments.triangle, fragments.barycentric, front(fragments, mesh, fine)
-    triangle, weight, seen = (_squares(np.asarray(each)) for each in every)
+    triangle, barycentric, seen = (_squares(np.asarray(each)) for each in every)
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
     owner = np.where(triangle >= 0, region[triangle], -1)
     shown = owner[:, owner.shape[1] // 2 + _SIDE // 2]
-    pixel, number_of = _chosen(shown, len(scene.parts), pixels, importance)
-    triangle, weight, seen, owner = triangle[pixel], weight[pixel], seen[pixel], owner[pixel]
+    pixel, weight = _chosen(shown, len(scene.parts), pixels, importance)
+    triangle, barycentric, seen, owner = triangle[pixel], barycentric[pixel], seen[pixel], owner[pixel]
     way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
     sky = np.stack([background(each, way) for each in environments])
     mean = np.where((owner < 0)[..., None], sky, 0).mean(2)
@@ -117,7 +117,7 @@ def exact_pixels(
         first += len(part.mesh.position)
         if not len(row):
             continue
-        where = on_triangles(face, triangle[row, place], weight[row, place])
+        where = on_triangles(face, triangle[row, place], barycentric[row, place])
         brdf, emitted = exact_at(part, shading, where)
         options = {"eye": camera.eye, "occluder": mesh, "progress": progress}
         value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
@@ -129,8 +129,8 @@ def exact_pixels(
         mean = mean + whole
         alone = np.bincount(row, minlength=len(pixel))[:, None] < 2
         half = half + np.where(alone, whole * (own.sum(1) > 1)[:, None], (both[0] - both[1]) / 2)
-    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, number_of)) for each in (mean, half))
-    return ExactPixels(pixel, shown[pixel], mean, number_of, error / np.where(norm > 0, norm, 1))
+    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, weight)) for each in (mean, half))
+    return ExactPixels(pixel, shown[pixel], mean, weight, error / np.where(norm > 0, norm, 1))
 
 
 def exact_picture(
