@@ -33,7 +33,9 @@ RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 
 # Libraries that only some modules touch: everything that reads files, and the rays.
 ONLY_IN = {
-    "embreex": "jaxprt.visibility.rays",
+    "embreex": "jaxprt.visibility.occluder",
+    "numba": "jaxprt.visibility.packets",
+    "llvmlite": "jaxprt.visibility.packets",
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
     "zarr": "jaxprt.files",

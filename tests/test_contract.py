@@ -59,6 +59,8 @@ HOST = {
     "image.raster.front_faces": "the same",
     "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
     "visibility.rays": "traces rays",
+    "visibility.occluder": "traces rays",
+    "visibility.packets": "traces rays",
     "visibility.blocks": "runs workers and writes files",
     "visibility.refinement": "traces rays, and chooses by values",
     "systems.separable.wavelets.precompute": "traces rays",

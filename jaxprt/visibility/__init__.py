@@ -1,8 +1,9 @@
 """What vertices see of the distant sphere: rays, hits, stored visibility, the loop over blocks, and refinement."""
 
-from jaxprt.visibility import blocks, diffuse, hits, points, rays, refinement, stored
+from jaxprt.visibility import blocks, diffuse, hits, occluder, points, rays, refinement, stored
+from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.points import point_starts
-from jaxprt.visibility.rays import LEVELS, Occluder, exhaustive, fractional, start_points
+from jaxprt.visibility.rays import LEVELS, exhaustive, fractional, start_points
 from jaxprt.visibility.refinement import refine
 from jaxprt.visibility.stored import StoredVisibility, precompute
 
@@ -15,6 +16,7 @@ __all__ = [
     "exhaustive",
     "fractional",
     "hits",
+    "occluder",
     "point_starts",
     "points",
     "precompute",

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
-from jaxprt.visibility.rays import Occluder, start_points
+from jaxprt.visibility.occluder import Occluder
+from jaxprt.visibility.rays import start_points
 
 _RAYS = 1 << 17  # rays in one call: what a core's cache holds
 
@@ -93,7 +94,7 @@ class DiffuseTracer:
         def fill(part: slice) -> None:
             cosine = np.maximum(upright[part] @ direction.T, 0)
             point, way = np.nonzero(cosine)
-            blocked = self._rays.blocked(start[part][point], direction[way])
+            blocked = self._rays.blocked(start[part], direction, point, way)
             cosine[point[blocked], way[blocked]] = 0
             result[part] = (cosine @ weight.reshape(len(weight), -1)).reshape(-1, *weight.shape[1:])
 

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxprt.sphere import cubemap
-from jaxprt.visibility.rays import Occluder
+from jaxprt.visibility.occluder import Occluder
 
 
 def hits(

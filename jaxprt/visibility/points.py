@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.visibility.rays import Occluder
+from jaxprt.visibility.occluder import Occluder
 
 
 class PointVisibility(eqx.Module):

@@ -1,9 +1,10 @@
-"""Visibility of the distant sphere from mesh vertices, by Embree. The only rays of the package.
+"""Visibility of the distant sphere from mesh vertices.
 
 Everything here is NumPy on the host; what comes out is an array, so the rest of the package is tested with
 visibility made by hand.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
@@ -11,14 +12,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Float, Float32, UInt8
 
 from jaxprt.files.arrays import sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import blocks
+from jaxprt.visibility.occluder import Occluder, check
 
 ALGORITHM = 1  # version of what is traced; a release that traces differently raises it
 ROUNDING = 3e-6  # of the norm: more than the last bits of single precision
@@ -26,7 +26,6 @@ BLOCK = 64  # vertices: a fraction of a second of work, and one file of the stor
 LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
 _SIDE = 4
 _RAYS = 1 << 17  # rays in one call: what a core's cache holds
-_NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
 _SINK = 0.02  # of the scene's diagonal, how deep a vertex may lie inside a simplified occluder
 
 
@@ -49,39 +48,6 @@ class RayCount:
         return RayCount(self.rays + other.rays, self.texels + other.texels, self.supersampled + other.supersampled)
 
 
-class Occluder:
-    """Triangles that cast shadows, in Embree's form.
-
-    Args:
-        mesh: The triangles; those of zero area cast nothing.
-
-    Raises:
-        ValueError: No triangles, positions that are not finite, or faces that name missing vertices.
-    """
-
-    def __init__(self, mesh: Mesh):
-        _check(mesh, "occluder")
-        self.position = np.asarray(mesh.position, np.float32)
-        self.face = np.asarray(mesh.face, np.int32)
-        used = self.position[self.face.ravel()]
-        low, high = used.min(0), used.max(0)
-        self.diagonal = float(np.linalg.norm(high - low)) or 1.0
-        # Far from the origin float32 itself is coarser than the share of the diagonal.
-        self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
-        self._scene = EmbreeScene()
-        TriangleMesh(self._scene, np.ascontiguousarray(self.position), np.ascontiguousarray(self.face))
-
-    def blocked(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]) -> np.ndarray:
-        """Whether each ray meets a triangle; releases the interpreter lock."""
-        return self._scene.run(origin, direction, query="OCCLUDED") == 0
-
-    def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
-        """First triangle on each ray, -1 for none, the distance to it, and the weights of its three vertices."""
-        found = self._scene.run(origin, direction, query="INTERSECT", output=True)
-        u, v = found["u"], found["v"]
-        return found["primID"].astype(np.int64), found["tfar"], np.stack([1 - u - v, u, v], -1)
-
-
 def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
     """Points just off the surface from which each vertex's rays start.
 
@@ -93,7 +59,7 @@ def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
     Raises:
         ValueError: As for `Occluder`, and for normals that are not finite.
     """
-    _check(mesh, "mesh")
+    check(mesh, "mesh")
     position = np.asarray(mesh.position, np.float32)
     out = _outward(mesh)
     nudge = np.float32(occluder.nudge)
@@ -250,42 +216,31 @@ class VisibilityJob(blocks.Job):
 class _Tables(NamedTuple):
     area: np.ndarray  # [d, 3] integral of direction over each texel
     center: np.ndarray  # [d, 3]
-    fine: np.ndarray  # [d, 16, 3]
+    fine: np.ndarray  # [d 16, 3]
     border: np.ndarray  # [6, n + 2, n + 2] texel numbers of faces with their neighbors' rims
+    order: np.ndarray  # [d] texel numbers, tile after tile
 
 
 @lru_cache(maxsize=4)
 def _tables(size: int) -> _Tables:
     fine = np.asarray(cubemap.direction(size=size * _SIDE), np.float32)
-    fine = fine.reshape(6, size, _SIDE, size, _SIDE, 3).swapaxes(2, 3).reshape(-1, LEVELS, 3)
+    fine = fine.reshape(6, size, _SIDE, size, _SIDE, 3).swapaxes(2, 3).reshape(-1, 3)
+    tile = math.gcd(size, _SIDE)
+    order = np.arange(6 * size * size).reshape(6, size // tile, tile, size // tile, tile).swapaxes(2, 3).ravel()
     return _Tables(
         np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3),
         np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3),
         np.ascontiguousarray(fine),
         np.asarray(cubemap.border_index(size=size)),
+        order,
     )
-
-
-def _check(mesh: Mesh, name: str) -> None:
-    """Refuses what Embree would hang or lie on, and vectors that make no frame."""
-    if not mesh.face.size:
-        raise ValueError(f"the {name} must have faces, got none")
-    for field in ("position", "normal", "tangent"):
-        broken = np.flatnonzero(~np.isfinite(np.asarray(getattr(mesh, field))).all(1))
-        if broken.size:
-            value = np.asarray(getattr(mesh, field))[broken[0]]
-            raise ValueError(
-                f"the {name}'s {field}s must be finite, got {broken.size} that are not, first at {broken[0]}: {value}"
-            )
-    low, high = int(mesh.face.min()), int(mesh.face.max())
-    if low < 0 or high >= len(mesh.position):
-        raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")
 
 
 def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables) -> RayCount:
     """Fills `seen` for one part of the points."""
-    vertex, texel = np.nonzero(above)
-    clear = ~occluder.blocked(start.take(vertex, axis=0), table.center.take(texel, axis=0))
+    vertex, rank = np.nonzero(above.take(table.order, axis=1))
+    texel = table.order.take(rank)
+    clear = ~occluder.blocked(start, table.center, vertex, texel)
     flat = seen.reshape(-1)
     place = vertex * above.shape[1] + texel
     flat[place] = clear
@@ -313,8 +268,8 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
     step = _RAYS // LEVELS
     for first in range(0, len(vertex), step):
         part = slice(first, first + step)
-        origin = np.repeat(start[vertex[part]], LEVELS, axis=0)
-        shadow = occluder.blocked(origin, table.fine.take(texel[part], axis=0).reshape(-1, 3))
+        way = (LEVELS * texel[part, None] + np.arange(LEVELS)).reshape(-1)
+        shadow = occluder.blocked(start, table.fine, np.repeat(vertex[part], LEVELS), way)
         out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)
     return out
 

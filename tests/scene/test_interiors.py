@@ -42,6 +42,11 @@ def occluder(name):
     return visibility.Occluder(make(name))
 
 
+def blocked(name, start, direction):
+    number = np.arange(len(start))
+    return occluder(name).blocked(start.astype(np.float32), direction.astype(np.float32), number, number)
+
+
 @functools.cache
 def starts(name):
     return visibility.start_points(make(name), occluder(name))
@@ -187,7 +192,7 @@ def test_light_comes_into_the_room_through_the_front_and_the_window_only():
     start, direction = rays("room")
     inside = start[:, 0] > -2
     start, direction = start[inside].astype(float), direction[inside].astype(float)
-    clear = ~occluder("room").blocked(start.astype(np.float32), direction.astype(np.float32))
+    clear = ~blocked("room", start, direction)
     start, direction = start[clear], direction[clear]
     with np.errstate(divide="ignore"):
         ends = np.where(direction > 0, (np.array([2, 2.5, 2]) - start) / direction, ([-2, 0, -2] - start) / direction)
@@ -205,8 +210,7 @@ def test_the_sun_falls_through_the_window_on_rug_table_and_sofa():
     for number in (1, 6, 7):
         part = parts[number]
         start = visibility.start_points(part, occluder("room"))
-        blocked = occluder("room").blocked(start, np.broadcast_to(SUN, start.shape))
-        clear = ~blocked & (np.asarray(part.normal) @ SUN > 0.1)
+        clear = ~blocked("room", start, np.broadcast_to(SUN, start.shape)) & (np.asarray(part.normal) @ SUN > 0.1)
         z = start[:, 2] + (start[:, 0] + 2) * SUN[2] / -SUN[0]
         assert np.mean(clear & (z < 1.2)) > 0.04
 
@@ -276,7 +280,7 @@ def test_the_sun_that_the_inside_of_the_ring_mirrors_gathers_on_the_table():
     normal = -np.stack([np.cos(turn), 0 * turn, np.sin(turn)], -1)
     place = -0.99 * radius * normal + np.stack([0 * turn, height + 0.003, 0 * turn], -1)
     cosine = normal @ SUN
-    lit = (cosine > 0) & ~occluder("ring").blocked(place.astype(np.float32), np.broadcast_to(SUN, place.shape))
+    lit = (cosine > 0) & ~blocked("ring", place, np.broadcast_to(SUN, place.shape))
     direction = 2 * cosine[:, None] * normal - SUN
     triangle, distance, _ = occluder("ring").hit(place.astype(np.float32), direction.astype(np.float32))
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[triangle, 0]]

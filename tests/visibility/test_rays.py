@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 
 from jaxprt import visibility
-from jaxprt.scene import Mesh, builtin
+from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import cubemap
 from jaxprt.visibility import Occluder, exhaustive, fractional, start_points
@@ -17,6 +19,11 @@ RESAMPLED = 0.01
 # A convex surface seen through texels that the horizon cuts, whose lower rays its own faces stop.
 CUT = 0.008
 SUPERSAMPLING = 3e-3
+# Files of the folder of awkward meshes that are meshes.
+AWKWARD = ["dragon_vrip_res3.ply", "bunny_vrip_res2.ply", "chair_model.obj", "cycloidal.ply", "busted.STL"]
+AWKWARD += ["featuretype.STL", "fuze.obj", "rabbit.obj", "quadknot.obj", "negative_indices.obj", "polygonfaces.obj"]
+AWKWARD += ["singlevn.obj", "soup.stl", "cube_blender_uv.ply", "tube.obj", "suzanne_facets.ply", "nancolor.obj"]
+AWKWARD += ["joined_tetrahedra.obj"]
 SLIVERS = 7e-3  # The same where a plane seen from its edge is thinner than a texel: no center meets it.
 
 
@@ -301,3 +308,40 @@ def test_the_smallest_meshes_see_the_sky(shape):
     assert isinstance(mesh, Mesh)
     seen = trace(mesh)
     assert (seen[wholly_above(mesh.normal, 8)] == 16).all()
+
+
+def packets_and_single_rays(mesh, *, size):
+    """Whether the same rays meet a triangle: by the occluder, by its last packet alone, and by embreex's own query."""
+    rays = Occluder(mesh)
+    start = start_points(mesh, rays)[:300]
+    point, way = np.nonzero(np.asarray(mesh.normal, np.float32)[:300] @ texels(size)[0].T > 0)
+    center = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
+    single = EmbreeScene()
+    TriangleMesh(single, rays.position, rays.face)
+    expected = single.run(start[point], center[way], query="OCCLUDED") == 0
+    return rays.blocked(start, center, point, way), rays.blocked(start, center, point[-5:], way[-5:]), expected
+
+
+def test_packets_of_rays_answer_as_single_rays():
+    found, last, expected = packets_and_single_rays(torus(), size=16)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(last, expected[-5:])
+    assert 0.05 < expected.mean() < 0.95
+
+
+@pytest.mark.parametrize("name", AWKWARD)
+def test_packets_of_rays_answer_as_single_rays_on_awkward_meshes(data, name):
+    found, last, expected = packets_and_single_rays(load_mesh(data / "meshes_awkward" / name), size=8)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(last, expected[-5:])
+
+
+def test_no_rays_meet_nothing():
+    nowhere, none = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
+    assert Occluder(torus()).blocked(nowhere, nowhere, none, none).shape == (0,)
+
+
+def test_without_packets_visibility_is_the_same(monkeypatch):
+    expected = trace(torus())
+    monkeypatch.setattr("jaxprt.visibility.packets.available", lambda: False)
+    np.testing.assert_array_equal(trace(torus()), expected)

@@ -1,0 +1,102 @@
+"""Triangles that rays meet, by Embree: the only rays of the package."""
+
+import threading
+from functools import cached_property
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float32, Integer
+
+from jaxprt.scene.mesh import Mesh
+
+_NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
+
+
+class Occluder:
+    """Triangles that cast shadows, in Embree's form.
+
+    Args:
+        mesh: The triangles; those of zero area cast nothing.
+
+    Raises:
+        ValueError: No triangles, positions that are not finite, or faces that name missing vertices.
+    """
+
+    def __init__(self, mesh: Mesh):
+        check(mesh, "occluder")
+        self.position = np.asarray(mesh.position, np.float32)
+        self.face = np.asarray(mesh.face, np.int32)
+        used = self.position[self.face.ravel()]
+        low, high = used.min(0), used.max(0)
+        self.diagonal = float(np.linalg.norm(high - low)) or 1.0
+        # Far from the origin float32 itself is coarser than the share of the diagonal.
+        self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
+        self._building = threading.Lock()
+
+    @cached_property
+    def _single(self) -> EmbreeScene:
+        """What embreex asks ray by ray."""
+        scene = EmbreeScene()
+        TriangleMesh(scene, np.ascontiguousarray(self.position), np.ascontiguousarray(self.face))
+        return scene
+
+    @cached_property
+    def _packed(self):
+        """What takes packets of rays, or None where embreex carries no library that does."""
+        from jaxprt.visibility import packets  # numba takes half a second to import
+
+        return packets.Packets(self.position, self.face) if packets.available() else None
+
+    def blocked(
+        self,
+        origin: Float32[np.ndarray, "m 3"],
+        direction: Float32[np.ndarray, "d 3"],
+        point: Integer[np.ndarray, " n"],
+        way: Integer[np.ndarray, " n"],
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether rays meet a triangle; releases the interpreter lock.
+
+        Sixteen rays that follow each other are fastest where they start near each other in similar directions.
+
+        Args:
+            origin: Points.
+            direction: Directions.
+            point: The point from which each ray starts.
+            way: The direction in which it goes.
+        """
+        with self._building:
+            packed = self._packed
+        if packed is not None:
+            return packed.blocked(origin, direction, point, way)
+        with self._building:
+            single = self._single
+        return single.run(origin.take(point, axis=0), direction.take(way, axis=0), query="OCCLUDED") == 0
+
+    def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
+        """First triangle on each ray, -1 for none, the distance to it, and the weights of its three vertices."""
+        with self._building:
+            single = self._single
+        found = single.run(origin, direction, query="INTERSECT", output=True)
+        u, v = found["u"], found["v"]
+        return found["primID"].astype(np.int64), found["tfar"], np.stack([1 - u - v, u, v], -1)
+
+
+def check(mesh: Mesh, name: str) -> None:
+    """Refuses meshes that Embree would hang or lie on, and vectors that make no frame.
+
+    Raises:
+        ValueError: No faces, faces that name missing vertices, or positions, normals or tangents that are not finite.
+    """
+    if not mesh.face.size:
+        raise ValueError(f"the {name} must have faces, got none")
+    for field in ("position", "normal", "tangent"):
+        broken = np.flatnonzero(~np.isfinite(np.asarray(getattr(mesh, field))).all(1))
+        if broken.size:
+            value = np.asarray(getattr(mesh, field))[broken[0]]
+            raise ValueError(
+                f"the {name}'s {field}s must be finite, got {broken.size} that are not, first at {broken[0]}: {value}"
+            )
+    low, high = int(mesh.face.min()), int(mesh.face.max())
+    if low < 0 or high >= len(mesh.position):
+        raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")
