@@ -189,16 +189,15 @@ def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q 
         light: From `light_side`.
         weight: From `weights`.
     """
-    colors = max(light.first.shape[1], weight.shape[1])
-    weight = jnp.broadcast_to(weight, (len(weight), colors))
-    light = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), colors, *x.shape[2:])), light)
-    met, row = jnp.einsum("gcnsq,qc->gscn", light.first, weight), tensor.weight
+    # Products summed along the last axes: as einsums, XLA's CPU code would transpose the large operands first.
+    met, row = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight
     if light.second is not None and tensor.second is not None:
-        both = jnp.einsum("qc,pc->cqp", weight, weight).reshape(colors, -1)
-        twice = jnp.einsum("gcosk,ck->gsco", light.second.reshape(*light.second.shape[:4], -1), both)
-        met, row = jnp.concatenate([met, twice], -1), jnp.concatenate([row, tensor.second.weight], -1)
-    rows = jnp.einsum("gscn,gmn->scgm", met, row)
-    return rows.reshape(*rows.shape[:2], -1)[..., tensor.place]
+        both = weight.T[:, :, None] * weight.T[:, None]
+        twice = jnp.sum(light.second * both[:, None, None], (-2, -1))
+        met, row = jnp.concatenate([met, twice], 2), jnp.concatenate([row, tensor.second.weight], -1)
+    clusters, colors, components, harmonic = met.shape
+    rows = row @ jnp.moveaxis(met, 2, 1).reshape(clusters, components, colors * harmonic)
+    return rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
 
 
 def view_side(
