@@ -1,5 +1,6 @@
 """Least squares by jaxopt, which no other module knows."""
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -11,10 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.inverse import numbers
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
-    import jaxopt
 
 DENSE = 512  # numbers whose derivatives are held, all of them
 _KNOWN = 1e-4  # of the largest singular value: what has less cannot be told from rounding
@@ -153,19 +150,33 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     return Fit(unravel(found), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
-_solver: Any = jaxopt.LevenbergMarquardt(
-    lambda u, residual, jac: residual,
-    materialize_jac=True,
-    solver="cholesky",
-    damping_parameter=1e-3,
-    implicit_diff=False,
-    jit=False,
-)
-# jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
-_solver._jac_fun = lambda u, residual, jac: jac
-# Residual and derivatives are arguments of the solver's own programs, so that fits of the same shapes share these.
-_begin, _update = jax.jit(_solver.init_state), jax.jit(_solver.update)
-_direction = jax.jit(lambda free, state: _solver.update(free, state, state.residual, state.jac).state.delta)
+@functools.cache
+def _jaxopt() -> Any:
+    """The package, imported when it is first needed: that takes as long as half of jaxprt."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
+        import jaxopt
+    return jaxopt
+
+
+@functools.cache
+def _marquardt_steps() -> tuple[Callable, Callable, Callable]:
+    """First state, next state and step of jaxopt's method of Levenberg and Marquardt.
+
+    Residual and derivatives are arguments of these programs, so that fits of the same shapes share them.
+    """
+    solver = _jaxopt().LevenbergMarquardt(
+        lambda u, residual, jac: residual,
+        materialize_jac=True,
+        solver="cholesky",
+        damping_parameter=1e-3,
+        implicit_diff=False,
+        jit=False,
+    )
+    # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
+    solver._jac_fun = lambda u, residual, jac: jac
+    direction = jax.jit(lambda free, state: solver.update(free, state, state.residual, state.jac).state.delta)
+    return jax.jit(solver.init_state), jax.jit(solver.update), direction
 
 
 def marquardt(
@@ -185,11 +196,12 @@ def marquardt(
         residual, slope = evaluate(place)
         return residual, slope.T
 
-    state = _begin(free, *both(free))
+    begin, update, direction = _marquardt_steps()
+    state = begin(free, *both(free))
     _finite(state.residual, state.jac)
     history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
     for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
-        moved, tried = _update(free, state, *both(free + _direction(free, state)))
+        moved, tried = update(free, state, *both(free + direction(free, state)))
         if not all(np.isfinite(each).all() for each in (moved, tried.residual, tried.jac)):
             grow = state.increase_factor
             tried = state._replace(
@@ -239,9 +251,9 @@ def _first_order(value: Callable, bounded: bool, length, steps: int) -> Any:
     """Makes a solver of jaxopt: it takes fixed steps where there are bounds, and searches along lines elsewhere."""
     options = {"maxiter": steps, "implicit_diff": False}
     if not bounded:
-        return jaxopt.LBFGS(value, **options)
-    box = jaxopt.projection.projection_box
-    return jaxopt.ProjectedGradient(value, box, stepsize=lambda _: length, **options)
+        return _jaxopt().LBFGS(value, **options)
+    box = _jaxopt().projection.projection_box
+    return _jaxopt().ProjectedGradient(value, box, stepsize=lambda _: length, **options)
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
