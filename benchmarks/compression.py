@@ -229,7 +229,7 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
             "bytes": stored,
             "bytes_per_vertex": stored / vertices,
             "precompute_seconds": precompute,
-            **{"peer": "published", "peer_seconds": other.seconds, "peer_error": peer[number][1]},
+            **{"peer": "published", **other.peer(), "peer_error": peer[number][1]},
         }
 
 
@@ -281,7 +281,7 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
                 "bytes_per_vertex": stored / sum(len(each.position) for each in seen),
                 "precompute_seconds": seconds,
                 "fit_seconds": fitted,
-                **{"peer": "published", "peer_seconds": other.seconds, "peer_error": peer[number][1]},
+                **{"peer": "published", **other.peer(), "peer_error": peer[number][1]},
             }
 
 

@@ -88,7 +88,7 @@ def measure(matrix: jax.Array, exact: np.ndarray, square: np.ndarray, terms: int
         kept = np.argsort(-np.abs(values))[:terms]
         peer_line = {
             "peer": name,
-            "peer_seconds": theirs.seconds,
+            **theirs.peer(),
             "peer_error": excess(values[kept], vectors[:, kept]),
         }
         lines.append({**common, **mine.line(), **peer_line})

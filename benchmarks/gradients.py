@@ -96,7 +96,7 @@ def measure(system: str, case: Case, small: Case, name: str, repeats: int):
         kinds["hessian"] = lambda: curved(moved, other, along)
     for kind, function in kinds.items():
         mine, alone = harness.compare(function, lambda: case.radiance(**case.argument), repeats=repeats)
-        times = {**mine.line(), "peer_seconds": alone.seconds, "cost": mine.seconds / alone.seconds}
+        times = {**mine.line(), **alone.peer(), "cost": mine.seconds / alone.seconds}
         yield {**common, "case": f"{system}: {kind} by {name}, {shape[0]} vertices", **times}
 
 

@@ -68,7 +68,7 @@ def compare(pool, name: str, mesh: Mesh, camera: Camera, samples: int, repeats: 
         "error": float(np.mean(drawn != traced)),
         "bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(fragments)),
         "peer": "embree-primary",
-        "peer_seconds": peer.seconds,
+        **peer.peer(),
         "peer_error": 0.0,
         "pixels_that_differ": int(np.sum(drawn != traced)),
         "pixels_seen_by_one_only": int(np.sum((drawn < 0) != (traced < 0))),
@@ -109,7 +109,7 @@ def edges(name: str, mesh: Mesh, camera: Camera, repeats: int) -> dict:
         "error": four,
         "bytes": picture[4]().nbytes,
         "peer": "one sample",
-        "peer_seconds": peer.seconds,
+        **peer.peer(),
         "peer_error": one,
     }
 

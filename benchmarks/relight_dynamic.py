@@ -240,7 +240,7 @@ def gradient(
 
     each = (triple.light.radiance, *map(jnp.asarray, (triple.diffuse, triple.specular, triple.coordinate)))
     slope, alone = harness.compare(lambda: jax.grad(loss, (0, 1, 2, 3))(*each), lambda: loss(*each), repeats=repeats)
-    peer = {"peer": "the loss alone", "peer_seconds": alone.seconds, "peer_error": error}
+    peer = {"peer": "the loss alone", **alone.peer(), "peer_error": error}
     return {**common, **slope.line(), "error": error, **peer}
 
 

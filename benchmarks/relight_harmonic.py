@@ -115,7 +115,7 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
                 "error": float(jnp.linalg.norm(function() - expected) / jnp.linalg.norm(expected)),
                 "bytes": size,
                 "peer": "rotation" if rotating else "memory-read",
-                "peer_seconds": theirs.seconds,
+                **theirs.peer(),
                 "peer_error": 0.0,
                 "frames_per_second": 1 / mine.seconds,
                 **({"paper_frames_per_second": paper[case]} if case in paper else {}),

@@ -81,16 +81,14 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
             0.0 if name == "memory-read" else float(np.linalg.norm((matrix @ dense_light).reshape(exact.shape) - exact))
         )
         case = {"case": f"light change, {vertices} vertices", "nanoseconds_per_vertex": first.seconds / vertices * 1e9}
-        peer_line = {"peer": name, "peer_seconds": second.seconds, "peer_error": wrong / float(np.linalg.norm(exact))}
+        peer_line = {"peer": name, **second.peer(), "peer_error": wrong / float(np.linalg.norm(exact))}
         lines.append({**common, **case, **first.line(), **peer_line})
     eye = jnp.array([3.0, 1.0, 2.0])
     view, change = harness.compare(
         lambda: combine(mine, view_tuple(transport, brdf, eye)), lambda: transport.apply(light), repeats=repeats
     )
     case = {"case": f"view change, {vertices} vertices", "nanoseconds_per_vertex": view.seconds / vertices * 1e9}
-    lines.append(
-        {**common, **case, **view.line(), "peer": "light change", "peer_seconds": change.seconds, "peer_error": 0.0}
-    )
+    lines.append({**common, **case, **view.line(), "peer": "light change", **change.peer(), "peer_error": 0.0})
     return lines
 
 
@@ -109,7 +107,7 @@ def measure_quantized(transport: SparseTransport, light: jax.Array, repeats: int
         "bytes": quantized.nbytes,
         "vertices": vertices,
         "peer": "floating point",
-        "peer_seconds": theirs.seconds,
+        **theirs.peer(),
         "peer_error": 0.0,
         "peer_bytes": transport.nbytes,
     }

@@ -79,7 +79,7 @@ def rotating(coefficient: jax.Array, matrix: jax.Array, exact: np.ndarray, repea
     found = np.concatenate([np.asarray(chunk) for chunk in theirs()], -1)  # [w, c, lm]
     return line | {
         "peer": "e3nn-jax",
-        "peer_seconds": other.seconds,
+        **other.peer(),
         "peer_error": relative(found.transpose(2, 1, 0), exact[: found.shape[-1]]),
         "peer_coefficients": found.shape[-1],
     }
@@ -101,7 +101,7 @@ def differentiating(
         "error": relative(with_gradient(coefficient, matrix, weight)[1], exact),
         "bytes": coefficient.nbytes + matrix.nbytes + weight.nbytes,
         "peer": "forward",
-        "peer_seconds": forward.seconds,
+        **forward.peer(),
         "peer_error": 0.0,
         "times_forward": mine.seconds / forward.seconds,
     }

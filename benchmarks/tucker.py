@@ -78,7 +78,7 @@ def against(name: str, tensor: jax.Array, start: str, sweeps: int, repeats: int)
     return described(name, tensor) | {
         **mine.line(),
         "peer": f"TensorLy, {start}, {sweeps} sweeps",
-        "peer_seconds": theirs.seconds,
+        **theirs.peer(),
         "peer_error": relative_error(array, *found[-1]),
     }
 

@@ -111,10 +111,16 @@ def test_measure_waits_for_the_result(monkeypatch):
     assert waited == ["result"] * 3
 
 
-def test_compare_alternates():
+def test_spread_is_half_the_distance_between_quartiles(clock):
+    timing = harness.measure(clock(1.0, 8.0, 9.0, 10.0, 11.0, 12.0), repeats=5)
+    assert timing.spread == pytest.approx(0.1)
+    assert timing.peer() == {"peer_seconds": 10.0, "peer_spread": timing.spread}
+
+
+def test_compare_alternates_and_warms_each():
     order = []
     harness.compare(lambda: order.append("a"), lambda: order.append("b"), repeats=3)
-    assert "".join(order) == "abababab"
+    assert "".join(order) == "ab" + 3 * "aabb"
 
 
 def test_repeats_must_be_positive():
