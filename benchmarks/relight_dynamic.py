@@ -4,10 +4,10 @@
 
 Objects on grounds, as many vertices as in three scenes of the paper, with as many adjustable BRDFs: Cook-Torrance's
 model over the Fresnel-roughness plane, by free lobes. `V` are frames of a new view, `V&B` of new materials too, `V&B&L`
-of a new light too. `peer` are frames of the paper, with interreflections, which it says take three quarters of
-`V&B&L`; of two Xeons of 3.2 GHz and a GeForce 7800 in 2007. `error` is the median over thirty random triples of light,
-BRDF and view, relative L2 of the radiance of those of 600 vertices that face the eye, against the integral over all
-texels.
+of a new light too; each is drawn, in 512 x 512 pixels. `peer` are frames of the paper, with interreflections, which it
+says take three quarters of `V&B&L`; of two Xeons of 3.2 GHz and a GeForce 7800 in 2007. `error` is the median over
+thirty random triples of light, BRDF and view, relative L2 of the radiance of those of 600 vertices that face the eye,
+against the integral over all texels.
 
 Lines `m = ...` are of the triples of one roughness. `brdf_error` is the part of the BRDF, with visibility as it is;
 `matte_error` that of the diffuse part, by clustered wavelets; what is left is light and visibility taken apart.
@@ -24,6 +24,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,13 +123,16 @@ def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: 
     samples = [samples_for(triple, transport.size) for triple in triples]
     material = [materials(plane, triple, scene.adjustable) for triple in triples]
     turn = itertools.count()
+    edge = 64 if quick else 512
+    shots = [eqx.tree_at(lambda c: c.eye, camera.orbit(mesh, width=edge, height=edge), each.eye) for each in triples]
 
     def frame(view: bool, matter: bool, light: bool):
         number = next(turn) % len(triples)
-        eye = jnp.asarray(triples[number if view else 0].eye)
+        shot = shots[number if view else 0]
         lit = dynamic.light_side(transport, triples[number].light, texels=TEXELS) if light else first
-        seen = dynamic.view_side(transport, brdfs, material[number if matter else 0], eye=eye)
-        return dynamic.combine(transport, lit, seen, samples=samples[number if matter else 0])
+        seen = dynamic.view_side(transport, brdfs, material[number if matter else 0], eye=shot.eye)
+        color = dynamic.combine(transport, lit, seen, samples=samples[number if matter else 0])
+        return interpolate(raster.rasterize(mesh, shot), mesh.face, color)
 
     found = errors(mesh, transport, brdfs, triples, material, quick)
     count = brdfs[0].lobe.lobes
