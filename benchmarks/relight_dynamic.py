@@ -124,7 +124,10 @@ def measure_set(scene: Published, mesh: Mesh, transport, brdfs, plane, triples: 
     material = [materials(plane, triple, scene.adjustable) for triple in triples]
     turn = itertools.count()
     edge = 64 if quick else 512
-    shots = [eqx.tree_at(lambda c: c.eye, camera.orbit(mesh, width=edge, height=edge), each.eye) for each in triples]
+    shots = [
+        eqx.tree_at(lambda c: c.eye, camera.orbit(mesh, width=edge, height=edge), jnp.asarray(each.eye))
+        for each in triples
+    ]
 
     def frame(view: bool, matter: bool, light: bool):
         number = next(turn) % len(triples)

@@ -113,7 +113,9 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
         mine, theirs = harness.compare(function, peer, repeats=repeats)
         expected = exact.get(case, harmonic.combine(arriving, view))
 
-        def picture(function=function, kept=case.startswith("fixed view")):
+        kept = case.startswith("fixed view")
+
+        def picture(function=function, kept=kept):
             return interpolate(drawn if kept else rasterize(mesh, shot), mesh.face, function())
 
         lines.append(
