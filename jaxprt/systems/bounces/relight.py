@@ -140,6 +140,11 @@ def arriving(
         raise ValueError(
             "the tensor must be of the transport's mesh and regions, got one of others with as many vertices"
         )
+    return _arriving(transport, tensor, light, weight)
+
+
+@jax.jit
+def _arriving(transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight) -> tuple[Arriving, ...]:
     whole = collect(tensor, light, weight)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
 
@@ -216,6 +221,11 @@ def view_side(
         points: Of each region; None for the vertices.
     """
     require.position("the eye", eye)
+    return _view_side(transport, surfaces, eye, points)
+
+
+@jax.jit
+def _view_side(transport: DynamicTransport, surfaces, eye: Array, points) -> tuple[ReflectedView, ...]:
     result = []
     for own, each, at in zip(transport.region, surfaces, points or [None] * len(surfaces), strict=True):
         position, frame = placed(own.seen.position, own.seen.frame, at)

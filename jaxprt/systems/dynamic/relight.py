@@ -7,6 +7,7 @@ A change of light redoes `light_side`, a change of view or of materials `view_si
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -186,15 +187,18 @@ def view_side(
     """
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
     require.position("the eye", eye)
+    _check_all(transport, brdfs, materials)
+    return _view_side(transport, brdfs, materials, eye, points)
+
+
+@jax.jit
+def _view_side(transport: DynamicTransport, brdfs, materials, eye: Array, points) -> DynamicView:
     region = []
     several = [None] * len(transport.region) if points is None else points
-    for own, surface, at in zip(
-        transport.region, mix(transport, brdfs, materials, points=points), several, strict=True
-    ):
+    for own, surface, at in zip(transport.region, _mix(transport, brdfs, materials, several), several, strict=True):
         brdf = surface.brdf
         place = placed(own.seen.position, own.seen.frame, at)
         if isinstance(brdf, SeparableBrdf):
-            check_mark(own.terms.mark, brdf.light_map)
             region.append(RegionView(surface, separable.view_factors(brdf, *place, eye), None, at))
             continue
         looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye, points=at)
@@ -214,24 +218,23 @@ def mix(
 
     Arguments and errors are those of `radiance`.
     """
-    count = len(transport.region)
-    if len(brdfs) != count or len(materials) != count:
-        raise ValueError(
-            f"there must be a BRDF and a material for each of {count} regions, got {len(brdfs)} and {len(materials)}"
-        )
+    _check_all(transport, brdfs, materials)
+    return _mix(transport, brdfs, materials, [None] * len(transport.region) if points is None else points)
+
+
+def _mix(transport: DynamicTransport, brdfs, materials, points: Sequence[Points | None]) -> tuple[RegionBrdf, ...]:
     result = []
-    for number, (own, brdf, material) in enumerate(zip(transport.region, brdfs, materials, strict=True)):
-        _check(number, own, brdf, material, len(transport.place))
+    for own, brdf, material, at in zip(transport.region, brdfs, materials, points, strict=True):
         if isinstance(brdf, SeparableBrdf):
             result.append(RegionBrdf(brdf, None, None))
             continue
         assert material is not None
-        at = None if points is None else points[number]
         diffuse, specular = (_by_row(each, own.vertex, at) for each in (material.diffuse, material.specular))
         result.append(RegionBrdf(_mixed(brdf, material.weight), diffuse, specular))
     return tuple(result)
 
 
+@partial(jax.jit, static_argnames=("samples",))
 def combine(
     transport: DynamicTransport, light: DynamicLight, view: DynamicView, *, samples: int = 1
 ) -> Float[Array, "v c"]:
@@ -299,6 +302,17 @@ def _by_row(value: Array, vertex: Array, points: Points | None) -> Array:
 
 def _has_pyramid(region: RegionTransport) -> bool:
     return region.seen.pyramid.shape[1] > 6 * region.seen.size**2 // 8
+
+
+def _check_all(transport: DynamicTransport, brdfs: Sequence, materials: Sequence) -> None:
+    """Refuses BRDFs and materials that do not fit the regions."""
+    count = len(transport.region)
+    if len(brdfs) != count or len(materials) != count:
+        raise ValueError(
+            f"there must be a BRDF and a material for each of {count} regions, got {len(brdfs)} and {len(materials)}"
+        )
+    for number, (own, brdf, material) in enumerate(zip(transport.region, brdfs, materials, strict=True)):
+        _check(number, own, brdf, material, len(transport.place))
 
 
 def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:

@@ -155,6 +155,13 @@ def view_lobes(
         ValueError: The number of parameters is not that of the table, or the eye is not one finite position.
     """
     require.position("the eye", eye)
+    return _view_lobes(transport, brdf, parameter, eye, points)
+
+
+@jax.jit
+def _view_lobes(
+    transport: LobeTransport, brdf: LobeBrdf, parameter: tuple[Array, ...], eye: Array, points: Points | None
+) -> LobeView:
     lobe, (face, s, t, spread) = _places(*placed(transport.position, transport.frame, points), brdf, eye, *parameter)
     seen = transport.lobe_visibility(face, s, t, spread, points)
     place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
