@@ -1,8 +1,10 @@
-"""What a compiler is told beyond the mathematics: steps that are compiled apart, and transposes written by hand.
+"""What a compiler is told beyond the mathematics: precision, steps that are compiled apart, loops, and transposes.
 
-XLA's CPU code repeats a step for each of its uses where it fuses the two; gathers, and loops over vertices, are then
-done many times over. JAX makes gradients of linear maps by transposing what it was given, step by step; that of a
-gather is a scatter, which is five times as slow. `isolated` and `linear` are the cures, under all transformations.
+GPUs round the factors of float32 products to ten bits unless told otherwise: `jit` tells. XLA's CPU code repeats a step
+for each of its uses where it fuses the two; gathers, and loops over vertices, are then done many times over. JAX makes
+gradients of linear maps by transposing what it was given, step by step; that of a gather is a scatter, which is five
+times as slow. `isolated` and `linear` are the cures, under all transformations. CPUs like loops whose steps stay in the
+cache, GPUs few kernels with much to do: `total` and `mapped` are such loops, each in the form that suits the device.
 """
 
 import functools
@@ -21,15 +23,38 @@ from jaxtyping import Array, PyTree
 
 Fixed = TypeVar("Fixed", bound=PyTree)
 
+_ROOM = 1 << 28  # bytes of what loops make at once on GPUs
+
+
+def jit(function: Callable, **options: Any) -> Any:
+    """`jax.jit` of a function whose matrix products are exact to its dtype on every device.
+
+    Holds for whatever the function calls while it is traced, BRDFs of users included, and for its derivatives.
+
+    Args:
+        function: Of arrays and pytrees of them.
+        options: As `jax.jit` has them.
+    """
+    return jax.jit(_exact(function), **options)
+
+
+def _exact(function: Callable) -> Callable:
+    @functools.wraps(function)
+    def traced(*argument, **named):
+        with jax.default_matmul_precision("highest"):
+            return function(*argument, **named)
+
+    return traced
+
 
 def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
-    """Decorates a step that is compiled by itself: like `jax.jit`, and also where another program holds it.
+    """Decorates a step that is compiled by itself: like `jit`, and on CPUs also where another program holds it.
 
     Args:
         function: Of arrays and pytrees of them, and of static options by name.
         static: Names of the options.
     """
-    compiled = jax.jit(function, static_argnames=static)
+    compiled = jit(function, static_argnames=static)
 
     def branched(*argument, **named):
         option = {name: named.pop(name) for name in static if name in named}
@@ -42,19 +67,90 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
         shape = jax.eval_shape(own, argument, named)
         first = next(each for each in jax.tree.leaves((argument, named)) if each.size)
-        # Branches are not fused with what is around them. The compiler does not see that this one is always taken.
-        taken = jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32) | 1
-        return jax.lax.cond(taken != 0, own, never, argument, named)
+        # Branches are not fused with what is around them. CPUs' compiler does not see that this one is always taken;
+        # others see it, and no branch is left.
+        taken = jax.lax.platform_dependent(
+            jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32), cpu=lambda x: (x | 1) != 0, default=_always
+        )
+        return jax.lax.cond(taken, own, never, argument, named)
 
-    inside = jax.jit(branched, static_argnames=static)  # Traced once, also where derivatives are taken outside any jit.
+    inside = jit(branched, static_argnames=static)  # Traced once, also where derivatives are taken outside any jit.
 
     @functools.wraps(function)
     def step(*argument, **named):
         leaf = jax.tree.leaves((argument, {name: each for name, each in named.items() if name not in static}))
         traced = any(isinstance(each, Tracer) for each in leaf) and any(np.size(each) for each in leaf)
-        return (inside if traced and jax.default_backend() == "cpu" else compiled)(*argument, **named)
+        return (inside if traced else compiled)(*argument, **named)
 
     return step
+
+
+def _always(_: Array) -> Array:
+    return jnp.asarray(True)
+
+
+def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
+    """The sum of a function over rows: on CPUs one row after another, elsewhere as many at once as there is room for.
+
+    Args:
+        term: The function of one row.
+        rows: Arrays whose first axis is summed over.
+    """
+    shape = jax.eval_shape(term, _first(rows))
+    start = jnp.zeros(shape.shape, shape.dtype)
+
+    def by_row(rows):
+        return jax.lax.scan(lambda carry, row: (carry + term(row), None), start, rows)[0]
+
+    def at_once(rows):
+        return jnp.sum(jax.vmap(term)(rows), 0, dtype=shape.dtype)
+
+    def by_block(rows):
+        block, rest = _blocks(rows, shape.size * shape.dtype.itemsize)
+        if block is None:
+            return at_once(rest)
+        return jax.lax.scan(lambda carry, rows: (carry + at_once(rows), None), at_once(rest), block)[0]
+
+    return jax.lax.platform_dependent(rows, cpu=by_row, default=by_block)
+
+
+def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
+    """`jax.lax.map`: on CPUs one row after another, elsewhere as many at once as there is room for.
+
+    Args:
+        function: The function of one row.
+        rows: Arrays along whose first axis it is mapped.
+    """
+    one = _first(rows)
+    size = sum(each.size for each in jax.tree.leaves((one, jax.eval_shape(function, one))))
+    count = len(jax.tree.leaves(rows)[0])
+    most = _at_once(count, 8 * size)
+
+    def by_block(rows):
+        return jax.vmap(function)(rows) if most >= count else jax.lax.map(function, rows, batch_size=most)
+
+    return jax.lax.platform_dependent(rows, cpu=partial(jax.lax.map, function), default=by_block)
+
+
+def _first(rows: PyTree) -> PyTree:
+    """Shapes of one row."""
+    return jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape[1:], each.dtype), rows)
+
+
+def _at_once(count: int, size: int) -> int:
+    """How many rows of so many bytes are made at once."""
+    return max(1, min(count, _ROOM // max(1, size)))
+
+
+def _blocks(rows: PyTree, size: int) -> tuple[PyTree | None, PyTree]:
+    """Rows in blocks of as many as are made at once, and the rest: all of them where one block has room for all."""
+    count = len(jax.tree.leaves(rows)[0])
+    most = _at_once(count, size)
+    whole = max(0, (count - 1) // most)
+    rest = jax.tree.map(lambda each: each[whole * most :], rows)
+    if not whole:
+        return None, rest
+    return jax.tree.map(lambda each: each[: whole * most].reshape(whole, most, *each.shape[1:]), rows), rest
 
 
 def linear(
@@ -152,9 +248,10 @@ def _batched(argument, axis, *, pair: _Pair, back: bool):
 
 
 _linear = Primitive("linear")
-_linear.def_impl(partial(jax.jit, static_argnames=("pair", "back"))(_run))
+_stepwise = jit(_run, static_argnames=("pair", "back"))
+_linear.def_impl(_stepwise)
 _linear.def_abstract_eval(_abstract)
-mlir.register_lowering(_linear, mlir.lower_fun(_run, multiple_results=False))
+mlir.register_lowering(_linear, mlir.lower_fun(_stepwise, multiple_results=False))
 ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batched

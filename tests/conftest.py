@@ -1,4 +1,4 @@
-"""Fixtures that every test may ask for: ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked`` and ``close``."""
+"""Fixtures that every test may ask for: ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked``, ``close``, ``loose``."""
 
 import functools
 import gc
@@ -157,6 +157,34 @@ def x64() -> Iterator[None]:
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No shape checks, as users run: for what the package itself says of wrong shapes."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="session")
+def loose() -> Callable[..., list[str]]:
+    """The function ``loose_products``: ``assert not loose(function, *arguments)``."""
+    return loose_products
+
+
+def loose_products(function: Callable, *arguments: Any) -> list[str]:
+    """Products of floating-point numbers in a function, wherever they are, that GPUs may round to TF32."""
+    return list(_loose(jax.make_jaxpr(function)(*arguments).jaxpr))
+
+
+def _loose(jaxpr: Any) -> Iterator[str]:
+    highest = (jax.lax.Precision.HIGHEST,) * 2
+    for equation in jaxpr.eqns:
+        given, name = equation.params, equation.primitive.name
+        floats = any(np.issubdtype(each.aval.dtype, np.inexact) for each in equation.invars)
+        if name in ("dot_general", "conv_general_dilated", "ragged_dot_general") and floats:
+            if given["precision"] != highest:
+                yield f"{equation} with precision {given['precision']}"
+        elif name == "linear":  # `jaxprt.compile.linear` has its map traced when it is lowered.
+            inner = jax.make_jaxpr(functools.partial(equation.primitive.impl, **given))
+            yield from _loose(inner(*(each.aval for each in equation.invars)).jaxpr)
+        for leaf in jax.tree.leaves(given, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
+            inner = getattr(leaf, "jaxpr", leaf)
+            if hasattr(inner, "eqns"):
+                yield from _loose(inner)
 
 
 @pytest.fixture(scope="session")

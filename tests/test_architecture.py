@@ -127,7 +127,7 @@ def test_a_library_is_imported_only_where_its_business_is(module):
 def test_decompositions_and_the_sphere_know_no_brdf_and_no_scene(module):
     if module.split(".")[1:2] in (["decompose"], ["sphere"]):
         known = {name.split(".")[1] for name in imports(TREES[module]) if name.startswith("jaxprt.")}
-        assert known <= {"decompose", "sphere"}
+        assert known <= {"decompose", "sphere", "compile"}
 
 
 @each_module
@@ -137,6 +137,14 @@ def test_jax_is_not_configured(module):
     assert not {name for name in names if re.match(r"jax\.(config|enable_x64|experimental\.enable_x64)\b", name)}
     assert not re.search(r"from jax(\.\w+)* import .*\b(config|enable_x64)\b", text)
     assert not re.search(r"environ\S*[\"'](JAX|XLA)_", text)
+
+
+@each_module
+def test_what_is_compiled_states_the_precision_of_its_products(module):
+    if module == "jaxprt.compile":
+        return
+    found = [node for node in ast.walk(TREES[module]) if isinstance(node, ast.Attribute) and node.attr == "jit"]
+    assert not found, "jax.jit leaves products to TF32 on GPUs: take jaxprt.compile.jit"
 
 
 @each_module

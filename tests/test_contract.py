@@ -948,6 +948,16 @@ def single(name: str) -> tuple[Callable, Call, Any]:
     return function, arrays, function(arrays)
 
 
+@each_pure
+def test_products_and_those_of_gradients_are_exact_on_gpus(name, loose):
+    function, arrays, _ = single(name)
+    assert not loose(function, arrays)
+    _, weigh, moving, _ = double(name)
+    if weigh is not None:
+        with jax.enable_x64(True):
+            assert not loose(weigh, moving)
+
+
 @functools.cache
 def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
     """What a function compiled whole gives for the arguments of ``single`` in float64.
@@ -968,7 +978,7 @@ def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
 
         def weigh(moving, still):
             result = function(**still[1] | eqx.combine(moving, still[0]), **example.options)
-            weighed = (jnp.vdot(Draw(100 + i).normal(*leaf.shape), leaf) for i, leaf in enumerate(floats(result)))
+            weighed = (jnp.sum(Draw(100 + i).normal(*leaf.shape) * leaf) for i, leaf in enumerate(floats(result)))
             return sum(weighed), result
 
         program = jax.jit(jax.value_and_grad(weigh, has_aux=True))

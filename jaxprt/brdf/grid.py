@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxprt.compile import mapped
+
 
 def as_argument(brdf: Callable) -> Callable:
     """A BRDF that jitted functions take: a plain function is not an array and must be wrapped.
@@ -64,7 +66,7 @@ def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float
         spot = jnp.concatenate([spot * size + low, spot * size + low + 1])
         weight = jnp.concatenate([weight * (1 - upper), weight * upper])
     # Row by row, so that a row stays in the cache while all views read it.
-    return jax.lax.map(
+    return mapped(
         lambda one: sum(one.at[s].get(mode="promise_in_bounds") * w for s, w in zip(spot, weight, strict=True)),
         row.reshape(len(row), -1),
     )

@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import models
+from jaxprt.compile import jit
 
 _ROUNDING = 16  # Units of rounding up to which points coincide, and triangles are lines.
 _FAR = 1e30
@@ -296,7 +297,7 @@ def _number(row: dict, column: str, line: int) -> float:
     return value
 
 
-@jax.jit
+@jit
 def _weight(plane: Plane, coordinate: Array) -> Array:
     """`Plane.weight` of two numbers that are finite: some sixty operations, as one program."""
     point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
@@ -332,7 +333,7 @@ def _clip(value: Array, low: ArrayLike, high: ArrayLike) -> Array:
     return jnp.where(value < low, low, jnp.where(value > high, high, value))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jit, static_argnums=0)
 def _scaled(chart: Callable[[Array], Array], point: Array, coordinate: Array) -> Array:
     """Coordinates in the chart, those of the points from 0 to 1."""
     low, high = jnp.min(chart(point), 0), jnp.max(chart(point), 0)

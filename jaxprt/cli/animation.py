@@ -140,5 +140,5 @@ def _about(angle: float) -> Array:
 
 def _swung(camera: Camera, angle: float) -> Camera:
     """A camera moved around what it looks at, about the vertical."""
-    offset = jnp.asarray(_about(angle)) @ (camera.eye - camera.target)
+    offset = jnp.matmul(_about(angle), camera.eye - camera.target, precision="highest")
     return Camera(camera.target + offset, camera.target, camera.up, camera.field_of_view, camera.width, camera.height)

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
+
 _OVERSAMPLE = 8
 _DEPTH = 5  # Blocks in the span, at most; one block alone needs five times as many products on BRDF matrices.
 _EQUAL = 1e-3  # difference of neighboring eigenvalues, as a share of the larger, below which they count as equal
@@ -77,7 +79,7 @@ def _check(terms: int, size: int) -> None:
         raise ValueError(f"terms must be between 1 and the matrix's rank bound {size}, got {terms}")
 
 
-@partial(jax.jit, static_argnames=("terms", "steps"))
+@partial(jit, static_argnames=("terms", "steps"))
 def symmetric(
     matrix: Float[Array, "n n"], *, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, " s"]]:
@@ -102,7 +104,7 @@ def symmetric(
     return _iterate(lambda x: matrix @ x, matrix.shape[0], terms, steps, matrix.dtype)
 
 
-@partial(jax.jit, static_argnames=("terms", "steps"))
+@partial(jit, static_argnames=("terms", "steps"))
 def left_singular(
     matrix: Float[Array, "m n"], *, metric: Float[Array, "n n"] | None = None, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "m r"], Float[Array, " s"]]:
@@ -133,7 +135,7 @@ def left_singular(
     return jnp.maximum(value, 0), vector, residual
 
 
-@partial(jax.jit, static_argnames=("terms", "steps"))
+@partial(jit, static_argnames=("terms", "steps"))
 def power(
     matrix: Float[Array, "n n"], *, terms: int, steps: int = 100
 ) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, "r s"]]:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
+
 _NEWTON = 4  # steps from an approximation that is right to a percent
 _SHARP = 5.0  # concentration from which a recurrence of Bessel functions is stable, and
 _BESSEL = 16  # orders above those asked for where a continued fraction begins
@@ -51,7 +53,7 @@ class Fit(eqx.Module):
     residual: Float[Array, " _"]
 
 
-@jax.jit
+@jit
 def log_density(
     direction: Float[Array, "*b 3"], mean: Float[Array, "l 3"], concentration: Float[Array, " l"]
 ) -> Float[Array, "*b l"]:
@@ -63,13 +65,13 @@ def log_density(
     return log_peak(concentration) - concentration * (x**2 + y**2 + z**2) / 2
 
 
-@jax.jit
+@jit
 def log_peak(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Logarithm of the density of a von Mises-Fisher lobe at its mean."""
     return jnp.log(concentration / (2 * np.pi)) - jnp.log(-jnp.expm1(-2 * concentration))
 
 
-@jax.jit
+@jit
 def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """1 - cos of the angle to the mean, averaged over a lobe: 1 - coth k + 1/k. For a sharp lobe its variance 1/k."""
     small = concentration < 1e-2  # There the two terms of coth k - 1/k cancel.
@@ -78,7 +80,7 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(small, 1 - concentration / 3 + concentration**3 / 45, far)
 
 
-@partial(jax.jit, static_argnames=("degree",))
+@partial(jit, static_argnames=("degree",))
 def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l *b"]:
     """What a von Mises-Fisher lobe leaves of each band of the harmonics that it is averaged over.
 
@@ -101,7 +103,7 @@ def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l 
     return jnp.stack([jnp.where(sharp, a, b) for a, b in zip(known, factor, strict=False)])
 
 
-@jax.jit
+@jit
 def concentration_of(drop: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Concentration whose mean 1 - cos is given, between 0 and 1; the inverse of `drop`.
 
@@ -123,7 +125,7 @@ def concentration_of(drop: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jax.lax.fori_loop(0, _NEWTON, newton, concentration)
 
 
-@partial(jax.jit, static_argnames=("steps",))
+@partial(jit, static_argnames=("steps",))
 def fit(
     sample: Float[Array, "s 3"],
     mass: Float[Array, " s"],
@@ -198,7 +200,7 @@ def fit(
     return Fit(Mixture(every[:count], mean, concentration), every[count:], likelihood, residual)
 
 
-@partial(jax.jit, static_argnames=("steps",))
+@partial(jit, static_argnames=("steps",))
 def weigh(
     density: Float[Array, "s m"], mass: Float[Array, " s"], weight: Float[Array, " m"], *, steps: int = 50
 ) -> tuple[Float[Array, " m"], Float[Array, " _"]]:

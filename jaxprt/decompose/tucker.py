@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.decompose import eigen
 
 _BLOCK = 4096  # columns
@@ -53,7 +54,7 @@ class Tucker(eqx.Module):
         return result
 
 
-@partial(jax.jit, static_argnames=("mode",))
+@partial(jit, static_argnames=("mode",))
 def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: int) -> Float[Array, "*k"]:
     """The product along a mode: the sum over it of the tensor times each column of the matrix.
 
@@ -68,7 +69,7 @@ def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: i
     return jax.lax.map(lambda each: matrix.T @ each, slices).reshape(shape)
 
 
-@partial(jax.jit, static_argnames=("mode",))
+@partial(jit, static_argnames=("mode",))
 def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
     """Inner products of the tensor's slices across a mode: the unfolding times its transpose."""
     slices = _slices(tensor, mode)
@@ -80,7 +81,7 @@ def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
     return jax.lax.scan(lambda sum, each: (sum + each @ each.T, None), jnp.zeros((size, size), tensor.dtype), slices)[0]
 
 
-@partial(jax.jit, static_argnames=("ranks",))
+@partial(jit, static_argnames=("ranks",))
 def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     """Truncated higher-order singular value decomposition.
 
@@ -104,7 +105,7 @@ def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     return Tucker(_core(tensor, factor), factor)
 
 
-@partial(jax.jit, static_argnames=("ranks",))
+@partial(jit, static_argnames=("ranks",))
 def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     """Sequentially truncated HOSVD: each mode is cut before the next one is looked at, the smallest first.
 
@@ -122,7 +123,7 @@ def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     return Tucker(core, tuple(factor))
 
 
-@partial(jax.jit, static_argnames=("ranks", "sweeps"))
+@partial(jit, static_argnames=("ranks", "sweeps"))
 def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2) -> tuple[Tucker, Float[Array, " s"]]:
     """Higher-order orthogonal iteration: the best factor of each mode, given the others, in turn.
 
@@ -198,6 +199,7 @@ def _square(matrix: Array) -> Array:
 
 
 @_square.defjvp
+@jit
 def _square_jvp(primal, tangent):
     # Transposed, the scan would add a whole matrix at each step.
     product = tangent[0] @ primal[0].T
@@ -225,6 +227,7 @@ def _dominant(matrix: Array, rank: int) -> Array:
 
 
 @_dominant.defjvp
+@partial(jit, static_argnums=0)
 def _dominant_jvp(rank, primal, tangent):
     (matrix,), (moved,) = primal, tangent
     vector = _dominant(matrix, rank)

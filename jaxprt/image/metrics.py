@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 
-@jax.jit
+
+@jit
 def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Float[Array, ""]:
     """Norm of the difference over the norm of the reference.
 
@@ -26,7 +28,7 @@ def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Flo
     return jnp.where(same, 0, ratio)
 
 
-@jax.jit
+@jit
 def psnr(
     image: Float[Array, "*b"], reference: Float[Array, "*b"], *, peak: Float[Array, ""] | float = 1.0
 ) -> Float[Array, ""]:

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxprt.compile import jit
 from jaxprt.image import raster
 from jaxprt.image.raster import SAMPLES, Fragments
 from jaxprt.scene.camera import Camera
@@ -99,7 +100,7 @@ def shading_points(
     return Pixels(triangle, barycentric, slope, pixel, coverage, background)
 
 
-@jax.jit
+@jit
 def interpolate(
     fragments: Fragments | Pixels, face: Int[Array, "f 3"], attribute: Float[Array, "v *c"]
 ) -> Float[Array, "..."]:
@@ -122,7 +123,7 @@ def interpolate(
     return jnp.where(seen.reshape(wide), total, 0)
 
 
-@jax.jit
+@jit
 def resolve(
     pixels: Pixels, color: Float[Array, "p c"], *, background: Float[Array, "h w c"] | None = None
 ) -> Float[Array, "h w c"]:
@@ -212,7 +213,7 @@ def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
 # repeats it for each.
 
 
-@jax.jit
+@jit
 def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array, " f"]):
     """Pixels that show one triangle, pixels that need several points, and the share of each pixel that shows none.
 
@@ -231,13 +232,13 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array
     return members, mixed, (empty / len(triangle)).reshape(height, width)
 
 
-@jax.jit
+@jit
 def _projected(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
     """Vertices as of `raster.project`."""
     return jnp.stack(raster.project(*jax.lax.stop_gradient((mesh.position, camera))))
 
 
-@jax.jit
+@jit
 def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
     """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down.
 
@@ -254,7 +255,7 @@ def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
     return mesh.region[face[0]], *(each[0] + each[1] + each[2] for each in normal), *change
 
 
-@jax.jit
+@jit
 def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...]):
     """What the samples of some pixels see, as arrays [s, m]: whether it is a front, and what `_same` takes."""
     shape = (fragments.depth.shape[0] * fragments.depth.shape[1], -1)
@@ -263,7 +264,7 @@ def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...
     return facing & (triangle >= 0), (triangle, 1 / depth, *rest)
 
 
-@jax.jit
+@jit
 def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]]:
     """Whether two samples are of one surface, for each pair (i, j) of the samples of a pixel with i < j.
 
@@ -284,7 +285,7 @@ def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]
     return same
 
 
-@jax.jit
+@jit
 def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> UInt8[Array, "n s"]:
     """Members with those of the pixels `row`: samples of one surface join the first of them."""
     first = []
@@ -298,7 +299,7 @@ def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> 
     return members.at[row].set(jnp.stack(each, -1).astype(members.dtype), mode="drop")
 
 
-@jax.jit
+@jit
 def _points(
     sample: Int[Array, " p"],
     members: UInt8[Array, "n s"],
@@ -335,7 +336,7 @@ def _affine(x, y, q):
     return value, [s[j] * y[i] - s[i] * y[j] for i, j in pairs], [s[i] * x[j] - s[j] * x[i] for i, j in pairs]
 
 
-@jax.jit
+@jit
 def _linear(x, y, q):
     """Weights of the vertices up to a common factor, which are linear in the picture, and their changes."""
     value, right, down = _affine(x, y, q)
@@ -343,7 +344,7 @@ def _linear(x, y, q):
     return [[side * jnp.abs(q[i]) * part[i] for i in range(3)] for part in (value, right, down)]
 
 
-@jax.jit
+@jit
 def _weights(value, right, down, across, along):
     """Perspective-correct weights after a step, which ends where it would leave the triangle, and 1 / their sum."""
     change = [across * right[i] + along * down[i] for i in range(3)]
@@ -356,7 +357,7 @@ def _weights(value, right, down, across, along):
     return [jnp.where(total > 0, each * rate, 1 / 3) for each in weight], rate
 
 
-@jax.jit
+@jit
 def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
     """Weights and their slopes, zero in padding."""
     slope = [[(part[i] - weight[i] * sum(part)) * rate for i in range(3)] for part in change]

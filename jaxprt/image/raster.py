@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from jaxprt.compile import jit
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
@@ -46,7 +47,7 @@ class Fragments(eqx.Module):
     depth: Float[Array, "h w *s"]
 
 
-@functools.partial(jax.jit, static_argnames="samples")
+@functools.partial(jit, static_argnames="samples")
 def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     """Finds the nearest triangle at every pixel's center, or at four samples in every pixel.
 
@@ -79,7 +80,7 @@ def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     return Fragments(triangle, _barycentric(triangle, x, y, q, camera), depth)
 
 
-@jax.jit
+@jit
 def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w *s"]:
     """Whether each pixel or sample shows the front of a surface, whose back is black.
 
@@ -88,7 +89,7 @@ def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w 
     return front_faces(mesh, camera)[fragments.triangle] & (fragments.triangle >= 0)
 
 
-@jax.jit
+@jit
 def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     """Whether the camera is on the front of each triangle: on the side that its shading normals point to.
 
@@ -109,7 +110,7 @@ def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     return (jnp.sign(side) * distance >= -plain) | (side == 0)
 
 
-@jax.jit
+@jit
 def ray_direction(camera: Camera) -> Float[Array, "h w 3"]:
     """Unit directions in the world from the eye through the center of every pixel."""
     column, row = _centers(camera)

@@ -1,20 +1,21 @@
 """Radiance to display: exposure and the sRGB transfer function."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxprt.compile import jit
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Of linear Rec. 709 RGB.
 
 
-@jax.jit
+@jit
 def expose(radiance: Float[Array, "*b"], *, stops: Float[Array, ""] | float) -> Float[Array, "*b"]:
     """Scales radiance by 2^stops, as a camera's exposure would; nothing is clamped."""
     radiance = _floating(radiance)
     return radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype))
 
 
-@jax.jit
+@jit
 def automatic_exposure(
     image: Float[Array, "h w 3"], *, percentile: Float[Array, ""] | float = 99.0, white: Float[Array, ""] | float = 0.9
 ) -> Float[Array, ""]:
@@ -36,7 +37,7 @@ def automatic_exposure(
     return jnp.log2(white / bright)
 
 
-@jax.jit
+@jit
 def encode_srgb(linear: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Encodes linear values by the sRGB transfer function.
 
@@ -50,7 +51,7 @@ def encode_srgb(linear: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, 12.92 * linear, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
-@jax.jit
+@jit
 def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Inverse of `encode_srgb`, continued outside of [0, 1] in the same way."""
     dark = encoded <= 0.04045
@@ -58,7 +59,7 @@ def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, encoded / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
-@jax.jit
+@jit
 def display(radiance: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Exposed linear radiance as values in [0, 1] to show or save as 8 bits: clamps, then encodes."""
     return encode_srgb(jnp.clip(radiance, 0, 1))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.inverse import numbers
 
 DENSE = 512  # numbers whose derivatives are held, all of them
@@ -64,7 +65,7 @@ def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m
         value, along = jax.linearize(function, x)
         return value, jax.lax.map(along, jnp.eye(len(x), dtype=x.dtype))
 
-    return jax.jit(both)
+    return jit(both)
 
 
 @eqx.filter_jit
@@ -150,6 +151,9 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     return Fit(unravel(found), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
+_product = jit(jnp.vdot)
+
+
 @functools.cache
 def _jaxopt() -> Any:
     """The package, imported when it is first needed: that takes as long as half of jaxprt."""
@@ -175,8 +179,8 @@ def _marquardt_steps() -> tuple[Callable, Callable, Callable]:
     )
     # jaxopt 0.8.5 does not read its argument jac_fun where it holds derivatives.
     solver._jac_fun = lambda u, residual, jac: jac
-    direction = jax.jit(lambda free, state: solver.update(free, state, state.residual, state.jac).state.delta)
-    return jax.jit(solver.init_state), jax.jit(solver.update), direction
+    direction = jit(lambda free, state: solver.update(free, state, state.residual, state.jac).state.delta)
+    return jit(solver.init_state), jit(solver.update), direction
 
 
 def marquardt(
@@ -209,7 +213,7 @@ def marquardt(
             )
             moved = free
         refused = refused + 1 if np.array_equal(moved, free) else 0  # Too long a step: the next is shorter.
-        promised = jnp.abs(tried.delta @ (state.damping_factor * tried.delta - state.gradient))
+        promised = jnp.abs(_product(tried.delta, state.damping_factor * tried.delta - state.gradient))
         free, state = moved, tried
         history.append(float(jnp.linalg.norm(state.residual)))
         brought, least = (promised, _MINOR) if refused else (history[-2] ** 2 - history[-1] ** 2, _SETTLED)
@@ -221,7 +225,7 @@ def marquardt(
     axis, value = _determined(rows)
     deviation = _deviation(axis, _scores(axis, value, rows, left))
     determined = axis if not held else _determined(rows[:, :-held])[0]
-    value, rate = jax.jit(lambda u: jax.jvp(bounded, (u,), (jnp.ones_like(u),)))(free)
+    value, rate = jit(lambda u: jax.jvp(bounded, (u,), (jnp.ones_like(u),)))(free)
     known = np.isfinite(deviation)
     deviation = np.where(known, np.where(known, deviation, 0) * np.abs(rate), np.inf)
     return Fit(unravel(value), np.array(history), unravel(jnp.asarray(deviation, free.dtype)), determined.T)
@@ -276,7 +280,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
     def solver(size, length) -> Any:
         return _first_order(lambda y: both(function(size * y), size * y)[1], bounded, length, steps)
 
-    @jax.jit
+    @jit
     def begin(x, bound):
         left, along = jax.linearize(function, x)
         back = jax.linear_transpose(along, x)
@@ -292,7 +296,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         state = solver(size, length).init_state(x / size, *limit)
         return square, (size, length), limit, x / size, state, both(left, x)
 
-    @jax.jit
+    @jit
     def update(y, state, limit, scales):
         moved, state = solver(*scales).update(y, state, *limit)
         return moved, state, both(function(scales[0] * moved), scales[0] * moved)

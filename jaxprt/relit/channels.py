@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf import Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import Channels, PerVertex
+from jaxprt.compile import jit
 from jaxprt.scene import Mesh, Part
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.points import Points
@@ -288,7 +289,7 @@ def _turned(mesh: Mesh, surface: Surface) -> Mesh:
     return eqx.tree_at(lambda each: (each.normal, each.tangent), mesh, (normal, tangent))
 
 
-@jax.jit
+@jit
 def _frames(normal: Array, tangent: Array, surface: Surface) -> tuple[Array, Array]:
     frame = directions.frame(normal, tangent)
     turned = jnp.einsum("vi,vij->vj", surface.normal, frame, precision="highest")

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import grid
+from jaxprt.compile import jit
 from jaxprt.image import raster
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Camera, Mesh
@@ -65,7 +66,7 @@ def curvature(shading: Shading, system: System) -> float:
     return float(np.sqrt((power * (degree * (degree + 1.0)) ** 2).sum() / total)) if total > 0 else 0.0
 
 
-@jax.jit
+@jit
 def error(
     position: Float[Array, "v 3"],
     normal: Float[Array, "v 3"],
@@ -89,7 +90,7 @@ def error(
     return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[face[:, 0]], 1)
 
 
-@jax.jit
+@jit
 def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Array, " f"]:
     """Triangles whose radiance varies within a pixel by more than one point of it can stand for.
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
+from jaxprt.compile import jit
 from jaxprt.image import raster, rasterize, resolve, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation
@@ -257,7 +258,7 @@ def _canvas(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
     return Canvas(pixels, jnp.asarray(order), raster.ray_direction(camera))
 
 
-@jax.jit
+@jit
 def _drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Float[Array, "h w c"]:
     """The picture of the points with these colors, in rows as they were shaded, in front of the light."""
     sky = background(environment, canvas.ray)
@@ -267,7 +268,7 @@ def _drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> F
     return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)
 
 
-@jax.jit
+@jit
 def _judged(
     mesh: Mesh, bend: Float[Array, " v"], pixels: Pixels, camera: Camera
 ) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
@@ -306,7 +307,7 @@ def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
     return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
 
 
-@jax.jit
+@jit
 def _points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, index: Int[Array, " p"]) -> Points:
     """Some points of a part of a picture, whose first vertex has a number in the mesh; padding lies on that vertex.
 
@@ -321,14 +322,14 @@ def _points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, inde
     return Points(jnp.where(padding, 0, corner), weight, slope)
 
 
-@partial(jax.jit, static_argnames="at_pixels")
+@partial(jit, static_argnames="at_pixels")
 def _viewed(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
     """Some points of a part, the material there, and what systems make of the view of them."""
     appearance = at_points(surface.part, surface.shading, surface.material, points)
     return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
 
 
-@jax.jit
+@jit
 def _lit(
     surface: Surface,
     arriving: tuple[PyTree, PyTree],
@@ -347,7 +348,7 @@ def _lit(
     return color if appearance.emitted is None else color + appearance.emitted
 
 
-@partial(jax.jit, static_argnames="at_pixels")
+@partial(jit, static_argnames="at_pixels")
 def _shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
     """Colors of some points of a part. For derivatives what is between is made again, not kept."""
 
@@ -358,7 +359,7 @@ def _shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool
     return jax.checkpoint(both)(surface, arriving, vertices, eye)
 
 
-@jax.jit
+@jit
 def _at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
     """Radiance of the vertices of a part, of each channel of its BRDF by itself."""
     blend = surface.appearance.blend

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
+from jaxprt.compile import jit
 from jaxprt.files import images
 from jaxprt.sphere import cubemap
 
@@ -150,7 +151,7 @@ def resample(
     return _resample_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size)
 
 
-@functools.partial(jax.jit, static_argnames="samples")
+@functools.partial(jit, static_argnames="samples")
 def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
     """Turns distant light: what came from s comes from R s.
 
@@ -204,7 +205,7 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
-@jax.jit
+@jit
 def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
     """Radiance that arrives from some directions in the world, bilinear between texels.
 

@@ -8,6 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.compile import jit
 from jaxprt.scene import mipmap, texture
 from jaxprt.scene.mipmap import Mipmap
 
@@ -177,7 +178,7 @@ class TexturedMaterial(eqx.Module):
         """The textures that it has."""
         return tuple(each for each in vars(self).values() if isinstance(each, Texture))
 
-    @jax.jit
+    @jit
     def at(
         self,
         coordinate: Float[Array, "*b 2"],

@@ -187,7 +187,10 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     same = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL)
     if not same or np.linalg.det(matrix) < 0:
         raise ValueError(f"rotation must be a 3 x 3 matrix that turns and nothing else, got {matrix.tolist()}")
-    place, normal, tangent = (v @ jnp.asarray(rotation, v.dtype).T for v in (mesh.position, mesh.normal, mesh.tangent))
+    place, normal, tangent = (
+        jnp.matmul(each, jnp.asarray(matrix.T, each.dtype), precision="highest")
+        for each in (mesh.position, mesh.normal, mesh.tangent)
+    )
     return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture)
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.scene import texture
 
 _PROBES = 4  # along a footprint that is longer than wide
@@ -27,7 +28,7 @@ class Mipmap(eqx.Module):
     shape: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
 
-@jax.jit
+@jit
 def make(image: Float[Array, "h w c"]) -> Mipmap:
     """The levels of an image, each the mean of the one before over texels of twice the edge.
 
@@ -59,7 +60,7 @@ def _halved(image: Array, axis: int) -> Array:
     return jnp.asarray(total)
 
 
-@functools.partial(jax.jit, static_argnames="wrap")
+@functools.partial(jit, static_argnames="wrap")
 def lookup(
     mipmap: Mipmap, coordinate: Float[Array, "p 2"], slope: Float[Array, "2 p 2"], *, wrap: tuple[str, str]
 ) -> Float[Array, "p c"]:

@@ -2,17 +2,17 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxprt.compile import jit
 from jaxprt.scene.mesh import Mesh
 
 WRAPS = ("repeat", "mirror", "clamp")  # What is beyond the edges: the image again, its mirror image, its border.
 
 
-@functools.partial(jax.jit, static_argnames="wrap")
+@functools.partial(jit, static_argnames="wrap")
 def lookup(
     image: Float[Array, "h w c"], coordinate: Float[Array, "*b 2"], *, wrap: tuple[str, str] = ("repeat", "repeat")
 ) -> Float[Array, "*b c"]:

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Int32
 
+from jaxprt.compile import jit
+
 _FRAME = np.array(
     [
         [[0, 0, -1], [0, -1, 0], [1, 0, 0]],
@@ -101,7 +103,7 @@ def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
     return jnp.asarray(_vector_area(size), jnp.result_type(float))
 
 
-@jax.jit
+@jit
 def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Float[Array, "*b 2"]]:
     """The face that a direction meets, and where.
 
@@ -118,7 +120,7 @@ def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Floa
     return face, jnp.stack([s, t], -1)
 
 
-@jax.jit
+@jit
 def project(
     x: Float[Array, "*b"], y: Float[Array, "*b"], z: Float[Array, "*b"]
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
@@ -152,7 +154,7 @@ def unproject(
     return x, y, z
 
 
-@functools.partial(jax.jit, static_argnames="sharpness")
+@functools.partial(jit, static_argnames="sharpness")
 def lookup(
     cubemap: Float[Array, "6 n n *c"], direction: Float[Array, "*b 3"], *, sharpness: int = 1
 ) -> Float[Array, "..."]:

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
+
 _GRAZING = 0.01  # least cosine of a view
 _PARALLEL = 32  # Rounding errors: a tangent this close to the normal has no direction of its own.
 
 
-@jax.jit
+@jit
 def normalize(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """Scales vectors to unit length, however short or long they are.
 
@@ -30,7 +32,7 @@ def normalize(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     return safe / jnp.sqrt(jnp.sum(safe**2, axis=-1, keepdims=True))
 
 
-@jax.jit
+@jit
 def tangent(normal: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """The tangent that belongs to a normal where the surface brings none: s of Wang's equation 7.
 
@@ -60,7 +62,7 @@ def tangent(normal: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     return normalize(jnp.where(singular[..., None], _axis(0, normal.dtype), result))
 
 
-@jax.jit
+@jit
 def frame(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """Rotations from the world to the local frame: ``frame @ w_world`` is local, the normal its z axis.
 
@@ -84,7 +86,7 @@ def frame(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[
     return jnp.stack([across, jnp.cross(normal, across), normal], axis=-2)
 
 
-@jax.jit
+@jit
 def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> Float[Array, "*b d 3"]:
     """Turns the same world directions into every local frame.
 
@@ -96,7 +98,7 @@ def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> F
     return jnp.stack(local, -1)
 
 
-@jax.jit
+@jit
 def view(frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Float[Array, "3"]) -> Float[Array, "*v 3"]:
     """Local unit directions to the eye, raised to 0.6 degrees above the horizon where they are lower.
 

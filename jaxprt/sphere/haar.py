@@ -6,12 +6,13 @@ details around it.
 
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 
-@jax.jit
+
+@jit
 def forward(image: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
     """Transforms each image to Haar coefficients.
 
@@ -39,7 +40,7 @@ def forward(image: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
     return jnp.concatenate([top, jnp.concatenate([horizontal, diagonal], -2)], -3)
 
 
-@jax.jit
+@jit
 def inverse(coefficient: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
     """Inverse, and transpose, of `forward`.
 

@@ -30,6 +30,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
+from jaxprt.compile import jit
 from jaxprt.sphere import cubemap
 
 _NEWTON_STEPS = 12  # The worst of thousands of spectra, with shares from 0.9 to 1e-6, has all digits after ten.
@@ -55,7 +56,7 @@ def degree_of(count: int) -> int:
     return root - 1
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b lm"]:
     """The basis functions in some directions.
 
@@ -78,7 +79,7 @@ def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b 
     return jnp.moveaxis(basis, 0, -1)
 
 
-@jax.jit
+@jit
 def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 3"]) -> Float[Array, "..."]:
     """The function that the coefficients stand for, in some directions.
 
@@ -96,7 +97,7 @@ def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 
     return jnp.tensordot(basis, coefficient, axes=1, precision="highest")
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
     """SH coefficients of a cubemap: the integral of basis times radiance over the sphere.
 
@@ -250,7 +251,7 @@ def _three_faces(s: np.ndarray, t: np.ndarray) -> np.ndarray:
     return np.concatenate([np.roll(local, turn, axis=-1) for turn in range(3)])
 
 
-@jax.jit
+@jit
 def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> Float[Array, "lm *c"]:
     """Multiplies every band by the factor of a zonal kernel, or of a window.
 
@@ -286,7 +287,7 @@ def cosine(*, degree: int) -> Float[Array, " l"]:
     return jnp.asarray(factor, jnp.result_type(float))
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def phong(exponent: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b l"]:
     """Factors of the Phong lobe (n + 1) / 2 pi max(0, cos)^n, whose integral is one.
 
@@ -344,7 +345,7 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) 
     return _least_laplacian(coefficient, kept)
 
 
-@jax.jit
+@jit
 def _least_laplacian(coefficient: Array, kept: Array) -> Array:
     degree = degree_of(coefficient.shape[0])
     band = _band(degree)
@@ -370,7 +371,7 @@ def _least_laplacian(coefficient: Array, kept: Array) -> Array:
     return jnp.where((kept == 0) & some, weight == 0, factor)
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def disc(direction: Float[Array, "*b 3"], angle: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b lm"]:
     """Coefficients of circular lights of radiance one.
 

@@ -6,11 +6,11 @@ center at ((column + 1/2) / n, (row + 1/2) / n).
 
 from functools import lru_cache, partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.sphere import directions
 
 _TINY = 1e-12
@@ -18,7 +18,7 @@ _LEAST = 1e-20
 _CROWD = 4  # power by which nodes crowd around the middle of `arcs`
 
 
-@jax.jit
+@jit
 def disk_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     """Orthographic projection of local directions, ((d.s + 1) / 2, (d.t + 1) / 2).
 
@@ -33,7 +33,7 @@ def disk_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     return (direction[..., :2] + 1) / 2
 
 
-@jax.jit
+@jit
 def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     """Inverse of `disk_coordinates`; points outside the disk give the nearest horizontal direction.
 
@@ -47,7 +47,7 @@ def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     return jnp.concatenate([xy / radius, jnp.where(outside, 0, z)], -1)
 
 
-@jax.jit
+@jit
 def polar_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     """Polar map (atan2(d.s, d.t), sqrt(1 - d.n)), the angle scaled from a full turn to [0, 1].
 
@@ -62,7 +62,7 @@ def polar_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     return jnp.stack([(angle / (2 * jnp.pi)) % 1, jnp.where(pole, 0, height)], -1)
 
 
-@jax.jit
+@jit
 def polar_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     """Inverse of `polar_coordinates`.
 
@@ -74,7 +74,7 @@ def polar_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     return jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), 1 - square], -1)
 
 
-@jax.jit
+@jit
 def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     """Parabolic map d.xy / (1 + d.z), scaled from [-1, 1] to [0, 1].
 
@@ -87,7 +87,7 @@ def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2
     return (direction[..., :2] / (1 + jnp.maximum(direction[..., 2:], 0)) + 1) / 2
 
 
-@jax.jit
+@jit
 def parabolic_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     """Inverse of `parabolic_coordinates`; points outside the disk give directions below the horizon."""
     xy = 2 * coordinates - 1
@@ -95,7 +95,7 @@ def parabolic_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3
     return jnp.concatenate([2 * xy, 1 - square], -1) / (1 + square)
 
 
-@jax.jit
+@jit
 def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
     """Bilinear lookup between texel centers, constant beyond the outermost centers.
 
@@ -123,7 +123,7 @@ def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> 
     return top * (1 - y) + bottom * y
 
 
-@jax.jit
+@jit
 def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
     """Bilinear lookup in a polar map: periodic in the angle, and continued across the normal.
 
@@ -145,7 +145,7 @@ def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"
     return lookup(around, (coordinates * n + 1) / (n + 2))
 
 
-@partial(jax.jit, static_argnames=("resolution",))
+@partial(jit, static_argnames=("resolution",))
 def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     """Directions at which an n x n disk map is sampled: one per texel, outside the disk too.
 
@@ -159,7 +159,7 @@ def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return jnp.concatenate([xy, jnp.sqrt(1 - jnp.sum(xy**2, -1, keepdims=True))], -1)
 
 
-@partial(jax.jit, static_argnames=("resolution",))
+@partial(jit, static_argnames=("resolution",))
 def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     """Directions at which an n x n parabolic map is sampled: one per texel, those outside the disk drawn in.
 
@@ -178,7 +178,7 @@ def polar_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
     return polar_direction(jnp.stack(jnp.meshgrid(center, center), -1))
 
 
-@partial(jax.jit, static_argnames=("resolution",))
+@partial(jit, static_argnames=("resolution",))
 def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
 
@@ -189,7 +189,7 @@ def texel_area(*, resolution: int) -> Float[Array, "n n"]:
     return jnp.where(inside, (2 / resolution) ** 2, 0.0)
 
 
-@partial(jax.jit, static_argnames=("resolution",))
+@partial(jit, static_argnames=("resolution",))
 def parabolic_texel_area(*, resolution: int) -> Float[Array, "n n"]:
     """Solid angle of each texel of a parabolic map whose center lies inside the unit disk, else 0.
 
@@ -208,7 +208,7 @@ def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
     return jnp.broadcast_to(ring[:, None], (resolution, resolution))
 
 
-@partial(jax.jit, static_argnames=("rings", "sectors"))
+@partial(jit, static_argnames=("rings", "sectors"))
 def arcs(middle: Float[Array, "3"], *, rings: int, sectors: int) -> tuple[Float[Array, "d 3"], Float[Array, " d"]]:
     """Quadrature over the upper hemisphere of what has a peak around one direction.
 

@@ -26,6 +26,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.sphere import harmonics
 
 # Up to this degree every sum is written out, which is fast and compiles in two seconds; beyond, compiling takes
@@ -33,7 +34,7 @@ from jaxprt.sphere import harmonics
 _UNROLLED = 6
 
 
-@jax.jit
+@jit
 def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) -> Float[Array, "lm *c"]:
     """Rotates a spherical function given by its SH coefficients.
 
@@ -55,7 +56,7 @@ def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) ->
     return _rotated(coefficient, rotation)
 
 
-@jax.jit
+@jit
 def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 3 3"]) -> Float[Array, "lm c w"]:
     """Rotates by many rotations at once, in the layout that is fastest: vertices last.
 
@@ -77,7 +78,7 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
     return _rotated(coefficient, jnp.moveaxis(rotation, 0, -1))
 
 
-@jax.jit
+@jit
 def about_z(
     coefficient: Float[Array, "lm *c"], cosine: Float[Array, "*v"], sine: Float[Array, "*v"]
 ) -> Float[Array, "lm *d"]:
@@ -101,13 +102,13 @@ def about_z(
     return jnp.concatenate([_about_z(coefficient[l * l : (l + 1) ** 2], angle) for l in range(degree + 1)])
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def matrix(rotation: Float[Array, "3 3"], *, degree: int) -> Float[Array, "lm lm"]:
     """D(R) itself, with Y(R s) = D(R) Y(s): orthogonal, one block per band."""
     return rotate(jnp.eye((degree + 1) ** 2, dtype=rotation.dtype), rotation)
 
 
-@functools.partial(jax.jit, static_argnames="degree")
+@functools.partial(jit, static_argnames="degree")
 def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array, "*b lm lm"]:
     """D(R) for degrees up to 2, as polynomials in the entries of R.
 

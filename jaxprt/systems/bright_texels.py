@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.brdf import grid
+from jaxprt.compile import jit, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
@@ -149,7 +150,7 @@ class BrightTexels(VertexSystem):
         return rest and (BrightTexels, self.count, rest)
 
 
-@partial(jax.jit, static_argnames=("count",))
+@partial(jit, static_argnames=("count",))
 def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
     """Takes the brightest texels out of a light, as far as they stand out.
 
@@ -235,7 +236,7 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
     return jnp.asarray(excess, jnp.result_type(excess, transport.position))
 
 
-@partial(jax.jit, static_argnames=("size", "samples"))
+@partial(jit, static_argnames=("size", "samples"))
 def _sent(
     brdf: Callable,
     frame: Float[Array, "p 3 3"],
@@ -271,29 +272,25 @@ def _sent(
 
     value = jax.vmap(one, in_axes=(1, 1, *(0 for _ in parameter)), out_axes=1)
 
-    def add(total, argument):
+    def lit(argument):
         direction, area, excess, visible = argument
         share = visible.astype(wo.dtype) if points is None else points.carry(visible)
-        sent = jax.lax.scan(point, dark, (direction, area))[0] * share
+        sent = total(point, (direction, area)) * share
         if weight is not None:
             sent = jnp.sum(sent[:, None] * weight, 0)
-        return total + sent * excess[:, None], None
+        return sent * excess[:, None]
 
-    def point(total, argument):
+    def point(argument):
         direction, area = argument
         wi = jnp.stack([_along(axis, direction) for axis in frame])
-        return total + value(wi, wo, *parameter) * jnp.maximum(_along(frame[2], area), 0), None
+        return value(wi, wo, *parameter) * jnp.maximum(_along(frame[2], area), 0)
 
-    channel = jax.eval_shape(value, wo, wo, *parameter)
-    dark = jnp.zeros(channel.shape, jnp.result_type(channel, excess, wo))
-    colors = max(len(dark) if weight is None else weight.shape[1], excess.shape[1])
     direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples))
     # One after another, so that what is between stays in the processor's cache.
-    none = jnp.zeros((colors, wo.shape[1]), dark.dtype)
-    return jax.lax.scan(add, none, (direction, area, excess, visible))[0].T
+    return total(lit, (direction, area, excess, visible)).T
 
 
-@jax.jit
+@jit
 def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
     """Share of some texels that each vertex sees, in sixteenths."""
     return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
@@ -325,7 +322,7 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     first = np.cumsum([0, *(len(x) ** 2 for x, _ in rule[:-1])])
     offset = np.random.default_rng(0).uniform(-2, 2, (12, 1, 2))  # middles of texels, in texels
     s, t = np.moveaxis((2 * offset + place) / size, -1, 0)[..., None]
-    evaluate = jax.jit(lambda wi, wo: brdf(wi, jnp.broadcast_to(wo, wi.shape)))
+    evaluate = jit(lambda wi, wo: brdf(wi, jnp.broadcast_to(wo, wi.shape)))
     need = 0
     for angle, turn in itertools.product(np.radians([0, 30, 60, 75]), np.pi / 4 * np.arange(4)):
         wo = np.array([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
@@ -356,7 +353,7 @@ def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Arr
     return _irradiance(transport, texel, _checked(transport, texel, excess))
 
 
-@jax.jit
+@jit
 def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
     flux = _flux(transport.frame[:, 2].T, texel, transport.visible(texel), size=transport.size)
     return (excess.T @ flux).T / np.pi

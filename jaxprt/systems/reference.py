@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, UInt8
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
+from jaxprt.compile import jit, mapped
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points, placed
@@ -93,7 +94,7 @@ def radiance(
     return jnp.concatenate(result, -2)
 
 
-@jax.jit
+@jit
 def integrate(
     seen: UInt8[Array, "b d"],
     position: Float[Array, "b 3"],
@@ -167,7 +168,7 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
         total = jax.lax.scan(add, jnp.zeros((len(mean), colors), value.dtype), (light, value, arriving))[0]
         return total, weight, height, chosen
 
-    total, weight, height, chosen = jax.lax.map(one, (given.frame, given.wo, level, jnp.arange(len(given.wo))))
+    total, weight, height, chosen = mapped(one, (given.frame, given.wo, level, jnp.arange(len(given.wo))))
     edge = size // adaptive.root(size)
     return total, adaptive.Choice(seen, weight, height, error), chosen.reshape(-1, 6, edge, edge)
 

@@ -13,11 +13,11 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.decompose import tucker
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic
@@ -67,14 +67,14 @@ def factor(
     return DynamicBrdf(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
 
 
-@jax.jit
+@jit
 def _smoothed(found: Reflected) -> Float[Array, "m s b"]:
     """What each BRDF and color sends, as harmonics of the view."""
     seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
     return tucker.multiply(found.tensor.reshape(-1, *found.tensor.shape[2:]), seen, mode=1)
 
 
-@jax.jit
+@jit
 def _maps(found: Reflected, smooth: Array, least: tucker.Tucker) -> tuple[Array, Array, Array]:
     """View maps of each function and term, light maps, and the error of a decomposition."""
     along, _, across = least.factor
@@ -109,7 +109,8 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
     Reference: Sun et al. 2007, section 3.1.
     """
     if isinstance(brdf, SeparableBrdf):
-        return SeparableBrdf(brdf.light_map, brdf.view_map @ fixed_weights(brdf).T, brdf.error, brdf.coordinates)
+        view = jnp.matmul(brdf.view_map, fixed_weights(brdf).T, precision="highest")
+        return SeparableBrdf(brdf.light_map, view, brdf.error, brdf.coordinates)
     if brdf.lobe is not None or not brdf.core.size:
         found = "those of what its lobes leave" if brdf.core.size else "none"
         raise ValueError(f"light paths need terms of whole BRDFs, from ranks and without lobes, got {found}")
@@ -117,7 +118,7 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
     return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
 
 
-@jax.jit
+@jit
 def _functions(core: Array, view_map: Array, light_map: Array) -> tuple[Array, Array]:
     """Light and view maps of the functions of a set, and of a constant one."""
     view = jnp.einsum("hoi,oyx->iyxh", core, view_map)
@@ -125,7 +126,7 @@ def _functions(core: Array, view_map: Array, light_map: Array) -> tuple[Array, A
     return light, jnp.pad(view, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
 
 
-@partial(jax.jit, static_argnames=("degree",))
+@partial(jit, static_argnames=("degree",))
 def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
     """What light factors make of harmonics in the local frame: integrals over the hemisphere with the cosine.
 
@@ -137,7 +138,7 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
     return harmonics.evaluate(direction, degree=degree).T @ met
 
 
-@jax.jit
+@jit
 def weights(
     factor: Float[Array, "m f h"], weight: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
 ) -> Float[Array, "p e"]:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import visibility
+from jaxprt.compile import jit
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.systems.bounces import functions
 from jaxprt.systems.separable import SeparableBrdf
@@ -26,7 +27,7 @@ _HITS = 64  # in a group: their responses should stay in the cache
 _GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
 
 
-@functools.partial(jax.jit, static_argnames=("edge",))
+@functools.partial(jit, static_argnames=("edge",))
 def respond(
     seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, edge: int
 ) -> Float[Array, "b l k"]:
@@ -52,7 +53,7 @@ def respond(
     return jax.lax.map(one, (seen, frame))
 
 
-@jax.jit
+@jit
 def respond_again(
     arriving: Float[Array, "s q b"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf
 ) -> Float[Array, "b q k"]:
@@ -86,7 +87,7 @@ class Rays(NamedTuple):
     texel: Int[np.ndarray, "g h"]
 
 
-@functools.partial(jax.jit, static_argnames=("points",))
+@functools.partial(jit, static_argnames=("points",))
 def arrive(
     response: Float[Array, "v l k"],
     frame: Float[Array, "v 3 3"],

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float16
 
 from jaxprt import visibility
+from jaxprt.compile import jit
 from jaxprt.decompose import eigen, tucker
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import cubemap, haar, harmonics
@@ -237,7 +238,7 @@ class AgainJob(_PathJob):
         return found.transpose(0, 3, 1, 4, 2)
 
 
-@functools.partial(jax.jit, static_argnames=("components", "modes"))
+@functools.partial(jit, static_argnames=("components", "modes"))
 def compress(
     tensor: Float[Array, "m l f"], *, components: int, modes: int
 ) -> tuple[Float[Array, "m n"], Float16[Array, "e n f"], Float[Array, "l e"], Float[Array, ""]]:
@@ -270,7 +271,7 @@ def compress(
     return weight, core.swapaxes(0, 1), mode, error
 
 
-@functools.partial(jax.jit, static_argnames=("components",))
+@functools.partial(jit, static_argnames=("components",))
 def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Array]:
     """The same along the vertices alone, where the light has few texels and every one counts alike."""
     whole = jnp.vdot(tensor, tensor)
@@ -288,7 +289,7 @@ def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
     return vertex * size, (core / size.reshape(-1, *[1] * (core.ndim - 1))).astype(jnp.float16)
 
 
-@jax.jit
+@jit
 def _expand(weight: Array, core: Array, coarse: Array) -> Array:
     """What arrives at the vertices of a cluster from each coarse texel and function, [s l q, m] as harmonics first."""
     met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))

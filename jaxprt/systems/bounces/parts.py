@@ -94,7 +94,10 @@ class PartBounces(protocol.System):
         require.kind("the light", light, LitTransfer, source="PartBounces.light")
         blends = zip(self.part, self._given(materials), strict=True)
         means = [self._mean(number, *each) for number, each in enumerate(blends)]
-        rows = [own if mean is None else own @ mean for own, mean in zip(self.tensor.factor, means, strict=True)]
+        rows = [
+            own if mean is None else jnp.matmul(own, mean, precision="highest")
+            for own, mean in zip(self.tensor.factor, means, strict=True)
+        ]
         arriving = collect(self.tensor, light, gathered(self.tensor, rows))
         each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
         return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.compile import isolated
+from jaxprt.compile import isolated, jit, mapped
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
@@ -179,6 +179,7 @@ def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "_ _"]]) -> Flo
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
 
 
+@jit
 def area_mean(value: Float[Array, "v *c"], area: Float[Array, " v"]) -> Float[Array, "*c"]:
     """Mean of a value over a surface, given the area of each vertex; zero if there is no area."""
     whole = jnp.sum(area)
@@ -269,7 +270,7 @@ def combine(
     return (whole if points is not None else whole[:, transport.place]).T
 
 
-@partial(jax.jit, static_argnames=("edge",))
+@partial(jit, static_argnames=("edge",))
 def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
     """Radiance of the texels of coarser faces: light is shared by the four texels around it, by its distances.
 
@@ -307,7 +308,7 @@ def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Ar
         light, core = argument
         return light @ core.reshape(kinds, math.prod(shape)).astype(light.dtype)
 
-    return jax.lax.map(one, (light, core)).reshape(clusters, light.shape[1], *shape)
+    return mapped(one, (light, core)).reshape(clusters, light.shape[1], *shape)
 
 
 @isolated

@@ -26,6 +26,7 @@ import tqdm
 from jaxtyping import Array, Float, Float16, Int
 
 from jaxprt import require, visibility
+from jaxprt.compile import jit
 from jaxprt.scene.mesh import Mesh
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import functions, jobs
@@ -333,7 +334,7 @@ def _areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
     return np.bincount(face.ravel(), np.repeat(area / 3, 3), len(mesh.position))
 
 
-@jax.jit
+@jit
 def _energy(tensor: TransferTensor) -> tuple[Float[Array, "g e n"], Float[Array, " g"]]:
     """What each mode and component holds of a cluster's tensor under light of natural spectrum, and all of it."""
     size = jnp.sum(tensor.weight**2, 1)
@@ -350,7 +351,7 @@ def _white(factor: Array, channel: Array | None) -> np.ndarray:
     """Weights of the functions of a region that is white if it can be, else as it is, brightest color."""
     if factor.ndim == 3:
         return np.append(np.zeros(factor.shape[2], np.float32), np.float32(1))
-    weight = np.asarray(factor if channel is None else factor @ channel)
+    weight = np.asarray(factor) if channel is None else np.asarray(factor) @ np.asarray(channel)
     return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.decompose import tucker
 from jaxprt.files import objects
 from jaxprt.sphere import hemisphere
@@ -87,6 +88,7 @@ class DynamicBrdf(eqx.Module):
         tensor = (self.core, self.factor, self.view_map, self.light_map)
         return sum(each.nbytes for each in tensor) + (0 if self.lobe is None else self.lobe.nbytes)
 
+    @jit
     def at(self, weight: Float[Array, " m"]) -> Mixed:
         """The BRDF with a weight for each of the set, as `jaxprt.brdf.navigation` makes them from coordinates.
 
@@ -227,14 +229,14 @@ def decompose(
     return DynamicBrdf(core, along.reshape(count, colors, -1), view, light, *rest, error, coordinates)
 
 
-@jax.jit
+@jit
 def _met(tensor: Array, weight: Array, inside: Array) -> tuple[Array, Array]:
     """The tensor with BRDFs and colors in one mode, whole and with the weights of the views that have one."""
     flat = tensor.reshape(-1, *tensor.shape[2:])
     return flat, flat[:, inside] * weight[inside, None]
 
 
-@jax.jit
+@jit
 def _maps(
     found: tucker.Tucker, flat: Array, met: Array, to_map: Array, weight: Array, whole: Array, inside: Array
 ) -> tuple[Array, ...]:

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import grid
+from jaxprt.compile import jit
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import lobe as lobe_system
 from jaxprt.systems.lobe import LobeBrdf
@@ -21,7 +22,7 @@ DEGREE = 24  # of the natural light that the factors are chosen for
 _RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
 _NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
 
-_stack = jax.jit(lambda brdfs: jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
+_stack = jit(lambda brdfs: jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
 
 
 class Reflected(NamedTuple):
@@ -93,7 +94,7 @@ def stacked(brdfs: Sequence[Callable]) -> Callable | None:
     return _stack(tuple(brdfs))
 
 
-@jax.jit
+@jit
 def _reflected(
     brdf: Callable, lobe: LobeBrdf | None, number: Array, view: Float[Array, "d 3"]
 ) -> tuple[Float[Array, "m c d b"], Float[Array, "m c d"], Float[Array, " m"]]:
@@ -118,7 +119,7 @@ def _reflected(
     return jnp.moveaxis(rest, 0, 2), jnp.moveaxis(square, 0, 2), jnp.min(least, 0)
 
 
-@jax.jit
+@jit
 def _to_map(direction: Array, dual: Array) -> Array:
     """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
     smooth = dual.astype(direction.dtype) @ harmonics.evaluate(direction, degree=DEGREE).T
@@ -142,7 +143,7 @@ def _heights(direction: Array) -> tuple[Array, np.ndarray]:
     return jnp.asarray(np.stack([np.sqrt(1 - height**2), 0 * height, height], -1)), back
 
 
-@jax.jit
+@jit
 def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float[Array, "d 3"]) -> Array:
     """Harmonics of what is reflected to views in the x z plane, turned about the normal to where the views are."""
     azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])

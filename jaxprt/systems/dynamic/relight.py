@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import isolated
+from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import bright_texels, lobe, separable
@@ -286,7 +285,7 @@ def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
     return result * specular + (irradiance + matte) * diffuse
 
 
-@jax.jit
+@jit
 def _gathered(rows: tuple[Array, ...], place: Array | None) -> Array:
     """Rows of all regions in the mesh's order of vertices; those of points one region after the other."""
     colors = max(each.shape[1] for each in rows)

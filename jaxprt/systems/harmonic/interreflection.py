@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxprt import visibility
+from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
@@ -125,7 +126,7 @@ def interreflect_diffuse(
     return TransferVector(jnp.asarray(total), transport.position)
 
 
-@jax.jit
+@jit
 def _shade(
     rows: Float[Array, "v l lm lm"],
     frame: Float[Array, "v 3 3"],
@@ -151,7 +152,7 @@ def _shade(
     return jax.lax.scan(one, start, jnp.arange(3))[0]
 
 
-@jax.jit
+@jit
 def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "b l lm lm"]:
     """The light that arrives from all texels, in the local frame."""
     count, texels, colors, terms = leaving.shape

@@ -11,11 +11,11 @@ checked: NaN in a light or in an eye then reaches every vertex, NaN in a probe e
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.compile import jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics, rotation
@@ -81,7 +81,7 @@ def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
 
 
 @require.arguments(transport=_matrix, brdf=_brdf, light=_light, eye=_eye)
-@jax.jit
+@jit
 def radiance(
     transport: TransferMatrix,
     brdf: HarmonicBrdf,
@@ -115,7 +115,7 @@ def radiance(
 
 
 @require.arguments(brdf=_brdf, light=_light, eye=_eye)
-@jax.jit
+@jit
 def unshadowed_radiance(
     mesh: Mesh,
     brdf: HarmonicBrdf,
@@ -146,7 +146,7 @@ def unshadowed_radiance(
 
 
 @require.arguments(transport=_vector, light=_light)
-@jax.jit
+@jit
 def diffuse_radiance(
     transport: TransferVector, albedo: Float[Array, "..."], light: Float[Array, "lm c *w"]
 ) -> Float[Array, "v _"]:
@@ -165,7 +165,7 @@ def diffuse_radiance(
 
 
 @require.arguments(probe=_probe, coefficient=_probe_coefficient)
-@jax.jit
+@jit
 def probe_light(
     position: Float[Array, "v 3"], probe: Float[Array, "p 3"], coefficient: Float[Array, "p lm c"]
 ) -> Float[Array, "lm c v"]:
@@ -196,7 +196,7 @@ def probe_light(
 
 
 @require.arguments(light=_light)
-@jax.jit
+@jit
 def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
     """Light turned to the frame of every vertex: the light side without transfer.
 
@@ -208,7 +208,7 @@ def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) ->
 
 
 @require.arguments(transport=_matrix, light=_light)
-@jax.jit
+@jit
 def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm _ v"]:
     """Light that arrives at every vertex in its own frame: the light side with transfer.
 
@@ -233,7 +233,7 @@ def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"])
 
 
 @require.arguments(brdf=_brdf, eye=_eye)
-@jax.jit
+@jit
 def view_coefficients(
     brdf: HarmonicBrdf,
     position: Float[Array, "v 3"],
@@ -245,14 +245,14 @@ def view_coefficients(
     return brdf.coefficients(directions.view(right_handed(frame), position, eye), *parameter)
 
 
-@jax.jit
+@jit
 def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Float[Array, "lm c v"]:
     """`view_coefficients` turned to the world, so that all vertices meet the same light: for a fixed view."""
     return rotation.rotate_each(view, right_handed(frame).swapaxes(1, 2))
 
 
 @require.arguments(transport=_matrix)
-@jax.jit
+@jit
 def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) -> Float[Array, "lm _ v"]:
     """`view_coefficients` through the transfer, to the distant light in the world: for a fixed view with shadows.
 
@@ -271,7 +271,7 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
 
 
 @require.arguments(light=_light_shape)
-@jax.jit
+@jit
 def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Float[Array, "v _"]:
     """Dot product of light and BRDF coefficients: radiance.
 

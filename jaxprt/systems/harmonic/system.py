@@ -143,4 +143,4 @@ def blended_view(
     if materials is None:
         return row
     materials.check(len(position), row.shape[1])
-    return jnp.einsum("ikv,vkc->icv", row, materials.weight)
+    return jnp.einsum("ikv,vkc->icv", row, materials.weight, precision="highest")

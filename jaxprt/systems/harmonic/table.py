@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import grid
+from jaxprt.compile import jit
 from jaxprt.sphere import harmonics, hemisphere, rotation
 
 # Rings and sectors of the quadrature, one after the other until the error is reached; the last is for judging alone.
@@ -113,7 +114,7 @@ class HarmonicBrdf(eqx.Module):
         batch = wo.shape[:-1]
         basis = harmonics.evaluate(wi.reshape(-1, 3), degree=self.degree)
         row = self.coefficients(wo.reshape(-1, 3), *(each.reshape(-1) for each in parameter))
-        return jnp.einsum("vi,icv->vc", basis, row).reshape(*batch, row.shape[1])
+        return jnp.einsum("vi,icv->vc", basis, row, precision="highest").reshape(*batch, row.shape[1])
 
 
 def tabulate(
@@ -193,7 +194,7 @@ def tabulate(
     return eqx.tree_at(lambda each: each.error, table, jnp.asarray(reached, table.table.dtype))
 
 
-@partial(jax.jit, static_argnames=("degree", "rings", "sectors"))
+@partial(jit, static_argnames=("degree", "rings", "sectors"))
 def project(
     brdf: Callable, wo: Float[Array, "v 3"], *, degree: int, rings: int, sectors: int
 ) -> Float[Array, "lm c v"]:
@@ -261,7 +262,7 @@ def _missed(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequ
     return float(np.max(error))
 
 
-@jax.jit
+@jit
 def _looked_up(table: HarmonicBrdf, wo: Array, parameter: tuple[Array, ...]) -> Array:
     return table.coefficients(wo, *parameter)
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from jaxprt import visibility
+from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
@@ -120,7 +121,7 @@ def precompute_diffuse(
     return TransferVector(jax.device_put(result["vector"]), visibility.rays.place(mesh, vertex))
 
 
-@partial(jax.jit, static_argnames="degree")
+@partial(jit, static_argnames="degree")
 def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "b lm lm"]:
     """Transfer matrices of shadowed light: M_oi = ∫ V y_o (in the local frame) y_i (in the world).
 
@@ -149,7 +150,7 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
     return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
 
 
-@partial(jax.jit, static_argnames="degree")
+@partial(jit, static_argnames="degree")
 def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "lm b"]:
     """Transfer vectors of shadowed light, t_i = 1/pi ∫ V y_i cos, with i in the world.
 
@@ -168,7 +169,7 @@ def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *,
     return _project(seen.astype(frame.dtype) * (cosine / (visibility.LEVELS * np.pi)), degree=degree)
 
 
-@jax.jit
+@jit
 def right_handed(frame: Float[Array, "v 3 3"]) -> Float[Array, "v 3 3"]:
     """Frames with the bitangent that belongs to their tangent and normal: a proper rotation whatever it was.
 

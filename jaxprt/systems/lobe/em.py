@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.decompose import mixture
 from jaxprt.sphere import directions, hemisphere
 
@@ -25,7 +26,7 @@ _GRAZING = 1e-3
 _TINY = 1e-12
 
 
-@jax.jit
+@jit
 def samples(
     brdf: Callable, wo: Float[Array, "v 3"]
 ) -> tuple[Float[Array, "v s 3"], Float[Array, "v s c"], Float[Array, "v s 1"], Float[Array, "v s"]]:
@@ -43,7 +44,7 @@ def samples(
     return jax.lax.map(one, wo, batch_size=_BATCH)
 
 
-@partial(jax.jit, static_argnames=("lobes",))
+@partial(jit, static_argnames=("lobes",))
 def start(
     wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
 ) -> tuple[mixture.Mixture, Float[Array, "v l"]]:
@@ -76,7 +77,7 @@ def start(
     return mixture.Mixture(weight, mean, concentration), least
 
 
-@partial(jax.jit, static_argnames=("steps",))
+@partial(jit, static_argnames=("steps",))
 def improve(
     sample: Float[Array, "v s 3"],
     mass: Float[Array, "v s"],
@@ -100,7 +101,7 @@ def improve(
     return jax.lax.map(one, (sample, mass, extent, lobe, least, fixed, weight), batch_size=_BATCH)
 
 
-@partial(jax.jit, static_argnames=("nodes",))
+@partial(jit, static_argnames=("nodes",))
 def blend(
     wo: Float[Array, "v 3"], lobe: mixture.Mixture, smoothing: Float[Array, ""], *, nodes: tuple[int, ...]
 ) -> mixture.Mixture:
@@ -125,7 +126,7 @@ def blend(
     return mixture.Mixture(every[..., 3] * total, mean, jnp.exp(every[..., 2]))
 
 
-@jax.jit
+@jit
 def weigh(
     sample: Float[Array, "v s 3"],
     mass: Float[Array, "v s c"],

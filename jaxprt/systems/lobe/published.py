@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxprt.compile import jit
 from jaxprt.decompose import mixture
 from jaxprt.systems.lobe import em
 from jaxprt.systems.lobe import table as lobe_table
@@ -45,7 +46,7 @@ def mirror_lobes(
     return lobe_table.LobeBrdf(mean, scale, weight, diffuse, (), jax.device_put(np.asarray(np.nan, wo.dtype)))
 
 
-@jax.jit
+@jit
 def _mirror_lobes(
     wo: Array, sample: Array, mass: Array, extent: Array, concentration: Array
 ) -> tuple[Array, Array, Array, Array]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import visibility
-from jaxprt.compile import isolated
+from jaxprt.compile import isolated, jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
@@ -305,7 +305,7 @@ def texel_bits(transport: LobeTransport) -> TexelBits:
     return TexelBits(turned, transport.position, transport.frame, transport.size)
 
 
-@jax.jit
+@jit
 def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     """Bits and means of visibility, as `LobeTransport` has them.
 

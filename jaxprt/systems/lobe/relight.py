@@ -23,7 +23,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import isolated
+from jaxprt.compile import isolated, jit, total
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
@@ -130,7 +130,7 @@ def prefilter(light: Environment) -> LobeLight:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
         )
-    return _prefilter(light, _blurs(light.radiance.shape[1], light.radiance.dtype))
+    return _prefilter(light, _blurs(light.radiance))
 
 
 @require.arguments(brdf=_brdf)
@@ -226,16 +226,14 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
         irradiance = view.points.carry(irradiance, axis=1)
     # Colors side by side, so that a tap reads them at once; lobes one after another, so that sums stay in the cache.
     rows = light.pyramid.T
-    colors = max(len(view.weight), len(light.pyramid))
 
-    def add(total, lobe):
+    def lit(lobe):
         place, visible, weight = lobe
         taps = zip(place, visible, strict=True)
-        lit = reduce(jnp.add, (rows.at[texel].get(mode="promise_in_bounds") * part[:, None] for texel, part in taps))
-        return total + lit * weight.T, None
+        read = reduce(jnp.add, (rows.at[texel].get(mode="promise_in_bounds") * part[:, None] for texel, part in taps))
+        return read * weight.T
 
-    none = jnp.zeros((view.weight.shape[2], colors), jnp.result_type(rows, view.weight))
-    glossy, _ = jax.lax.scan(add, none, (view.place, view.visible, jnp.swapaxes(view.weight, 0, 1)))
+    glossy = total(lit, (view.place, view.visible, jnp.swapaxes(view.weight, 0, 1)))
     return glossy + (irradiance * view.diffuse).T
 
 
@@ -255,7 +253,7 @@ def scales(size: int) -> Scales:
     return Scales(edge, spread, (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
 
 
-@jax.jit
+@jit
 def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLight:
     _, size, _, colors = light.radiance.shape
     scale = scales(size)
@@ -288,17 +286,28 @@ def _edge(width: float, size: int, *, least: int) -> int:
     return edge
 
 
-def _blurs(size: int, dtype) -> list[tuple[Array, Array]]:
+def _blurs(radiance: Float[Array, "6 n n c"]) -> list[tuple[Array | np.ndarray, Array | np.ndarray]]:
     """For each width the texels [tile, m, face] that make a tile of the blurred faces, and their weights [tile, o, m].
 
     What is blurred is made in tiles, so that a small dense product makes each, and weights are the same on all faces.
+    They are kept on the light's device; in a program they are constants.
     """
     with jax.ensure_compile_time_eval():  # What a trace made could not be kept.
-        return _made_blurs(size, str(dtype))
+        size, dtype = radiance.shape[1], str(radiance.dtype)
+        if isinstance(radiance, np.ndarray | jax.core.Tracer):
+            return _made_blurs(size, dtype)
+        return _placed_blurs(size, dtype, min(radiance.devices(), key=lambda each: each.id))
 
 
 @lru_cache(maxsize=4)
-def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
+def _placed_blurs(size: int, dtype: str, device: jax.Device) -> list[tuple[Array, Array]]:
+    """On a device, but not bound to it: lights that lie on several devices are blurred there."""
+    with jax.default_device(device):
+        return jax.device_put(_made_blurs(size, dtype))
+
+
+@lru_cache(maxsize=4)
+def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
     scale = scales(size)
     result = []
     for edge, spread in zip(scale.edge.tolist()[1:], scale.spread.tolist()[1:], strict=True):
@@ -321,7 +330,7 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[Array, Array]]:
         away = 1 - np.einsum("toi,tmi->tom", place, center[index])
         weight = known[:, None] * np.exp(-concentration * away)
         weight /= weight.sum(-1, keepdims=True)
-        result.append((jax.device_put(_on_faces(source)[index]), jax.device_put(np.asarray(weight, dtype))))
+        result.append((_on_faces(source)[index], np.asarray(weight, dtype)))
     return result
 
 

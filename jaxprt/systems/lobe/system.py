@@ -47,8 +47,8 @@ class LobeSystem(protocol.VertexSystem):
             return view_lobes(self.transport, self.brdf, eye=eye, points=self.points)
         materials.check(self.vertices, len(self.brdf.weight))
         seen = view_lobes(self.transport, self.brdf, *materials.parameter, eye=eye, points=self.points)
-        weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight)
-        diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight)
+        weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight, precision="highest")
+        diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight, precision="highest")
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
 
     def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import grid
+from jaxprt.compile import jit
 from jaxprt.decompose import mixture
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems.lobe import em, knots
@@ -160,7 +161,7 @@ class LobeBrdf(eqx.Module):
         return value.T.reshape(*batch, len(self.weight))
 
 
-@jax.jit
+@jit
 def mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
     """Lobes between those along the first parameter of a table, which then has no axis.
 
@@ -287,7 +288,7 @@ def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array,
     return _end(lobe, em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
 
 
-@partial(jax.jit, static_argnames=("lobes",))
+@partial(jit, static_argnames=("lobes",))
 def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array, mixture.Mixture, Array, Array]:
     """The mass of all colors, lobes and their least concentrations from which EM starts, and the diffuse part's."""
     gray = jnp.sum(mass, -1)
@@ -295,7 +296,7 @@ def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array,
     return gray, lobe, least, jnp.sum(gray, 1, keepdims=True) / 2
 
 
-@partial(jax.jit, static_argnames=("nodes",))
+@partial(jit, static_argnames=("nodes",))
 def _end(lobe: mixture.Mixture, weight: Array, *, nodes: tuple[int, ...]) -> tuple[Array, Array, Array, Array]:
     """The parts of a table of one BRDF: lobes that EM has found, on the nodes of the view."""
     mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
@@ -330,7 +331,7 @@ def _values(brdf: Callable, wi: Array, wo: Array) -> Array:
     return brdf(wi, wo)
 
 
-@jax.jit
+@jit
 def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
     """Relative error of a table without parameters under light of natural spectrum."""
     random = np.random.default_rng(1).uniform(size=(2, 24))

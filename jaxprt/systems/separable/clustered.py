@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
 from jaxprt import require, visibility
-from jaxprt.compile import linear
+from jaxprt.compile import jit, linear, mapped
 from jaxprt.decompose import clustering, eigen
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import haar
@@ -94,7 +94,7 @@ class ClusteredTransport(eqx.Module):
         mark = None if self.mark is None else self.mark[:terms]
         return ClusteredTransport(index, mode, core, weight, *same, rms, mark)
 
-    @jax.jit
+    @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
         """Transport times light coefficients, per vertex: each cluster's modes meet the light once.
 
@@ -120,16 +120,23 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
     # Rows that no vertex is read from are written past the end, which is dropped.
     at = jnp.where(_read(transport), transport.vertex, count + jnp.arange(rows)).reshape(len(light), -1)
 
-    def one(result, argument):
-        mode, core, weight, light, at = argument
+    def one(argument):
+        mode, core, weight, light = argument
         met = light.T @ mode.astype(dtype) @ core.reshape(modes, components * terms).astype(dtype)
         component = jnp.moveaxis(met.reshape(-1, components, terms), 0, 2)
-        found = weight.astype(dtype) @ component.reshape(components, -1)
-        return result.at[at].set(found, mode="drop", unique_indices=True), None
+        return weight.astype(dtype) @ component.reshape(components, -1)
+
+    def written(result, at, found):
+        return result.at[at].set(found, mode="drop", unique_indices=True)
 
     start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
-    clusters = (transport.mode, transport.core, transport.weight, light, at)
-    return jax.lax.scan(one, start, clusters)[0].reshape(count, terms, -1)
+    clusters = (transport.mode, transport.core, transport.weight, light)
+    result = jax.lax.platform_dependent(
+        (at, clusters),
+        cpu=lambda each: jax.lax.scan(lambda out, row: (written(out, row[0], one(row[1])), None), start, each)[0],
+        default=lambda each: written(start, each[0], mapped(one, each[1])),
+    )
+    return result.reshape(count, terms, -1)
 
 
 def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
@@ -146,7 +153,7 @@ def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
     at = transport.vertex.reshape(clusters, -1)
     read = _read(transport).reshape(*at.shape, 1)
     cotangent = cotangent.reshape(len(cotangent), -1)
-    found = jax.lax.map(one, (transport.mode, transport.core, transport.weight, at, read))
+    found = mapped(one, (transport.mode, transport.core, transport.weight, at, read))
     start = jnp.zeros((len(transport.rms), found.shape[2]), dtype)
     return start.at[transport.index.astype(jnp.int32)].add(found)
 
@@ -266,7 +273,7 @@ class ClusterJob(visibility.blocks.Job):
         return self.member.shape[1]
 
 
-@partial(jax.jit, static_argnames=("components", "modes", "keep"))
+@partial(jit, static_argnames=("components", "modes", "keep"))
 def compress(
     seen: UInt8[Array, "m d"],
     frame: Float[Array, "m 3 3"],
@@ -331,7 +338,7 @@ def _remainder(value: Array, total: Array) -> Array:
     return jnp.concatenate([total[None], left]) / jnp.where(total > 0, total, 1)
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(jit, static_argnames=("size",))
 def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) -> Array:
     def energy(argument):
         dtype = argument[2].dtype

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.compile import jit
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, directions
 
@@ -52,7 +53,7 @@ def light_errors(
     return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
 
 
-@jax.jit
+@jit
 def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
     size = light.radiance.shape[1]
     direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.compile import isolated
+from jaxprt.compile import isolated, jit
 from jaxprt.decompose import eigen
 from jaxprt.files import objects
 from jaxprt.scene.environment import Environment
@@ -188,11 +188,13 @@ def factor(
     # Transport that another machine made serves the same factors here.
     turn = eigen.orientation(np.asarray(value), np.asarray(vector))[:, :terms].T.astype(value.dtype)
     shape = (terms, resolution, resolution, -1)
-    light_map, view_map = (jnp.tensordot(turn, each, 1).reshape(shape) for each in (light_map, view_map))
+    light_map, view_map = (
+        jnp.tensordot(turn, each, 1, precision="highest").reshape(shape) for each in (light_map, view_map)
+    )
     return SeparableBrdf(light_map, view_map, jnp.asarray(remainder[terms - 1]), hemisphere.parabolic_coordinates)
 
 
-@jax.jit
+@jit
 def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array) -> tuple[Array, Array, Array]:
     """M diag(cos dw) without and with the weight of the views, in rows of one view and color, and C."""
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
@@ -200,7 +202,7 @@ def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array)
     return flux, matrix, light_covariance(direction[inside], degree=_DEGREE)
 
 
-@jax.jit
+@jit
 def _maps(
     table: Array, solid_angle: Array, flux: Array, matrix: Array, covariance: Array, value: Array, vector: Array
 ) -> tuple[Array, Array]:
@@ -346,12 +348,12 @@ def _leading(
         count = min(4 * count, most)
 
 
-@jax.jit
+@jit
 def _total(matrix: Array, covariance: Array) -> Array:
     return jnp.sum((matrix @ covariance) * matrix)
 
 
-@jax.jit
+@jit
 def _remainder(value: Array, total: Array) -> Array:
     """Errors that the first terms leave."""
     lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxprt.brdf import models
+from jaxprt.compile import jit
 from jaxprt.decompose import eigen
 from jaxprt.sphere import hemisphere
 from jaxprt.systems.separable.factorization import SeparableBrdf, tabulate
@@ -71,7 +72,7 @@ def factor_symmetric(
     return SeparableBrdf(light_map, view_map, error, coordinates)
 
 
-@partial(jax.jit, static_argnames=("terms", "solve"))
+@partial(jit, static_argnames=("terms", "solve"))
 def _eigenvectors(
     table: Array, area: Array, inside: Array, *, terms: int, solve: Callable
 ) -> tuple[Array, Array, Array, Array]:
@@ -125,7 +126,7 @@ def factor_normalized(
     return SeparableBrdf(light_map, view_map, error, coordinates)
 
 
-@jax.jit
+@jit
 def _normalized(table: Array, area: Array) -> tuple[Array, Array, Array]:
     """Light and view map, and their error."""
     view_map = jnp.sum(jnp.abs(table) * area, -1)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer, UInt
 
 from jaxprt import require
+from jaxprt.compile import jit, total
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.sparse import SparseTransport
 
@@ -46,7 +47,7 @@ class QuantizedTransport(eqx.Module):
         mark = None if self.mark is None else self.mark[:terms]
         return QuantizedTransport(index, level, quantum, self.position, self.frame, rms, mark)
 
-    @jax.jit
+    @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
         """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
 
@@ -66,14 +67,12 @@ class QuantizedTransport(eqx.Module):
         rows = self.index.reshape(kept, -1), self.level.reshape(kept, -1)
         dtype = jnp.result_type(coefficient, self.quantum)
 
-        def step(total, row):
+        def term(row):
             number, level = row
             light = coefficient.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
-            return total + _unpack(level).astype(dtype) * light, None
+            return _unpack(level).astype(dtype) * light
 
-        colors = max(coefficient.shape[1], self.quantum.shape[2])
-        total, _ = jax.lax.scan(step, jnp.zeros((vertices * terms, colors), dtype), rows)
-        return total.reshape(vertices, terms, -1) * self.quantum
+        return total(term, rows).reshape(vertices, terms, -1) * self.quantum
 
     @property
     def terms(self) -> int:
@@ -86,7 +85,7 @@ class QuantizedTransport(eqx.Module):
         return self.index.nbytes + self.level.nbytes + self.quantum.nbytes
 
 
-@jax.jit
+@jit
 def quantize(transport: SparseTransport) -> QuantizedTransport:
     """Rounds coefficients to multiples of a quantum: the largest of each vertex, term and color over the last level.
 
@@ -122,7 +121,7 @@ def quantize(transport: SparseTransport) -> QuantizedTransport:
     return QuantizedTransport(index, _pack(level), quantum, *same)
 
 
-@jax.jit
+@jit
 def dequantize(transport: QuantizedTransport) -> SparseTransport:
     """The transport in floating point again, rounded as it is."""
     level = _unpack(transport.level.reshape(-1)).reshape(*transport.level.shape, -1)

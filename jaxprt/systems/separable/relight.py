@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.compile import isolated, linear
+from jaxprt.compile import isolated, jit, linear
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, check_mark
@@ -56,7 +56,7 @@ def _environment(value: Any) -> None:
 
 
 @require.arguments(light=_environment)
-@jax.jit
+@jit
 def project(light: Environment) -> Float[Array, "b c"]:
     """Haar coefficients of an environment, each cubemap face by itself.
 
@@ -72,7 +72,7 @@ def project(light: Environment) -> Float[Array, "b c"]:
     return coefficient.reshape(-1, coefficient.shape[-1])
 
 
-@partial(jax.jit, static_argnames=("threshold",))
+@partial(jit, static_argnames=("threshold",))
 def choose_by_magnitude(coefficient: Float[Array, "b c"], *, threshold: int = 1024) -> Float[Array, "b c"]:
     """Drops what is below the threshold in signed 16 bits per color, as published.
 
@@ -92,7 +92,7 @@ def choose_by_magnitude(coefficient: Float[Array, "b c"], *, threshold: int = 10
     return jnp.where(jnp.abs(_level(coefficient)) >= threshold, coefficient, 0)
 
 
-@jax.jit
+@jit
 def quantize(coefficient: Float[Array, "b c"]) -> Float[Array, "b c"]:
     """Rounds to signed 16 bits: multiples of the largest coefficient of each color / 32767.
 
@@ -116,7 +116,7 @@ def _level(coefficient: Array) -> Array:
     return jnp.round(coefficient / quantum)
 
 
-@partial(jax.jit, static_argnames=("count",))
+@partial(jit, static_argnames=("count",))
 def choose_by_area(coefficient: Float[Array, "b c"], *, count: int) -> Float[Array, "b c"]:
     """Keeps the `count` coefficients largest in magnitude times the area of their basis function.
 
@@ -127,7 +127,7 @@ def choose_by_area(coefficient: Float[Array, "b c"], *, count: int) -> Float[Arr
     return _choose(coefficient, area, count)
 
 
-@partial(jax.jit, static_argnames=("count",))
+@partial(jit, static_argnames=("count",))
 def choose_by_transport(
     coefficient: Float[Array, "b c"], rms: Float[Array, " b"], *, count: int
 ) -> Float[Array, "b c"]:
@@ -245,7 +245,7 @@ def view_factors(
     return _view_factors(brdf, position, frame, eye)
 
 
-@jax.jit
+@jit
 def _view_factors(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
     return brdf.view(directions.view(frame, position, eye))
 
@@ -283,7 +283,7 @@ def modulate(
     return _modulated(view, weight, terms=terms)
 
 
-@partial(jax.jit, static_argnames=("terms",))
+@partial(jit, static_argnames=("terms",))
 def _modulated(view: Array, weight: Array, *, terms: tuple[int, ...]) -> Array:
     return view * weight[:, np.repeat(np.arange(len(terms)), terms)]
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt
 
 from jaxprt import require, visibility
-from jaxprt.compile import linear
+from jaxprt.compile import jit, linear, total
 
 # Versions of what makes the results of `separable.wavelets`; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "separable": 1}
@@ -85,7 +85,7 @@ class SparseTransport(eqx.Module):
         found = Transpose(jnp.asarray(row), jnp.asarray(padded), jnp.asarray(chunk, jnp.int32))
         return eqx.tree_at(lambda x: x.transpose, self, found, is_leaf=lambda x: x is None)
 
-    @jax.jit
+    @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r _"]:
         """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
 
@@ -137,16 +137,15 @@ def _accumulate(index: Shaped[Array, "k n"], value: Float[Array, "k n l"], table
     gray = value.shape[-1] == 1
     value = value[..., 0] if gray else value
 
-    def step(total, row):
+    def term(row):
         number, weight = row
         read = table.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
-        return total + (weight[:, None] if gray else weight) * read, None
+        return (weight[:, None] if gray else weight) * read
 
-    start = jnp.zeros((index.shape[1], table.shape[1]), jnp.result_type(table, value))
-    return jax.lax.scan(step, start, (index, value))[0]
+    return total(term, (index, value))
 
 
-@partial(jax.jit, static_argnames=("keep",))
+@partial(jit, static_argnames=("keep",))
 def largest(
     coefficient: Float[Array, "b d r l"], *, keep: int
 ) -> tuple[Shaped[Array, "k b r"], Float[Array, "k b r l"]]:

@@ -45,7 +45,7 @@ class SeparableSystem(protocol.VertexSystem):
         if materials is None:
             return factor
         materials.check(self.vertices, self.brdf.view_map.shape[-1])
-        return jnp.einsum("vrk,vkc->vrc", factor, materials.weight)
+        return jnp.einsum("vrk,vkc->vrc", factor, materials.weight, precision="highest")
 
     def combine(self, light: Float[Array, "_ r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
         """Radiance: the dot product of the two tuples."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped, UInt8
 
 from jaxprt import visibility
+from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
@@ -74,7 +75,7 @@ def precompute(
     return SparseTransport(index, value, position, frame, rms, mark=jax.device_put(marked(brdf.light_map)))
 
 
-@jax.jit
+@jit
 def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: SeparableBrdf) -> Float[Array, "b d r l"]:
     """Haar coefficients of visibility x cosine x solid angle x light map.
 
@@ -118,7 +119,7 @@ def _points(size: int) -> tuple[Float[np.ndarray, "p d 3"], Float[np.ndarray, "p
     return np.stack(direction), np.stack(area)
 
 
-@partial(jax.jit, static_argnames=("keep",))
+@partial(jit, static_argnames=("keep",))
 def compress(
     seen: UInt8[Array, "b d"],
     frame: Float[Array, "b 3 3"],
