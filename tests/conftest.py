@@ -1,4 +1,7 @@
-"""Fixtures that every test may ask for: ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked``, ``close``, ``loose``."""
+"""Fixtures that every test may ask for.
+
+They are ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked``, ``close``, ``loose`` and ``elsewhere``.
+"""
 
 import functools
 import gc
@@ -157,6 +160,15 @@ def x64() -> Iterator[None]:
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No shape checks, as users run: for what the package itself says of wrong shapes."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The programs of GPUs, run here: what depends on the platform takes the form for others than CPUs."""
+    jax.clear_caches()
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, default, **forms: default(*arguments))
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.compile import isolated, linear
+from jaxprt import compile as compiled
+from jaxprt.compile import isolated, jit, linear, mapped, total
 
 
 def product(fixed, x):
@@ -160,3 +161,61 @@ def test_a_gradient_outside_any_program_is_compiled_once():
     before = len(traces)
     np.testing.assert_array_equal(slope(jnp.ones(3)), first)
     assert len(traces) == before
+
+
+def summed(index, value, table):
+    return total(lambda row: table[row[0]] * row[1][:, None], (index, value))
+
+
+def each(index, value, table):
+    return mapped(lambda row: (table[row[0]] * row[1][:, None]).T, (index, value))
+
+
+@pytest.fixture
+def rows(x64):
+    random = np.random.default_rng(3)
+    index, value, table = random.integers(6, size=(7, 5)), random.normal(size=(7, 5)), random.normal(size=(6, 3))
+    return jnp.asarray(index), jnp.asarray(value), jnp.asarray(table)
+
+
+@pytest.mark.parametrize("room", [1 << 28, 250, 1])
+@pytest.mark.parametrize("form", ["cpu", "default"])
+def test_loops_give_the_same_in_the_form_of_every_device(form, room, rows, monkeypatch):
+    monkeypatch.setattr(compiled, "_ROOM", room)  # All rows at once, some, or one.
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, **forms: forms[form](*arguments))
+    index, value, table = rows
+    one = np.asarray(table)[index] * np.asarray(value)[..., None]
+    weight = np.random.default_rng(4).normal(size=one.shape)
+    np.testing.assert_allclose(summed(*rows), one.sum(0), rtol=1e-12)
+    np.testing.assert_allclose(each(*rows), one.swapaxes(1, 2), rtol=1e-12)
+    for loop, seen in ((summed, weight[0]), (each, weight.swapaxes(1, 2))):
+        slope = jax.jit(jax.grad(lambda t, v, loop=loop, seen=seen: jnp.sum(loop(index, v, t) * seen), (0, 1)))
+        by_table, by_value = slope(table, value)
+        of_rows = weight[:1] if loop is summed else weight
+        np.testing.assert_allclose(by_value, np.sum(np.asarray(table)[index] * of_rows, -1), rtol=1e-11)
+        expected = np.zeros(table.shape)
+        np.add.at(expected, index, np.asarray(value)[..., None] * of_rows)
+        np.testing.assert_allclose(by_table, expected, rtol=1e-11)
+        batch = jax.vmap(loop, (None, None, 0))(index, value, jnp.stack([table, 2 * table]))
+        np.testing.assert_allclose(batch[1], 2 * batch[0], rtol=1e-12)
+    assert summed(index[:0], value[:0], table).shape == (5, 3)
+    assert not np.any(summed(index[:0], value[:0], table))
+
+
+def test_programs_for_gpus_have_no_loops_over_rows_no_branches_to_choose_and_exact_products(rows, loose):
+    step = isolated(lambda x: jnp.sin(x) @ x.T)
+
+    def both(index, value, table):
+        return step(summed(index, value, table))
+
+    program = jit(both).trace(*rows)
+    cpu, gpu = (program.lower(lowering_platforms=(name,)).as_text() for name in ("cpu", "cuda"))
+    assert "while" in cpu
+    assert "while" not in gpu
+    assert "precision = [HIGHEST, HIGHEST]" in gpu
+    assert not loose(both, *rows)
+    assert loose(lambda x: x @ x, jnp.ones((2, 2)))
+
+
+def test_products_inside_maps_and_their_transposes_are_exact(matrix, x, loose):
+    assert not loose(jax.grad(ours), x, matrix)

@@ -948,16 +948,6 @@ def single(name: str) -> tuple[Callable, Call, Any]:
     return function, arrays, function(arrays)
 
 
-@each_pure
-def test_products_and_those_of_gradients_are_exact_on_gpus(name, loose):
-    function, arrays, _ = single(name)
-    assert not loose(function, arrays)
-    _, weigh, moving, _ = double(name)
-    if weigh is not None:
-        with jax.enable_x64(True):
-            assert not loose(weigh, moving)
-
-
 @functools.cache
 def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
     """What a function compiled whole gives for the arguments of ``single`` in float64.
@@ -984,6 +974,16 @@ def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
         program = jax.jit(jax.value_and_grad(weigh, has_aux=True))
         (_, result), gradient = program(moving, still)
         return result, lambda moving: program(moving, still)[0][0], moving, gradient
+
+
+@each_pure
+def test_products_and_those_of_gradients_are_exact_on_gpus(name, loose):
+    function, arrays, _ = single(name)
+    assert not loose(function, arrays)
+    _, weigh, moving, _ = double(name)
+    if weigh is not None and name not in OF_ROUNDING:  # The products of JAX's rule for QR state no precision.
+        with jax.enable_x64(True):
+            assert not loose(weigh, moving)
 
 
 @pytest.mark.parametrize("name", [name for name in PURE if name in EXAMPLES and name not in OF_ROUNDING])

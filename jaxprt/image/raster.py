@@ -12,15 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.compile import jit
+from jaxprt.image import depths
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
 FACES = (1 << 24) - 1  # Triangles whose numbers a float32 holds exactly.
 PATCH = {1: 3, 2: 4}  # Cells along the edge of the square patches that triangles are cut into, by cells along a pixel.
-CHUNK = 1 << 13  # Patches drawn at once; CHUNK * (CHUNK + 1) must fit in an int32.
 EDGE_ON = 1e-3  # Sine of the angle between a triangle and the view within which the triangle counts as front.
 TILE = 8  # Pixels along the edge of the tiles whose farthest depth hides what lies behind.
 
@@ -246,13 +246,16 @@ def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Arra
     some = (bounds[2] > 0) & (bounds[3] > 0)
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     front = area < 0  # Rows go down, so that counter-clockwise is negative. Where w < 0 the guess does not matter.
-    nothing = jax.lax.complex(jnp.array(jnp.inf, x.dtype), jnp.array(-1, x.dtype))
-    nearest = jnp.full(height * width * samples, nothing)
-    nearest = _draw(nearest, some & front, x, y, q, bounds, fine * width, fine)
-    hidden = _hidden(jnp.max(nearest.real.reshape(height, width, samples), -1), q, bounds, TILE // fine)
-    nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
-    nearest = nearest.reshape(height, width, samples)
-    return nearest.real, nearest.imag.astype(jnp.int32)
+    shape = height, width, samples
+
+    def drawn(form: type[depths.Narrow] | type[depths.Wide]):
+        nearest = form.blank(math.prod(shape), x.dtype)
+        nearest = _draw(nearest, some & front, x, y, q, bounds, fine * width, fine)
+        hidden = _hidden(jnp.max(nearest.depth(x.dtype).reshape(shape), -1), q, bounds, TILE // fine)
+        nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
+        return nearest.depth(x.dtype).reshape(shape), nearest.triangle().reshape(shape)
+
+    return jax.lax.platform_dependent(cpu=lambda: drawn(depths.Narrow), default=lambda: drawn(depths.Wide))
 
 
 def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
@@ -275,16 +278,16 @@ def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f
     return ahead & small & (farthest < nearest * (1 - 1e-4))
 
 
-def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
-    """Draws some of the triangles over what is nearest so far: the complex numbers depth + i number.
+def _draw(nearest: depths.Narrow | depths.Wide, drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
+    """Draws some of the triangles over what is nearest so far.
 
-    The minimum of complex numbers goes by the real part, then by the imaginary one, so that one scatter finds both.
-    Cuts the pixels' box of every triangle into patches, and draws the patches of all triangles in order, CHUNK at a
-    time: each step looks at the next CHUNK triangles and draws the first CHUNK of their patches that are still to do.
+    Cuts the pixels' box of every triangle into patches, and draws the patches of all triangles in order, a chunk at a
+    time: each step looks at the next triangles, as many as a chunk has patches, and draws the first of their patches
+    that are still to do.
     """
     faces, patch = q.shape[1], PATCH[fine]
-    chunk = min(CHUNK, -(-faces // 1024) * 1024)
-    height = nearest.shape[0] // width
+    chunk = nearest.chunk(faces)
+    height = len(jax.tree.leaves(nearest)[0]) // width
     column, row, columns, rows = bounds
     rank = _running_sum(drawn)
     number = jnp.zeros(faces + chunk, jnp.int32)
@@ -298,7 +301,7 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (patch - 1), jnp.int32(patch)), 0)
         count = jnp.minimum(count.at[0].add(-done), chunk + 1)  # One more, to tell that some are left over.
         last = _running_sum(count)
-        first = last - count
+        first = jnp.pad(last[:-1], (1, 0))
         begins = jnp.zeros(chunk, jnp.int32).at[jnp.where(count > 0, first, chunk)].set(1, mode="drop")
         owner = _running_sum(begins) - (count[0] > 0)  # The first may have been finished by the step before.
 
@@ -307,9 +310,8 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
         left, top = column[t] + jax.lax.rem(part, wide) * patch, row[t] + jax.lax.div(part, wide) * patch
         right, bottom = jnp.where(slot < last[-1], column[t] + columns[t], 0), row[t] + rows[t]
         corner = [[axis[i][t] for i in range(3)] for axis in (x, y, q)]
-        identity = t.astype(x.dtype)
 
-        def pixel(nearest, k):
+        def pixel(k):
             i, j = top + jax.lax.div(k, jnp.int32(patch)), left + jax.lax.rem(k, jnp.int32(patch))
             at = j.astype(x.dtype) + (1 - width) / 2, i.astype(x.dtype) + (1 - height) / 2
             inside = (i < bottom) & (j < right)
@@ -319,11 +321,9 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
                 lower, later = i & 1, j & 1
                 at = at[0] + SHIFT * (1 - 2 * lower).astype(x.dtype), at[1] + SHIFT * (2 * later - 1).astype(x.dtype)
                 place = (i >> 1) * (2 * width) + (j >> 1) * 4 + 2 * lower + later
-            d = jnp.where(inside, _cover(corner[0], corner[1], corner[2], *at), jnp.inf)
-            return nearest.at[place].min(jax.lax.complex(d, identity), mode="promise_in_bounds"), None
+            return place, jnp.where(inside, _cover(corner[0], corner[1], corner[2], *at), jnp.inf)
 
-        # A scan, since XLA would else compute what belongs to a patch anew for each of its pixels.
-        nearest, _ = jax.lax.scan(pixel, nearest, jnp.arange(patch * patch, dtype=jnp.int32))
+        nearest = nearest.drawn(pixel, patch * patch, t)
 
         over = last[-1] > chunk
         part = jnp.where(over, part[-1] + 1, 0)
@@ -335,11 +335,12 @@ def _draw(nearest: Complex[Array, " p"], drawn: Bool[Array, " f"], x, y, q, boun
 def _running_sum(count: Int[Array, " n"] | Bool[Array, " n"]) -> Int[Array, " n"]:
     """Inclusive sums of counts by products with triangular matrices, four times faster than XLA's on the CPU.
 
-    Exact to 2^24; sums beyond are rounded, but stay beyond.
+    Exact to 2^24; sums beyond are rounded or less, but stay beyond.
     """
     n = count.shape[0]
     block = jnp.pad(count.astype(jnp.float32), (0, -n % 128)).reshape(-1, 128)
-    total = jnp.matmul(block, jnp.triu(jnp.ones((128, 128), jnp.float32)), precision="highest").astype(jnp.int32)
+    total = jnp.matmul(block, jnp.triu(jnp.ones((128, 128), jnp.float32)))
+    total = jnp.minimum(total, 2.0**29).astype(jnp.int32)  # Two of them still fit in an int32.
     if n > 128:
-        total = total + (_running_sum(total[:, -1]) - total[:, -1])[:, None]
+        total = total + jnp.pad(_running_sum(total[:, -1])[:-1], (1, 0))[:, None]
     return total.ravel()[:n]

@@ -240,7 +240,8 @@ def _nodes(cell: Array, frame: Array, size: int) -> tuple[list[Array], Array, Ar
     s, t = (edge * (at[:, None] + jnp.asarray(offset, frame.dtype)) - 1 for at in (column, row))
     s, t = s[:, None, :], t[:, :, None]
     # Component by component, which XLA fuses; products with matrices it does not.
-    axis = jnp.einsum("kij,kaj->kia", frame, jnp.asarray(cubemap.axes(), frame.dtype)[face])[..., None, None]
+    axes = jnp.asarray(cubemap.axes(), frame.dtype)[face]
+    axis = jnp.einsum("kij,kaj->kia", frame, axes, precision="highest")[..., None, None]
     short = jax.lax.rsqrt(1 + s**2 + t**2)
     wi = [(s * axis[:, i, 0] + t * axis[:, i, 1] + axis[:, i, 2]) * short for i in range(3)]
     weight = (edge[..., None] / (2 * SIDE)) ** 2 * short**3

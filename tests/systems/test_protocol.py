@@ -5,6 +5,7 @@ To add a system, add a line to ``MADE``: it gets the scene's name and makes a sy
 
 import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -266,6 +267,17 @@ def test_stages_give_the_whole_inside_a_program_and_outside(name, close):
     close(system.combine(arriving, system.view(EYE, materials)), whole)
     compiled = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))
     close(compiled(system, light(), materials), whole, tolerance=2e-5)
+
+
+@each_system
+def test_products_in_the_verbs_are_exact_on_gpus(name, loose):
+    system, materials, _ = made(name)
+
+    def change(environment, eye):
+        radiance = partial(prt.radiance, system, materials=materials)
+        return jax.jvp(lambda light, eye: radiance(Environment(light), eye=eye), (environment, eye), (environment, eye))
+
+    assert not loose(change, light().radiance, EYE)
 
 
 @each_system

@@ -310,7 +310,7 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
 
     Reference: the addition theorem, with s_l from `jaxprt.sphere.harmonics.natural`.
     """
-    cosine = jnp.clip(direction @ direction.T, -1, 1)
+    cosine = jnp.clip(jnp.matmul(direction, direction.T, precision="highest"), -1, 1)
 
     def step(carry, band):
         (before, legendre, total), (order, size) = carry, band
