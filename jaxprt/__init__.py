@@ -20,6 +20,7 @@ from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere,
 from jaxprt.relit import RelitScene, plan, precompute, refine
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt.systems.devices import shard
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "relit",
     "scene",
     "separable",
+    "shard",
     "sphere",
     "total",
     "visibility",

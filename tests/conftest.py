@@ -24,7 +24,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_force_host_platform_device_count=3",  # for what is laid over several devices; all else is on the first
+    "--xla_force_host_platform_device_count=4",  # for what is laid over several devices; all else is on the first
 )
 
 import jax

@@ -38,7 +38,7 @@ class StoredVisibility(eqx.Module):
         frame: Rows are tangent, bitangent, normal.
     """
 
-    level: UInt8[Array, "d w"]
+    level: UInt8[Array, "d pair"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
 

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import NamedSharding, PartitionSpec
 
 import jaxprt as prt
 from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
@@ -337,22 +336,88 @@ def test_a_mesh_of_one_triangle_is_lit(name):
     assert color.any() == (not name.startswith("bounces"))
 
 
+def devices(count: int) -> list[jax.Device]:
+    """Some devices; XLA_FLAGS asks for four."""
+    if len(jax.devices()) < count:
+        pytest.skip(f"XLA_FLAGS asks for {count} devices")
+    return jax.devices()[:count]
+
+
 @each_system
-def test_a_system_laid_over_devices_by_vertices_has_the_same_radiance(name, close):
-    case, devices = made(name, "triangle"), jax.devices()
-    if len(devices) < 3:
-        pytest.skip("XLA_FLAGS asks for three devices, one for each vertex")
-    across = jax.sharding.Mesh(np.array(devices[:3]), ("vertex",))
+def test_a_system_laid_over_devices_has_the_same_radiance_and_gradients(name, close):
+    case = made(name, "triangle")
+    system = prt.shard(case.system, devices(4))  # Three vertices, and a spare one where the system's arrays allow that.
+    assert system.vertices == 3
+    weight = np.random.default_rng(8).normal(size=(3, 3)).astype(np.float32)
 
-    def lay(leaf):
-        spot = next((axis for axis, size in enumerate(jnp.shape(leaf)) if size == case.system.vertices), None)
-        axes = PartitionSpec() if spot is None else PartitionSpec(*[None] * spot, "vertex")
-        return jax.device_put(leaf, NamedSharding(across, axes))
+    @jax.jit
+    def program(system, radiance, materials):
+        def total(radiance):
+            color = prt.radiance(system, Environment(radiance), eye=EYE, materials=materials)
+            return jnp.sum(weight * color), color
 
-    system = jax.tree.map(lay, case.system)
-    laid = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))(system, light(), case.materials)
-    assert len(laid.sharding.device_set) == 3
-    close(laid, shown(case, light()), tolerance=2e-5)
+        return jax.value_and_grad(total, has_aux=True)(radiance)
+
+    (value, color), slope = program(system, light().radiance, case.materials)
+    assert len(color.sharding.device_set) == 4
+    close(color, shown(case, light()), tolerance=2e-5)
+    if MADE[name].linear:
+        np.testing.assert_allclose(np.vdot(slope, light().radiance), value, atol=1e-4 * np.abs(weight * color).sum())
+
+
+@pytest.mark.parametrize("name", ["separable", "lobe, bright texels"])
+def test_each_device_has_an_equal_share_of_the_vertices(name, close):
+    case = made(name, "triangle")
+    even, spare = prt.shard(case.system, devices(3)), prt.shard(case.system, devices(4))
+    close(shown(case._replace(system=even), light()), shown(case, light()), tolerance=2e-5)
+    close(shown(case._replace(system=spare), light()), shown(case, light()), tolerance=2e-5)
+    assert type(even) is type(case.system)
+    for laid, count in ((even, 3), (spare.system, 4)):
+        transport = laid.transport if name == "separable" else laid.visibility
+        assert len(transport.position) == count
+        array = transport.value if name == "separable" else transport.pyramid
+        shares = {each.device: each.data.shape for each in array.addressable_shards}
+        assert len(shares) == count
+        assert len(set(shares.values())) == 1
+        assert sum(map(np.prod, shares.values())) == array.size
+    assert prt.memory(even) == prt.memory(case.system)
+    points = Points(jnp.array([[0, 1], [1, 2], [2, 0]]), jnp.full((3, 2), 1 / 3))
+    there = [shown(case._replace(system=each.at(points)), light()) for each in (case.system, spare)]
+    close(there[1], there[0], tolerance=2e-5)
+    with pytest.raises(ValueError, match="corners of points must be between 0 and 2"):
+        spare.at(Points(jnp.full((3, 1), 3), jnp.full((3, 1), 1 / 3)))
+
+
+def test_materials_are_those_of_the_vertices_without_the_spare_ones(close):
+    system, _ = lobes("triangle", "channels")
+    blend = prt.Blend(jnp.asarray(np.random.default_rng(9).uniform(size=(3, 3, 3)), jnp.float32))
+    spare = prt.shard(system, devices(4))
+    close(
+        prt.radiance(spare, light(), eye=EYE, materials=blend),
+        prt.radiance(system, light(), eye=EYE, materials=blend),
+        tolerance=2e-5,
+    )
+    with pytest.raises(ValueError, match=r"must have weights \[3 vertices, 3 channels, c\], got \[4, 3, 3\]"):
+        spare.view(EYE, prt.Blend(jnp.ones((4, 3, 3))))
+
+
+def test_a_transport_is_laid_over_devices_where_its_vertices_divide():
+    transport = made("separable", "triangle").system.transport
+    laid = prt.shard(transport, devices(3))
+    coefficient = jnp.asarray(np.random.default_rng(3).normal(size=(6 * SIZE**2, 3)), jnp.float32)
+    np.testing.assert_allclose(laid.apply(coefficient), transport.apply(coefficient), rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="the transport's 3 vertices must divide by 4 devices"):
+        prt.shard(transport, devices(4))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
+    system, here = made("lobe", "triangle").system, jax.devices()[0]
+    for wrong in ([], "cuda", ["cuda:0"], [here, here], 4, None):
+        with pytest.raises(ValueError, match=r"devices must be one or more different ones of \["):
+            prt.shard(system, wrong)
+    with pytest.raises(TypeError, match="have vertices, got Environment"):
+        prt.shard(light(), [here])
 
 
 OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | bounces.PartBounces | protocol.Total

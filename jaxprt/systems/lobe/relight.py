@@ -12,6 +12,7 @@ exact for light that is linear over the lobe, and never negative.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache, partial, reduce
 from typing import Any
 
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
@@ -286,7 +288,7 @@ def _edge(width: float, size: int, *, least: int) -> int:
     return edge
 
 
-def _blurs(radiance: Float[Array, "6 n n c"]) -> list[tuple[Array | np.ndarray, Array | np.ndarray]]:
+def _blurs(radiance: Float[Array, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
     """For each width the texels [tile, m, face] that make a tile of the blurred faces, and their weights [tile, o, m].
 
     What is blurred is made in tiles, so that a small dense product makes each, and weights are the same on all faces.
@@ -294,13 +296,13 @@ def _blurs(radiance: Float[Array, "6 n n c"]) -> list[tuple[Array | np.ndarray, 
     """
     with jax.ensure_compile_time_eval():  # What a trace made could not be kept.
         size, dtype = radiance.shape[1], str(radiance.dtype)
-        if isinstance(radiance, np.ndarray | jax.core.Tracer):
+        if isinstance(radiance, np.ndarray | Tracer):
             return _made_blurs(size, dtype)
         return _placed_blurs(size, dtype, min(radiance.devices(), key=lambda each: each.id))
 
 
 @lru_cache(maxsize=4)
-def _placed_blurs(size: int, dtype: str, device: jax.Device) -> list[tuple[Array, Array]]:
+def _placed_blurs(size: int, dtype: str, device: Any) -> list[tuple[Array, Array]]:
     """On a device, but not bound to it: lights that lie on several devices are blurred there."""
     with jax.default_device(device):
         return jax.device_put(_made_blurs(size, dtype))
