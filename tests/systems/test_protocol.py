@@ -279,6 +279,17 @@ def test_products_in_the_verbs_are_exact_on_gpus(name, loose):
     assert not loose(change, light().radiance, EYE)
 
 
+@pytest.mark.parametrize("name", ["separable, quantized", "dynamic and bounces"])  # They have all loops among them.
+def test_what_gpus_run_gives_the_same_radiance(name, request, close):
+    case = made(name, "triangle")
+    expected = shown(case, light())
+    request.getfixturevalue("elsewhere")
+    program = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))
+    close(program(case.system, light(), case.materials), expected, tolerance=2e-5)
+    text = jax.jit(program).trace(case.system, light(), case.materials).lower(lowering_platforms=("cuda",)).as_text()
+    assert "complex<" not in text
+
+
 @each_system
 def test_a_batch_of_lights_is_each_light_by_itself(name, close):
     case = made(name)
