@@ -186,7 +186,7 @@ def _loose(jaxpr: Any) -> Iterator[str]:
     highest = (jax.lax.Precision.HIGHEST,) * 2
     for equation in jaxpr.eqns:
         given, name = equation.params, equation.primitive.name
-        floats = any(np.issubdtype(each.aval.dtype, np.inexact) for each in equation.invars)
+        floats = any(jax.numpy.issubdtype(each.aval.dtype, np.inexact) for each in equation.invars)
         if name in ("dot_general", "conv_general_dilated", "ragged_dot_general") and floats:
             if given["precision"] != highest:
                 yield f"{equation} with precision {given['precision']}"
