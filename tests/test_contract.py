@@ -285,7 +285,7 @@ class Draw:
 
     def direct(self, size=4, *, vertices=3):
         """Visibility for ``light``, in bytes for two vertices each."""
-        level = self.integer(256, 6 * size * size, visibility.rays.BLOCK // 2, dtype=jnp.uint8)
+        level = self.integer(256, 1, 6 * size * size, visibility.rays.BLOCK // 2, dtype=jnp.uint8)
         return visibility.StoredVisibility(level, self.normal(vertices, 3), self.rotation(vertices))
 
     def pyramid(self, size=8, *, vertices=3):

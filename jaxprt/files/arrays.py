@@ -1,13 +1,18 @@
-"""Named arrays on disk, written block by block along one axis: zarr, with what makes it safe to be killed.
+"""Named arrays on disk, written block by block along one axis by any number of processes.
 
-A store is a folder. Each block of each array is one file, written aside and renamed; then the block's checksum is
-entered. A block counts only if its checksum is there and right, so a process may be killed at any moment, files may
-be lost or cut off, and what is read back is either what was written or reported missing.
+A store is a folder: a header in JSON, and one file in NumPy's own format for each array and for the checksums of all
+blocks. Every block has a place of its own in each file, so processes on one machine or on several write theirs without
+knowing of each other, and any program that reads NumPy's format can map the arrays. A block counts only if its
+checksum is there and right, so a process may be killed at any moment, files may be lost or cut off, and what is read
+back is either what was written or reported missing.
 """
 
+import errno
 import functools
+import json
 import os
 import shutil
+import uuid
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,10 +21,14 @@ from typing import Any, NamedTuple
 
 import filelock
 import numpy as np
-import zarr
 
-VERSION = 3
+from jaxprt.files import mapped
+
+VERSION = 4
 _FORMAT = "jaxprt blocks"
+_HEADER = "store.json"
+_CHECKSUM = "checksum"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SUMS = 32
 _PART = 1 << 20  # values that are summed at a time
 _STRIDE = 7919  # by which signs move from one part to the next
@@ -34,7 +43,7 @@ class Layout(NamedTuple):
 
 
 class BlockStore:
-    """Arrays on disk in blocks.
+    """Arrays on disk in blocks. Travels by pickle as the path and the layout.
 
     Args:
         path: Folder of the store; made when it is not there.
@@ -43,6 +52,9 @@ class BlockStore:
         blocks: Number of blocks.
         near: Sketches, by `sketch`, of computed arrays that the store's were made from. They must equal those of an
             existing store up to rounding, which differs between kinds of processors.
+
+    Attributes:
+        path: Folder of the store.
 
     Raises:
         ValueError: The path holds something else, another version of the format or of the algorithm, or arrays made
@@ -57,28 +69,43 @@ class BlockStore:
         blocks: int,
         near: Mapping[str, list[float]] | None = None,
     ):
-        self.path = Path(path)
+        self.path = Path(path).absolute()
         self._layout = dict(layout)
+        self._blocks = blocks
         shapes = {name: [*at.shape, at.dtype] for name, at in layout.items()}
         header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, "shapes": shapes, **header}
         near = dict(near or {})
+        files = {name: (_stored(at, blocks), at.dtype) for name, at in layout.items()}
+        files[_CHECKSUM] = (blocks,), "uint32"
         if not self.path.exists():
-            _create(self.path, {**header, "near": near}, self._layout, blocks)
-        self._group = _open(self.path, header, near)
-        lost = [name for name in (*self._layout, "checksum") if name not in self._group]
-        if lost:
-            raise ValueError(f"{self.path} lacks the array {lost[0]}: it is damaged; delete it to start anew")
+            _create(self.path, {**header, "near": near}, files)
+        self._key = _open(self.path, header, near)
+        self._offset = {name: _offset(self.path, name, *each) for name, each in files.items()}
+
+    @property
+    def here(self) -> bool:
+        """Whether the folder is the same store where this is asked: a worker may not share the file system."""
+        try:
+            return json.loads((self.path / _HEADER).read_text()).get("key") == self._key
+        except (OSError, ValueError):
+            return False
 
     @contextmanager
-    def writing(self) -> Iterator[None]:
-        """Holds the store for writing; the lock goes with the process, however it ends.
+    def writing(self, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
+        """Holds a part of the store for writing, the k-th of n; the lock goes with the process, however it ends.
 
         Raises:
-            BlockingIOError: Another process is writing to it.
+            BlockingIOError: Another process is writing the same part, or the store is being written in other parts.
         """
-        lock = filelock.FileLock(self.path / ".lock", timeout=0)
+        number, count = part
+        lock = self.path / f".lock.{number}-of-{count}"
         try:
-            with lock:
+            with filelock.FileLock(lock, timeout=0):
+                # Writers of other parts of the same number have other blocks; all others may have the same ones.
+                for other in self.path.glob(".lock.*-of-*"):
+                    if not other.name.endswith(f"-of-{count}"):
+                        with filelock.FileLock(other, timeout=0):
+                            pass
                 yield
         except filelock.Timeout:
             raise BlockingIOError(
@@ -86,30 +113,82 @@ class BlockStore:
             ) from None
 
     def write(self, block: int, array: Mapping[str, np.ndarray]) -> None:
-        """Writes one block of every array, in the layout's types, then its checksum."""
-        array = {name: np.asarray(array[name], layout.dtype) for name, layout in self._layout.items()}
-        for name, layout in self._layout.items():
-            self._array(name)[_place(layout, block)] = array[name]
-        self._array("checksum")[block] = _checksum(array)
+        """Writes one block of every array, in the layout's types, then its checksum.
+
+        Raises:
+            OSError: The disk is full, or the file system fails in another way. Other blocks stay as they are.
+        """
+        value = {name: np.ascontiguousarray(array[name], at.dtype) for name, at in self._layout.items()}
+        for name, at in self._layout.items():
+            if value[name].shape != at.shape:
+                raise ValueError(f"{name} must have blocks of {list(at.shape)}, got {list(value[name].shape)}")
+        try:
+            for name, each in value.items():
+                self._put(name, block, each)
+            self._put(_CHECKSUM, block, np.array(_checksum(value), np.uint32))
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            raise OSError(
+                error.errno, f"{self.path} cannot grow ({error.strerror}); finished blocks are kept: call again to go on"
+            ) from error
 
     def read(self, block: int) -> dict[str, np.ndarray] | None:
         """One block of every array, or None where it was not written or is not what was written."""
         try:
-            expected = int(self._read("checksum", block, ()))
+            expected = int(self._get(_CHECKSUM, block, (), "uint32"))
             if not expected:
                 return None
-            array = {name: self._read(name, _place(at, block), at.shape) for name, at in self._layout.items()}
-        except (ValueError, OSError, RuntimeError):
+            array = {name: self._get(name, block, at.shape, at.dtype) for name, at in self._layout.items()}
+        except (EOFError, OSError):
             return None
         return array if _checksum(array) == expected else None
 
-    def _array(self, name: str) -> zarr.Array:
-        found = self._group[name]
-        assert isinstance(found, zarr.Array)
-        return found
+    def written(self) -> np.ndarray:
+        """Which blocks have a checksum, as a mask; whether it is right only `read` knows."""
+        found = np.zeros(self._blocks, np.uint32)
+        try:
+            with (self.path / f"{_CHECKSUM}.npy").open("rb") as file:
+                file.seek(self._offset[_CHECKSUM])
+                there = np.frombuffer(file.read(found.nbytes // 4 * 4), np.uint32)
+        except OSError:
+            return found > 0
+        found[: len(there)] = there
+        return found > 0
 
-    def _read(self, name: str, place: Any, shape: tuple[int, ...]) -> np.ndarray:
-        return np.asarray(self._array(name)[place]).reshape(shape)
+    def whole(self, name: str, count: int) -> np.ndarray:
+        """An array of all blocks, cut to a number of entries along its axis. All blocks must have been found by `read`.
+
+        Arrays whose blocks follow each other along the first axis are maps of their file, which take no memory of
+        their own: pages are read when they are first used. Others are gathered into memory.
+        """
+        at = self._layout[name]
+        shape = _stored(at, self._blocks)
+        found = mapped.open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)
+        if not at.axis:
+            return found[:count]
+        size = at.shape[at.axis]
+        result = mapped.empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
+        for block in range(self._blocks):
+            first = block * size
+            place = (slice(None),) * at.axis
+            result[(*place, slice(first, first + size))] = found[block][(*place, slice(count - first))]
+        return result
+
+    def _put(self, name: str, block: int, value: np.ndarray) -> None:
+        """Writes a block of one array; the file is closed, so that other machines see it."""
+        left = memoryview(value.reshape(-1).view(np.uint8))
+        with (self.path / f"{name}.npy").open("r+b", buffering=0) as file:
+            file.seek(self._offset[name] + block * value.nbytes)
+            while left:
+                left = left[file.write(left) :]
+
+    def _get(self, name: str, block: int, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+        value = np.empty(shape, dtype)
+        with (self.path / f"{name}.npy").open("rb", buffering=0) as file:
+            file.seek(self._offset[name] + block * value.nbytes)
+            mapped.read_into(file, value)
+        return value
 
 
 def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
@@ -143,28 +222,28 @@ def _signs() -> np.ndarray:
     return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
 
 
-def _create(path: Path, header: Mapping[str, Any], layout: Mapping[str, Layout], blocks: int) -> None:
+def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
     """Makes an empty store aside and moves it into place, so that a half-made one is never met."""
-    aside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    shutil.rmtree(aside, ignore_errors=True)
-    group = zarr.create_group(aside, attributes=dict(header))
-    for name, (shape, axis, dtype) in layout.items():
-        whole = (*shape[:axis], shape[axis] * blocks, *shape[axis + 1 :])
-        group.create_array(name, shape=whole, chunks=shape, dtype=dtype, compressors=None, fill_value=0)
-    group.create_array("checksum", shape=(blocks,), chunks=(1,), dtype="uint32", compressors=None, fill_value=0)
+    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.new")  # processes on several machines may have one number
     try:
-        aside.rename(path)
-    except OSError:  # another process was faster; what it made is checked like any other
+        aside.mkdir(parents=True)
+        for name, (shape, dtype) in files.items():
+            with (aside / f"{name}.npy").open("xb") as file:
+                mapped.write_header(file, shape, dtype)
+        (aside / _HEADER).write_text(json.dumps({**header, "key": uuid.uuid4().hex}))
+        try:
+            aside.rename(path)
+        except OSError:  # another process was faster; what it made is checked like any other
+            if not path.exists():
+                raise
+    finally:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> zarr.Group:
+def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
+    """Refuses stores of something else; returns the store's own key."""
     try:
-        group = zarr.open_group(path, mode="r+")
-        found = dict(group.attrs)
-        for each in path.iterdir():  # Arrays have headers of their own, which may be damaged too.
-            if each.is_dir():
-                group[each.name]
+        found = _found(path)
     except Exception as error:
         raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
     if found.get("format") != _FORMAT:
@@ -182,7 +261,26 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
         told = "; ".join(f"{key}: there {found.get(key)}, now {header[key]}" for key in differ)
         raise ValueError(f"{path} holds arrays made from something else ({told}); name another path or delete it")
     _check_near(path, found.get("near", {}), near)
-    return group
+    return str(found.get("key"))
+
+
+def _found(path: Path) -> dict[str, Any]:
+    """The header of a store, of this version or of those up to 3, which zarr wrote."""
+    old = path / "zarr.json"
+    if old.exists() and not (path / _HEADER).exists():
+        return dict(json.loads(old.read_text()).get("attributes", {}))
+    return dict(json.loads((path / _HEADER).read_text()))
+
+
+def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
+    """Where the values of an array begin in its file."""
+    file = path / f"{name}.npy"
+    try:
+        return mapped.read_header(file, shape, dtype)
+    except FileNotFoundError:
+        raise ValueError(f"{path} lacks the array {name}: it is damaged; delete it to start anew") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
 
 
 def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
@@ -200,17 +298,14 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
             )
 
 
-def _place(layout: Layout, block: int) -> tuple[slice, ...]:
-    """Where a block lies in the whole array."""
-    size = layout.shape[layout.axis]
-    place = [slice(None)] * len(layout.shape)
-    place[layout.axis] = slice(block * size, (block + 1) * size)
-    return tuple(place)
+def _stored(at: Layout, blocks: int) -> tuple[int, ...]:
+    """Shape of an array's file: of the array itself where blocks follow each other in memory too."""
+    return (blocks, *at.shape) if at.axis else (blocks * at.shape[0], *at.shape[1:])
 
 
 def _checksum(array: Mapping[str, np.ndarray]) -> int:
     """CRC-32 of a block, never 0, which stands for not written."""
     value = 0
     for name in sorted(array):
-        value = zlib.crc32(np.ascontiguousarray(array[name]).data, value)
+        value = zlib.crc32(array[name].reshape(-1).view(np.uint8).data, value)
     return value or 1

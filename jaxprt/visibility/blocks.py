@@ -1,19 +1,26 @@
 """The block loop: independent blocks, computed anywhere, stored as they come, resumed where they stopped."""
 
 import abc
+import collections
 import hashlib
 import os
+import pickle
+import queue
 import uuid
-from collections.abc import Mapping
-from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import tqdm
 from threadpoolctl import threadpool_limits
 
+from jaxprt.files import mapped
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import Mesh
+
+_HELD = 1 << 28  # bytes of results, and of copies of a job, that are on their way at once
+_MOST = 4096  # blocks on their way at once
 
 
 class Job(abc.ABC):
@@ -53,6 +60,42 @@ class Job(abc.ABC):
         """One block of every result array, and the number of rays that it took."""
 
 
+class Part(ThreadPoolExecutor):
+    """Computes the k-th of n equal parts of every job's blocks on this machine, and leaves the others to others.
+
+    Many machines share a job by this, with nothing but a folder in common. Give it as the `executor`, with the same
+    `path` everywhere. A job whose other parts are not finished yet raises `Unfinished`; the part that ends last, or a
+    call without a part, returns the whole result.
+
+    Args:
+        number: Which part, from 1.
+        count: Number of parts.
+
+    Raises:
+        ValueError: No such part.
+    """
+
+    def __init__(self, number: int, count: int):
+        if not 1 <= number <= count:
+            raise ValueError(f"the part must be from 1/{count} to {count}/{count}, got {number}/{count}")
+        super().__init__(cores())
+        self.number, self.count = number, count
+
+    def of(self, blocks: int) -> range:
+        """Its blocks: neighbors, so that writers rarely meet in a file."""
+        return range((self.number - 1) * blocks // self.count, self.number * blocks // self.count)
+
+
+class Unfinished(RuntimeError):
+    """A part is done, but other parts of the same job are not."""
+
+
+def cores() -> int:
+    """Number of cores that this process may use: those that a batch system gave it, where it gave some."""
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux has it
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def compute(
     job: Job,
     *,
@@ -63,35 +106,77 @@ def compute(
 ) -> dict[str, np.ndarray]:
     """Computes all blocks of a job.
 
+    With a path, each block is written where it is computed, if that machine sees the folder, and dropped.
+
     Args:
         job: What to compute.
         path: Folder in which finished blocks are kept; blocks found there are not computed again.
-        executor: Where blocks are computed; threads on this machine's cores if None.
+        executor: Where blocks are computed; threads on this machine's cores if None. A `Part` computes its own blocks.
         progress: Whether to show a progress bar.
         label: Its text.
 
     Returns:
-        The result arrays; those that have a place for each vertex are cut to the number of vertices.
+        The result arrays; those that have a place for each vertex are cut to the number of vertices. With a path, those
+        whose vertices come first are maps of the store's files: pages are read when they are first used.
 
     Raises:
-        ValueError: The store at `path` was made from something else.
+        ValueError: The store at `path` was made from something else, or a part of a job has no path.
         BlockingIOError: Another process is writing to it.
+        OSError: The disk is full; finished blocks are kept in the store.
+        Unfinished: The part is done, and others are not.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
     blocks = -(-job.vertices // job.step)
+    part = executor if isinstance(executor, Part) else None
+    if part is not None and path is None:
+        raise ValueError(f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None")
     store = None if path is None else BlockStore(path, job.header, job.layout, blocks, job.near)
-    result = {name: np.zeros(_whole(at, blocks), at.dtype) for name, at in job.layout.items()}
-    with tqdm.tqdm(total=job.vertices, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
-        todo = [block for block in range(blocks) if not _load(store, block, result, job)]
-        bar.update(job.vertices - sum(_count(job, block) for block in todo))
-        if todo and store is not None:
-            with store.writing():
+    counts = {name: _entries(at, job, blocks) for name, at in job.layout.items()}
+    own = range(blocks) if part is None else part.of(blocks)
+    total = sum(_count(job, block) for block in own)
+    with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
+        if store is None:
+            kept = _Kept(job, counts)
+            _run(job, own, kept.place, None, executor, bar)
+            return kept.array
+        todo = _missing(store, own)
+        bar.update(total - sum(_count(job, block) for block in todo))
+        if todo:
+            with store.writing((1, 1) if part is None else (part.number, part.count)):
                 # Another process may have finished some of them before this one got the lock.
-                _run(job, [b for b in todo if not _load(store, b, result, job)], store, executor, result, bar)
-        elif todo:
-            _run(job, todo, store, executor, result, bar)
+                _run(job, _missing(store, todo), store.write, store, executor, bar)
         bar.update(bar.total - bar.n)
-    return {name: _cut(result[name], at, job) for name, at in job.layout.items()}
+    if part is not None:
+        left = int(np.sum(~store.written())) or len(_missing(store, set(range(blocks)) - set(own)))
+        if left:
+            raise Unfinished(
+                f"part {part.number}/{part.count} of {store.path} is done; {left} of its {blocks} blocks are missing: "
+                "run the other parts, then the same once more without a part"
+            )
+    return {name: store.whole(name, count) for name, count in counts.items()}
+
+
+class _Kept:
+    """Results that are held in memory alone.
+
+    Attributes:
+        array: The result arrays.
+    """
+
+    def __init__(self, job: Job, counts: Mapping[str, int]):
+        self._job = job
+        self.array = {
+            name: mapped.empty((*at.shape[: at.axis], counts[name], *at.shape[at.axis + 1 :]), at.dtype)
+            for name, at in job.layout.items()
+        }
+
+    def place(self, block: int, array: Mapping[str, np.ndarray]) -> None:
+        """Puts one block of every array where it belongs."""
+        for name, at in self._job.layout.items():
+            first = block * at.shape[at.axis]
+            before = (slice(None),) * at.axis
+            into = self.array[name][(*before, slice(first, first + at.shape[at.axis]))]
+            into[...] = array[name][(*before, slice(into.shape[at.axis]))]
 
 
 def fingerprint(*array: Any) -> str:
@@ -112,42 +197,34 @@ def scene_key(mesh: Mesh) -> str:
     return fingerprint(*single, *(np.asarray(each, np.int32) for each in (mesh.face, mesh.region)))
 
 
-def _run(job, todo, store, executor, result, bar) -> None:
+def _run(job, todo, keep, store, executor, bar) -> None:
+    """Computes blocks and gives each to `keep`, unless the worker has written it to the store itself."""
     key = uuid.uuid4().hex
-    _jobs[key] = job
-    own = None if executor is not None else ThreadPoolExecutor(os.cpu_count())
+    own = ThreadPoolExecutor(cores()) if executor is None else None
     pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]
+    here = own is not None or isinstance(executor, Part)
+    _jobs[key] = job, store
     # Where each core has a block, LAPACK's own threads wait by spinning: beside two busy processes clusters took three
     # times as long. An executor that the caller brings has its own setting.
-    limit = None if own is None else threadpool_limits(limits=1, user_api="blas")
-    future = {}
+    limit = threadpool_limits(limits=1, user_api="blas") if here else None
+    flow = _Flow(pool, key, (job, store), ahead=_ahead(job, here))
     rays = 0
     try:
-        future = {pool.submit(_work, key, None, block): block for block in todo}
-        while future:
-            again = []
-            for done in as_completed(future):
-                block, answer = future[done], done.result()
-                if answer is None:
-                    again.append(block)
-                    continue
-                array, count = answer
-                if store is not None:
-                    store.write(block, array)
-                _place(result, block, array, job)
-                rays += count
-                bar.update(_count(job, block))
-                if rays:
-                    speed = rays / max(bar.format_dict["elapsed"], 1e-9)
-                    bar.set_postfix_str(f"{speed / 1e6:.1f} Mrays/s", refresh=False)
-            # Workers that did not know the job get it with their next block.
-            future = {pool.submit(_work, key, job, block): block for block in again}
-    except BrokenExecutor as error:
+        for block, (array, count) in flow.results(todo):
+            if array is not None:
+                keep(block, array)
+            elif not here and store.read(block) is None:
+                raise OSError(f"{store.path} lacks block {block} that a worker wrote: is it one folder everywhere?")
+            rays += count
+            bar.update(_count(job, block))
+            if rays:
+                speed = rays / max(bar.format_dict["elapsed"], 1e-9)
+                bar.set_postfix_str(f"{speed / 1e6:.1f} Mrays/s", refresh=False)
+    except (BrokenExecutor, CancelledError) as error:
         kept = "they are lost" if store is None else f"they are kept in {store.path}: call again to go on"
         raise RuntimeError(f"a worker died after {bar.n} of {job.vertices} vertices; {kept}") from error
     finally:
-        for each in future:
-            each.cancel()
+        flow.cancel()
         _jobs.pop(key, None)
         try:
             if own is not None:
@@ -157,41 +234,96 @@ def _run(job, todo, store, executor, result, bar) -> None:
                 limit.restore_original_limits()
 
 
-_jobs: dict[str, Job] = {}  # per process: the jobs that it was sent, the last two at most
+class _Flow:
+    """Blocks on their way through an executor, a bounded number at a time, so that results do not pile up.
+
+    The job travels to workers that do not know it yet, in a bounded number of copies too.
+    """
+
+    def __init__(self, pool: Executor, key: str, work: tuple[Job, BlockStore | None], *, ahead: int):
+        self._pool, self._key, self._work, self._ahead = pool, key, work, ahead
+        self._done: queue.SimpleQueue = queue.SimpleQueue()
+        self._flying: dict[int, Future] = {}
+        self._carrying: set[int] = set()
+        self._asked = 0
+        self._pickle: bytes | None = None
+
+    def results(self, todo) -> Iterator[tuple[int, tuple[Mapping[str, np.ndarray] | None, int]]]:
+        """Each block with its result, as they come."""
+        waiting = collections.deque(todo)
+        while waiting or self._flying:
+            while waiting and len(self._flying) < self._ahead:
+                self._submit(waiting.popleft())
+            block = self._done.get()
+            answer = self._flying.pop(block).result()
+            self._carrying.discard(block)
+            if answer is None:  # The worker did not know the job: it, or another, gets it with its next block.
+                self._asked += 1
+                waiting.appendleft(block)
+            else:
+                yield block, answer
+
+    def cancel(self) -> None:
+        """Cancels what has not begun."""
+        for each in self._flying.values():
+            each.cancel()
+
+    def _submit(self, block: int) -> None:
+        sent = None
+        if self._asked:
+            if self._pickle is None:
+                self._pickle = pickle.dumps(self._work)
+            if not self._carrying or len(self._carrying) < _HELD // len(self._pickle):
+                sent = self._pickle
+                self._asked -= 1
+                self._carrying.add(block)
+        future = self._flying[block] = self._pool.submit(_work, self._key, sent, block)
+        future.add_done_callback(lambda _: self._done.put(block))
 
 
-def _work(key: str, job: Job | None, block: int) -> tuple[Mapping[str, np.ndarray], int] | None:
-    """Runs in a worker: one block, or None where the worker has not been sent the job yet."""
-    if job is not None and key not in _jobs:
+# Per process: the jobs that it was sent, the last two at most, and their stores where it can write to them.
+_jobs: dict[str, tuple[Job, BlockStore | None]] = {}
+
+
+def _work(key: str, sent: bytes | None, block: int) -> tuple[Mapping[str, np.ndarray] | None, int] | None:
+    """Runs in a worker: one block, or None where the worker has not been sent the job yet.
+
+    The arrays of the block are None where they have been written to the store.
+    """
+    if sent is not None and key not in _jobs:
         while len(_jobs) > 1:
             _jobs.pop(next(iter(_jobs)))
-        _jobs[key] = job
-    known = _jobs.get(key, job)
-    return None if known is None else known.run(block)
+        job, store = pickle.loads(sent)
+        _jobs[key] = job, store if store is not None and store.here else None
+    if key not in _jobs:
+        return None
+    job, store = _jobs[key]
+    array, rays = job.run(block)
+    if store is None:
+        return array, rays
+    store.write(block, array)
+    return None, rays
 
 
-def _load(store: BlockStore | None, block: int, result: dict[str, np.ndarray], job: Job) -> bool:
-    array = None if store is None else store.read(block)
-    if array is not None:
-        _place(result, block, array, job)
-    return array is not None
+def _ahead(job: Job, here: bool) -> int:
+    """Blocks that are computed or wait for it at once: two a core here, some hundred megabytes of results elsewhere."""
+    size = sum(int(np.prod(at.shape)) * np.dtype(at.dtype).itemsize for at in job.layout.values())
+    return 2 * cores() if here else max(2 * cores(), min(_HELD // max(1, size), _MOST))
 
 
-def _place(result: dict[str, np.ndarray], block: int, array: Mapping[str, np.ndarray], job: Job) -> None:
-    for name, at in job.layout.items():
-        size = at.shape[at.axis]
-        place = (slice(None),) * at.axis + (slice(block * size, (block + 1) * size),)
-        result[name][place] = array[name]
+def _missing(store: BlockStore, blocks: Iterable[int]) -> list[int]:
+    """Those of some blocks that the store lacks; checksums are taken on all cores."""
+    written = store.written()
+    with ThreadPoolExecutor(cores()) as pool:
+        blocks = list(blocks)
+        there = pool.map(lambda block: written[block] and store.read(block) is not None, blocks)
+        return [block for block, found in zip(blocks, there, strict=True) if not found]
 
 
-def _cut(array: np.ndarray, at: Layout, job: Job) -> np.ndarray:
-    whole = at.shape[at.axis] != job.step or array.shape[at.axis] == job.vertices
-    return array if whole else np.take(array, np.arange(job.vertices), at.axis)
+def _entries(at: Layout, job: Job, blocks: int) -> int:
+    """Entries of an array along its axis: one for each vertex, or all of its blocks."""
+    return job.vertices if at.shape[at.axis] == job.step else at.shape[at.axis] * blocks
 
 
 def _count(job: Job, block: int) -> int:
     return min(job.step, job.vertices - block * job.step)
-
-
-def _whole(at: Layout, blocks: int) -> tuple[int, ...]:
-    return (*at.shape[: at.axis], at.shape[at.axis] * blocks, *at.shape[at.axis + 1 :])

@@ -32,20 +32,25 @@ class StoredVisibility(eqx.Module):
     """Visibility of every texel from every vertex, in four bits.
 
     Attributes:
-        level: Two vertices to a byte: of every 64 vertices the first half in the low bits, the second in the high ones.
-            Texels first, so that one texel's are contiguous.
+        level: Blocks of 64 vertices, two to a byte: the first half of a block in the low bits, the second in the high
+            ones. From a store, on CPUs, it is a map of the store's file: what is not read takes no memory.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
     """
 
-    level: UInt8[Array, "d pair"]
+    level: UInt8[Array, "block d w"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
 
     @property
+    def texels(self) -> int:
+        """Number of texels."""
+        return self.level.shape[1]
+
+    @property
     def size(self) -> int:
         """Edge of the cubemap's faces in texels."""
-        return haar.face_edge(self.level.shape[0])
+        return haar.face_edge(self.texels)
 
     @property
     def nbytes(self) -> int:
@@ -54,15 +59,20 @@ class StoredVisibility(eqx.Module):
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
         """Share of some texels that each vertex sees, 0 to 1; 0 below its horizon."""
-        level = _unpack(self.level[texel]).astype(jnp.result_type(float))
+        level = _unpack(self.level[:, texel]).astype(jnp.result_type(float))
         return level[:, : len(self.position)] / rays.LEVELS
 
     def seen(self, vertex: Int[np.ndarray, " b"]) -> UInt8[np.ndarray, "b d"]:
         """Visibility of all texels from some vertices, in sixteenths, on the host."""
         block, place = np.divmod(vertex, rays.BLOCK)
-        pair = np.asarray(self.level)[:, block * _HALF + place % _HALF]
-        level = np.where(place < _HALF, pair & 15, pair >> 4)
-        return np.ascontiguousarray((level + (level > _MIDDLE)).astype(np.uint8).T)
+        level = np.empty((len(vertex), self.texels), np.uint8)
+        held = np.asarray(self.level)
+        for number in np.unique(block):  # A block is contiguous, and one of its vertices alone is not.
+            own = np.flatnonzero(block == number)
+            pair = np.ascontiguousarray(held[number].T)
+            level[own] = np.where(place[own, None] < _HALF, pair[place[own] % _HALF] & 15, pair[place[own] % _HALF] >> 4)
+        level += level > _MIDDLE
+        return level
 
 
 def precompute(
@@ -89,7 +99,7 @@ def precompute(
         progress: Whether to show a progress bar.
 
     Returns:
-        The visibility of every vertex.
+        The visibility of every vertex. With a path it is mapped on CPUs: it takes memory only where it is read.
 
     Raises:
         ValueError: A size that is no power of two, positions, normals or tangents that are not finite, no such
@@ -105,11 +115,9 @@ def precompute(
     return StoredVisibility(jax.device_put(result["level"]), position, jax.device_put(job.frame))
 
 
-def _unpack(pair: UInt8[Array, "t w"]) -> UInt8[Array, "t v"]:
+def _unpack(pair: UInt8[Array, "g t w"]) -> UInt8[Array, "t v"]:
     """Levels in sixteenths, two to each byte."""
-    texels, width = pair.shape
-    pair = pair.reshape(texels, width // _HALF, 1, _HALF)
-    level = jnp.concatenate([pair & 15, pair >> 4], 2).reshape(texels, 2 * width)
+    level = jnp.concatenate([pair & 15, pair >> 4], 2).swapaxes(0, 1).reshape(pair.shape[1], -1)
     return level + (level > _MIDDLE)
 
 
@@ -123,7 +131,7 @@ class _Job(rays.VisibilityJob):
 
     @property
     def layout(self) -> Mapping[str, Layout]:
-        return {"level": Layout((6 * self.size**2, _HALF), 1, "uint8")}
+        return {"level": Layout((1, 6 * self.size**2, _HALF), 0, "uint8")}
 
     @property
     def step(self) -> int:
@@ -132,4 +140,4 @@ class _Job(rays.VisibilityJob):
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         level = (seen - (seen > _MIDDLE)).T
-        return {"level": np.ascontiguousarray(level[:, :_HALF] | level[:, _HALF:] << 4)}, count.rays
+        return {"level": (level[:, :_HALF] | level[:, _HALF:] << 4)[None]}, count.rays

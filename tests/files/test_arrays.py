@@ -3,14 +3,16 @@
 import json
 import os
 import pathlib
+import pickle
+import resource
 import subprocess
 import sys
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
-import zarr
 
-from jaxprt.files import arrays
+from jaxprt.files import arrays, mapped
 from jaxprt.files.arrays import BlockStore, Layout
 
 LAYOUT = {"index": Layout((3, 4), 1, "uint16"), "value": Layout((3, 4, 2), 1, "float32")}
@@ -53,12 +55,12 @@ def found(path):
     return result
 
 
-def chunk(path, name, number):
-    """The file of one block of one array."""
-    place = {"index": f"0/{number}", "value": f"0/{number}/0", "checksum": f"{number}"}[name]
-    file = path / name / "c" / place
-    assert file.is_file()
-    return file
+def place(path, name, number):
+    """The file of an array, and where a block lies in it."""
+    size = 4 if name == "checksum" else block(0)[name].nbytes
+    file = path / f"{name}.npy"
+    start = file.stat().st_size - BLOCKS * size
+    return file, slice(start + number * size, start + (number + 1) * size)
 
 
 def test_blocks_read_back_as_written_in_any_order(tmp_path):
@@ -80,62 +82,88 @@ def test_missing_parent_folders_are_made(tmp_path):
     assert found(open_store(tmp_path / "some" / "where" / "a.prt").path) == []
 
 
-def test_stores_hold_no_pickles_and_leave_nothing_aside(path):
-    kinds = {file.suffix or file.parent.name for file in path.rglob("*") if file.is_file()}
-    assert not kinds & {".pkl", ".pickle", ".npy"}
-    meta = json.loads((path / "index" / "zarr.json").read_text())
-    assert meta["data_type"] == "uint16"
-    assert [codec["name"] for codec in meta["codecs"]] == ["bytes"]
+def test_a_store_has_one_file_for_each_array_and_leaves_nothing_aside(path):
+    files = {file.name for file in path.iterdir()}
+    assert files == {"store.json", "index.npy", "value.npy", "checksum.npy"}
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_any_program_that_knows_zarr_can_read_it(path):
-    group = zarr.open_group(path, mode="r")
-    np.testing.assert_array_equal(group["value"][:, 4:8], block(1)["value"])
-    assert group.attrs["system"] == "test"
-    assert group.attrs["version"] == arrays.VERSION
+def test_any_program_that_knows_the_format_of_numpy_can_map_it(path):
+    value = np.load(path / "value.npy", mmap_mode="r", allow_pickle=False)
+    np.testing.assert_array_equal(value[1], block(1)["value"])
+    header = json.loads((path / "store.json").read_text())
+    assert (header["system"], header["version"]) == ("test", arrays.VERSION)
+
+
+@pytest.mark.parametrize("count", [1, 17, 20])
+def test_whole_arrays_are_cut_to_their_entries_and_mapped_where_blocks_follow_each_other(tmp_path, count):
+    layout = LAYOUT | {"first": Layout((4, 3), 0, "float16")}
+    store = BlockStore(tmp_path / "a.prt", HEADER, layout, BLOCKS)
+    for number in reversed(range(BLOCKS)):
+        store.write(number, block(number) | {"first": np.full((4, 3), number, np.float16)})
+    for name, axis in (("index", 1), ("value", 1)):
+        expected = np.concatenate([block(number)[name] for number in range(BLOCKS)], axis)
+        found = store.whole(name, count)
+        np.testing.assert_array_equal(found, np.take(expected, np.arange(count), axis))
+        assert found.ctypes.data % mapped.ALIGN == 0
+        assert mapped.reference(found) is found
+    first = store.whole("first", count)
+    np.testing.assert_array_equal(first[:, 1], np.arange(count) // 4)
+    there = mapped.reference(first)
+    assert isinstance(there, mapped.Reference)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(there)).open(), first)
+    assert mapped.reference(first[1:]) is not None
+    (store.path / "first.npy").rename(tmp_path / "gone")
+    with pytest.raises(FileNotFoundError, match=r"first\.npy must be seen by all workers"):
+        there.open()
 
 
 @pytest.mark.parametrize("name", ["index", "value", "checksum"])
-@pytest.mark.parametrize("damage", ["deleted", "truncated", "emptied", "one bit", "zeroed", "longer", "folder"])
+@pytest.mark.parametrize("damage", ["cut off", "one bit", "zeroed", "longer"])
 def test_damaged_blocks_are_reported_missing_and_can_be_written_again(path, name, damage):
-    file = chunk(path, name, 2)
-    content = file.read_bytes()
-    if damage == "deleted":
-        file.unlink()
-    elif damage == "folder":
-        file.unlink()
-        file.mkdir()
+    file, at = place(path, name, 2)
+    content = bytearray(file.read_bytes())
+    if damage == "cut off":
+        del content[at.start + 3 :]
+    elif damage == "one bit":
+        content[at.start] ^= 4
+    elif damage == "zeroed":
+        content[at] = bytes(at.stop - at.start)
     else:
-        file.write_bytes(
-            {
-                "truncated": content[: len(content) // 2],
-                "emptied": b"",
-                "one bit": bytes([content[0] ^ 4]) + content[1:],
-                "zeroed": bytes(len(content)),
-                "longer": content + b"more",
-            }[damage]
-        )
-    assert found(path) in ([0, 1, 3, 4], list(range(BLOCKS)) if damage == "longer" else None)
-    if damage == "folder":
-        file.rmdir()
-    open_store(path).write(2, block(2))
+        content += b"more"
+    file.write_bytes(content)
+    left = {"cut off": [0, 1], "longer": list(range(BLOCKS))}.get(damage, [0, 1, 3, 4])
+    assert found(path) == left
+    store = open_store(path)
+    for number in set(range(BLOCKS)) - set(left):
+        store.write(number, block(number))
     assert found(path) == list(range(BLOCKS))
 
 
 def test_blocks_swapped_on_disk_are_reported_missing(path):
-    first, second = chunk(path, "value", 1), chunk(path, "value", 3)
-    one, other = first.read_bytes(), second.read_bytes()
-    first.write_bytes(other)
-    second.write_bytes(one)
+    value = np.load(path / "value.npy", mmap_mode="r+")
+    value[[1, 3]] = value[[3, 1]]
+    del value
     assert found(path) == [0, 2, 4]
+
+
+def test_blocks_of_another_shape_are_refused(path):
+    with pytest.raises(ValueError, match=r"index must have blocks of \[3, 4\], got \[4, 3\]"):
+        open_store(path).write(0, block(0) | {"index": block(0)["index"].T})
 
 
 @pytest.mark.parametrize("name", ["index", "checksum"])
 def test_a_store_without_one_of_its_arrays_is_refused_by_name(path, name):
-    (path / name / "zarr.json").unlink()
-    with pytest.raises(ValueError, match=r"a\.prt.*" + name):
-        open_store(path).read(0)
+    (path / f"{name}.npy").unlink()
+    with pytest.raises(ValueError, match=r"a\.prt lacks the array " + name):
+        open_store(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no array", b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'sh"])
+def test_arrays_whose_headers_are_damaged_are_refused(path, content):
+    (path / "index.npy").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.prt exists but is not a readable store"):
+        open_store(path)
 
 
 @pytest.mark.parametrize(
@@ -159,8 +187,16 @@ def test_stores_with_another_number_of_blocks_are_refused(path):
 
 def test_stores_of_another_version_are_refused(path, monkeypatch):
     monkeypatch.setattr(arrays, "VERSION", arrays.VERSION + 1)
-    with pytest.raises(ValueError, match=r"a\.prt has format version 3, this package writes 4; delete it"):
+    with pytest.raises(ValueError, match=r"a\.prt has format version 4, this package writes 5; delete it"):
         open_store(path)
+
+
+def test_stores_of_versions_that_zarr_wrote_are_refused_by_their_version(tmp_path):
+    (tmp_path / "a.prt").mkdir()
+    header = {"zarr_format": 3, "node_type": "group", "attributes": {"format": "jaxprt blocks", "version": 3}}
+    (tmp_path / "a.prt" / "zarr.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match=r"a\.prt has format version 3, this package writes 4; delete it"):
+        open_store(tmp_path / "a.prt")
 
 
 @pytest.mark.parametrize("kind", ["empty folder", "foreign folder", "foreign zarr", "plain file", "broken header"])
@@ -169,9 +205,10 @@ def test_what_is_no_store_is_refused_and_left_alone(tmp_path, kind):
     if kind == "plain file":
         path.write_text("precious")
     elif kind == "foreign zarr":
-        zarr.create_group(path, attributes={"mine": 1})
+        path.mkdir()
+        (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {"mine": 1}}')
     elif kind == "broken header":
-        (open_store(path).path / "zarr.json").write_text("{")
+        (open_store(path).path / "store.json").write_text("{")
     else:
         path.mkdir()
         if kind == "foreign folder":
@@ -192,6 +229,45 @@ def test_two_writers_are_one_too_many(path):
         pytest.fail("two writers at once")
     with second.writing():
         second.write(0, block(0))
+
+
+@pytest.mark.parametrize("held", [(1, 1), (2, 4), (3, 4), (1, 2)])
+def test_parts_of_one_number_are_written_at_once_and_others_are_refused(path, held):
+    with ExitStack() as writers:
+        writers.enter_context(open_store(path).writing(held))
+        for part in ((1, 1), (2, 4), (4, 4), (1, 2)):
+            allowed = part != held and part[1] == held[1]
+            with ExitStack() as more:
+                if not allowed:
+                    more.enter_context(pytest.raises(BlockingIOError, match=r"a\.prt is being written by another"))
+                with open_store(path).writing(part):
+                    assert allowed
+    with open_store(path).writing():
+        pass
+
+
+def test_a_full_disk_is_told_and_finished_blocks_stay(tmp_path):
+    store, limits = open_store(tmp_path / "a.prt"), resource.getrlimit(resource.RLIMIT_FSIZE)
+    store.write(0, block(0))
+    full = (store.path / "value.npy").stat().st_size + block(0)["value"].nbytes // 2
+    resource.setrlimit(resource.RLIMIT_FSIZE, (full, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"a\.prt cannot grow \(.*\); finished blocks are kept: call again"):
+            store.write(1, block(1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert found(store.path) == [0]
+    store.write(1, block(1))
+    assert found(store.path) == [0, 1]
+
+
+def test_a_store_knows_itself_after_a_journey_and_no_other_in_its_place(path, tmp_path):
+    store = pickle.loads(pickle.dumps(open_store(path)))
+    assert store.here
+    path.rename(tmp_path / "moved")
+    assert not store.here
+    open_store(path)
+    assert not store.here
 
 
 def test_a_lock_left_behind_by_a_killed_process_does_not_hold(path):

@@ -100,8 +100,8 @@ def test_the_slope_by_roughness_is_that_of_the_integral(scene):
 
 def test_single_texels_by_as_many_points_as_their_brdf_needs_are_the_integral(scene):
     seen, position, frame, light, eye = scene
-    level = np.zeros((6 * SIZE**2, 32), np.uint8)
-    level[:, :4] = np.asarray(seen - (seen > 8)).T
+    level = np.zeros((1, 6 * SIZE**2, 32), np.uint8)
+    level[0, :, :4] = np.asarray(seen - (seen > 8)).T
     transport = StoredVisibility(jnp.asarray(level), position, frame)
     sun = jax.tree.map(lambda each: each[1], light)
     texel, excess, _ = bright_texels.split(sun, count=1)

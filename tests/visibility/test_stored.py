@@ -48,6 +48,12 @@ class Counting(ThreadPoolExecutor):
         return super().submit(*arguments, **options)
 
 
+def forget(path, block):
+    """Takes a block's checksum away."""
+    checksum = np.load(path / "checksum.npy", mmap_mode="r+")
+    checksum[block] = 0
+
+
 def same(first, second):
     for field in ("level", "position", "frame"):
         np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
@@ -102,7 +108,7 @@ def test_the_size_is_that_of_the_light_and_two_vertices_take_a_byte(transport):
     # Vertices are stored by blocks of 64.
     assert transport.nbytes == ALL * visibility.rays.BLOCK // 2 == transport.level.size
     small = precompute(builtin.plane(cells=1), size=1, progress=False)
-    assert (small.size, small.level.shape[0]) == (1, 6)
+    assert (small.size, small.texels) == (1, 6)
     # From a plane that faces up, +y is seen whole, -y not at all.
     np.testing.assert_array_equal(small.visible(jnp.array([2, 3])), [[1] * 4, [0] * 4])
 
@@ -119,7 +125,7 @@ def test_a_store_is_resumed_and_only_what_is_missing_is_traced(mesh, tmp_path):
     same(precompute(mesh, size=SIZE, vertex=vertex, path=path, progress=False), whole)
     for lost, count in (((), 0), ((1,), 1), ((0, 2), 2)):
         for block in lost:
-            (path / "checksum" / "c" / str(block)).unlink()
+            forget(path, block)
         with Counting() as executor:
             same(precompute(mesh, size=SIZE, vertex=vertex, path=path, executor=executor, progress=False), whole)
             assert executor.count == count

@@ -160,7 +160,7 @@ def compress(
     factors = light_factors(brdf)
     clusters = max(1, round(count / _MEMBERS), min(_CLUSTERS, count // _FEWEST))
     components = min(components, count // clusters)
-    keep = min(keep, visible.level.shape[0])
+    keep = min(keep, visible.texels)
     terms = separable.clustered.precompute(
         visible,
         factors,

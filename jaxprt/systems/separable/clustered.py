@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, mapped
 from jaxprt.decompose import clustering, eigen
+from jaxprt.files import mapped
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import haar
 from jaxprt.systems.separable import wavelets
@@ -221,8 +222,8 @@ def precompute(
         raise ValueError(
             f"components must be between 1 and the {member.shape[1]} vertices of a cluster, got {components}"
         )
-    if not 1 <= keep <= direct.level.shape[0]:
-        raise ValueError(f"keep must be between 1 and {direct.level.shape[0]}, got {keep}")
+    if not 1 <= keep <= direct.texels:
+        raise ValueError(f"keep must be between 1 and {direct.texels}, got {keep}")
     if not 1 <= modes <= min(keep, components * brdf.terms):
         most = min(keep, components * brdf.terms)
         raise ValueError(f"modes must be between 1 and the smaller of keep and components x terms, {most}, got {modes}")
@@ -231,7 +232,7 @@ def precompute(
     index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
     weight = jax.device_put(result["weight"]).reshape(*member.shape, components)
     row, place = member.ravel(), places(member)
-    rms = _rms(index, mode, core, weight, size=direct.level.shape[0])
+    rms = _rms(index, mode, core, weight, size=direct.texels)
     same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
     return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(marked(brdf.light_map)))
 
@@ -351,6 +352,10 @@ def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) ->
     return jnp.sqrt(jnp.zeros(size, total.dtype).at[index.astype(jnp.int32)].add(total) / count)
 
 
+def _is_reference(value: Any) -> bool:
+    return isinstance(value, mapped.Reference)
+
+
 @dataclass(frozen=True)
 class _Job(ClusterJob):
     """Transport of the terms of a BRDF; see `blocks.Job`."""
@@ -361,6 +366,18 @@ class _Job(ClusterJob):
     components: int
     modes: int
     count: int
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields; visibility that is mapped from a store travels as the name of its file."""
+        level = mapped.reference(self.direct.level)  # pyright: ignore[reportArgumentType]
+        return {**vars(self), "direct": eqx.tree_at(lambda each: each.level, self.direct, level)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Maps the visibility here."""
+        direct = state["direct"]
+        if isinstance(direct.level, mapped.Reference):
+            direct = eqx.tree_at(lambda each: each.level, direct, direct.level.open(), is_leaf=_is_reference)
+        vars(self).update(state, direct=direct)
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -382,7 +399,7 @@ class _Job(ClusterJob):
     def layout(self) -> Mapping[str, Layout]:
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
-            "index": Layout((1, self.count), 0, "uint16" if self.direct.level.shape[0] <= 1 << 16 else "uint32"),
+            "index": Layout((1, self.count), 0, "uint16" if self.direct.texels <= 1 << 16 else "uint32"),
             "mode": Layout((1, self.count, self.modes), 0, "float16"),
             "core": Layout((1, self.modes, self.components, self.brdf.terms), 0, "float16"),
         }

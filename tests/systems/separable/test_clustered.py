@@ -332,7 +332,7 @@ def test_float64_workers_give_the_same_and_their_store_is_resumed(seen, brdf, sm
 def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path):
     path = tmp_path / "a.prt"
     precompute(seen, brdf, path=path, progress=False, **SMALL)
-    darker = eqx.tree_at(lambda t: t.level, seen, seen.level.at[5, 7].set(0x11))
+    darker = eqx.tree_at(lambda t: t.level, seen, seen.level.at[0, 5, 7].set(0x11))
     other = eqx.tree_at(lambda b: b.light_map, brdf, 2 * brdf.light_map)
     for transport, factored, options in (
         (darker, brdf, SMALL),

@@ -261,7 +261,7 @@ def blind(seen, vertex):
     level = np.asarray(seen.level).copy()
     for each in vertex:
         block, place = divmod(int(each), 64)
-        level[:, block * 32 + place % 32] &= 0xF0 if place < 32 else 0x0F
+        level[block, :, place % 32] &= 0xF0 if place < 32 else 0x0F
     dark = eqx.tree_at(lambda t: t.level, seen, jnp.asarray(level))
     assert not dark.seen(np.asarray(vertex)).any()
     return dark
