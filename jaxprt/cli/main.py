@@ -21,6 +21,7 @@ from jaxprt.cli import animation, report
 from jaxprt.cli.report import Made, View
 from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Environment, Part, Scene
+from jaxprt.visibility import blocks
 
 SYSTEMS = ("planned", "separable", "harmonic", "lobe", "dynamic")
 _LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # share of the squared Laplacian that each window leaves
@@ -115,6 +116,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--azimuth", type=float, default=20.0, help="of the camera, degrees from +z to +x (default 20)")
     parser.add_argument("--elevation", type=float, default=15.0, help="of the camera, degrees (default 15)")
     parser.add_argument("--table", type=int, nargs="?", const=4000, metavar="N", help="add errors on N vertices (4000)")
+    parser.add_argument(
+        "--part",
+        metavar="K/N",
+        help="precompute the K-th of N parts into a shared --output, and draw nothing; without --part the rest is done",
+    )
     parser.add_argument("--output", type=Path, default=Path("output"), help="folder for pictures and report.json")
     return parser
 
@@ -140,18 +146,32 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError("--error needs --system planned")
     if options.animate is not None and "dynamic" not in (options.system or ()):
         raise ValueError("--animate needs --system dynamic")
+    if options.part is not None and "dynamic" in (options.system or ()):
+        raise ValueError("--part needs systems other than dynamic")
+
+
+def _part(text: str | None) -> blocks.Part | None:
+    """The part K/N of all blocks that is asked for; None for all of them."""
+    number, _, count = (text or "1/1").partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise ValueError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
+    return None if text is None else blocks.Part(int(number), int(count))
 
 
 def _run(options: argparse.Namespace) -> None:
     _check(options)
+    part = _part(options.part)
     view = _view(options)
     _make_folder(options.output)
+    systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["planned"])
+    if part is not None:
+        _share(view, options, systems, part)
+        return
     found = _describe(view, options)
     print(
         f"jaxprt {prt.__version__}: {', '.join(f'{p.name} {len(p.mesh.position)}' for p in view.scene.parts)} vertices"
     )
     _warn_of_backs(view)
-    systems = options.system or (["separable", "harmonic", "lobe"] if options.mesh is None else ["planned"])
     made, changing = {}, None
     for system in systems:
         if system == "dynamic":
@@ -190,6 +210,17 @@ def _run(options: argparse.Namespace) -> None:
     _tell(found, path)
 
 
+def _share(view: View, options: argparse.Namespace, systems: Sequence[str], part: blocks.Part) -> None:
+    """Computes one part of the blocks, and says what is left to do."""
+    left = []
+    for system in systems:
+        try:
+            _made(system, view, options, part)
+        except blocks.UnfinishedError as error:
+            left.append(str(error))
+    print("\n".join(left or ["all parts are done: the same command without --part draws the pictures"]))
+
+
 def _make_folder(path: Path) -> None:
     """Makes the folder of the output, or says what is wrong with it before anything is computed."""
     try:
@@ -200,12 +231,12 @@ def _make_folder(path: Path) -> None:
         raise ValueError(f"--output must be a folder that can be written to, got {path}")
 
 
-def _made(system: str, view: View, options: argparse.Namespace) -> Made:
+def _made(system: str, view: View, options: argparse.Namespace, part: blocks.Part | None = None) -> Made:
     """The scene, made ready by one system."""
     output = options.output / system
     if system == "planned":
         error = 0.05 if options.error is None else options.error
-        return report.plan(view, output, error=error, bounces=options.bounces)
+        return report.plan(view, output, error=error, bounces=options.bounces, executor=part)
     recipe: Recipe
     if system == "separable":
         recipe = prt.relit.Terms(options.terms, options.keep)
@@ -213,7 +244,7 @@ def _made(system: str, view: View, options: argparse.Namespace) -> Made:
         recipe = prt.relit.Harmonics(options.order - 1, _LAPLACIAN[options.window])
     else:
         recipe = prt.relit.Lobes(options.lobes)
-    return report.make(view, recipe, output, bounces=options.bounces)
+    return report.make(view, recipe, output, bounces=options.bounces, executor=part)
 
 
 def _view(options: argparse.Namespace) -> View:

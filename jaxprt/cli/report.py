@@ -6,6 +6,7 @@ import math
 import statistics
 import timeit
 from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,27 +112,27 @@ class Truth(NamedTuple):
     seconds: dict[str, float]
 
 
-def plan(view: View, output: Path, *, error: float, bounces: int | None) -> Made:
+def plan(view: View, output: Path, *, error: float, bounces: int | None, executor: Executor | None = None) -> Made:
     """Makes a scene ready by a plan, which is kept with all else: the same command goes on with the same one.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
     """
     lights = list(view.lights.values())
-    made = _made(view, output, error=error, environments=lights, bounces=bounces)
+    made = _made(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
     for part in objects.load(output / "plan").part:
         made.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
     return made
 
 
-def make(view: View, recipe: Recipe, output: Path, *, bounces: int | None) -> Made:
+def make(view: View, recipe: Recipe, output: Path, *, bounces: int | None, executor: Executor | None = None) -> Made:
     """Makes a scene ready by one recipe; what is finished is kept in a folder.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
     """
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    made = _made(view, output, system=recipe, size=size, bounces=bounces)
+    made = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
     for part in view.scene.parts:
         made.cost[part.name] = {"recipe": type(recipe).__name__, **vars(recipe)}
     return made

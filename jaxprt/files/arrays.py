@@ -130,7 +130,8 @@ class BlockStore:
             if error.errno not in _FULL:
                 raise
             raise OSError(
-                error.errno, f"{self.path} cannot grow ({error.strerror}); finished blocks are kept: call again to go on"
+                error.errno,
+                f"{self.path} cannot grow ({error.strerror}); finished blocks are kept: call again to go on",
             ) from error
 
     def read(self, block: int) -> dict[str, np.ndarray] | None:
@@ -177,7 +178,7 @@ class BlockStore:
 
     def _put(self, name: str, block: int, value: np.ndarray) -> None:
         """Writes a block of one array; the file is closed, so that other machines see it."""
-        left = memoryview(value.reshape(-1).view(np.uint8))
+        left = value.reshape(-1).view(np.uint8).data
         with (self.path / f"{name}.npy").open("r+b", buffering=0) as file:
             file.seek(self._offset[name] + block * value.nbytes)
             while left:

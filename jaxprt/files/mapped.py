@@ -108,7 +108,7 @@ def read_into(file: Any, value: np.ndarray) -> None:
     Raises:
         EOFError: The file ends before.
     """
-    left = memoryview(value.reshape(-1).view(np.uint8))
+    left = value.reshape(-1).view(np.uint8).data
     while left:
         count = file.readinto(left)
         if not count:

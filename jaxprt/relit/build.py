@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 
+import filelock
 import numpy as np
 import tqdm
 
@@ -18,6 +19,7 @@ from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.systems.protocol import Joined
+from jaxprt.visibility import UnfinishedError
 
 
 def precompute(
@@ -49,7 +51,8 @@ def precompute(
             finds worth it, and none with `system`.
         size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed; this machine's cores if None.
+        executor: Where blocks are computed; this machine's cores if None. A `jaxprt.visibility.Part` computes its part
+            of all that can be begun, for machines that share nothing but the path.
         progress: Whether to show progress bars.
 
     Returns:
@@ -61,6 +64,7 @@ def precompute(
         ValueError: There is no such system or part, the size is no power of two, bounces are not from 0 to 2, a
             part's material is not one that its system can have, or the store at `path` was made from something else.
         NotADirectoryError: There is a file at `path`.
+        jaxprt.visibility.UnfinishedError: The executor's part is done, and other parts are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
@@ -81,11 +85,16 @@ def precompute(
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name]) for part in scene.parts]
     mesh = scene.mesh
-    systems = []
+    systems, unfinished = [], []
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         at = folder and folder / f"{number}_{_file_name(part.name)}"
         target = Target(mesh, size=size, path=at, executor=executor, progress=progress)
-        systems.append(recipes[part.name].make(shading, target))
+        try:
+            systems.append(recipes[part.name].make(shading, target))
+        except UnfinishedError as others:  # The next part of the scene does not wait for this one.
+            unfinished.append(others)
+    if unfinished:
+        raise UnfinishedError("; ".join(map(str, unfinished)))
     reflected = None
     if bounces:
         # One store for one bounce and two: the second goes on from the first.
@@ -106,6 +115,14 @@ def _checked(part: Part, recipe: Recipe) -> Shading:
 
 def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     """The plan, made once for a folder."""
+    if folder is None:
+        return _plan(scene, None, **options)
+    # Where several processes share the folder, one makes the plan and the others take it.
+    with filelock.FileLock(folder / ".plan.lock"):
+        return _plan(scene, folder, **options)
+
+
+def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     kept = folder and folder / "plan"
     if kept is not None and kept.exists():
         found, environments = objects.load(kept), options["environments"]

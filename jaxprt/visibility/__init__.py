@@ -1,7 +1,7 @@
 """What vertices see of the distant sphere: rays, hits, stored visibility, the loop over blocks, and refinement."""
 
 from jaxprt.visibility import blocks, diffuse, hits, occluder, points, rays, refinement, stored
-from jaxprt.visibility.blocks import Part, Unfinished
+from jaxprt.visibility.blocks import Part, UnfinishedError
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.points import point_starts
 from jaxprt.visibility.rays import LEVELS, exhaustive, fractional, start_points
@@ -13,7 +13,7 @@ __all__ = [
     "Occluder",
     "Part",
     "StoredVisibility",
-    "Unfinished",
+    "UnfinishedError",
     "blocks",
     "diffuse",
     "exhaustive",

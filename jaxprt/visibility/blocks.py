@@ -64,8 +64,8 @@ class Part(ThreadPoolExecutor):
     """Computes the k-th of n equal parts of every job's blocks on this machine, and leaves the others to others.
 
     Many machines share a job by this, with nothing but a folder in common. Give it as the `executor`, with the same
-    `path` everywhere. A job whose other parts are not finished yet raises `Unfinished`; the part that ends last, or a
-    call without a part, returns the whole result.
+    `path` everywhere. A job whose other parts are not finished yet raises `UnfinishedError`. The part that ends last,
+    or a call without a part, returns the whole result.
 
     Args:
         number: Which part, from 1.
@@ -86,7 +86,7 @@ class Part(ThreadPoolExecutor):
         return range((self.number - 1) * blocks // self.count, self.number * blocks // self.count)
 
 
-class Unfinished(RuntimeError):
+class UnfinishedError(RuntimeError):
     """A part is done, but other parts of the same job are not."""
 
 
@@ -123,7 +123,7 @@ def compute(
         ValueError: The store at `path` was made from something else, or a part of a job has no path.
         BlockingIOError: Another process is writing to it.
         OSError: The disk is full; finished blocks are kept in the store.
-        Unfinished: The part is done, and others are not.
+        UnfinishedError: The part is done, and others are not.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
     blocks = -(-job.vertices // job.step)
@@ -149,7 +149,7 @@ def compute(
     if part is not None:
         left = int(np.sum(~store.written())) or len(_missing(store, set(range(blocks)) - set(own)))
         if left:
-            raise Unfinished(
+            raise UnfinishedError(
                 f"part {part.number}/{part.count} of {store.path} is done; {left} of its {blocks} blocks are missing: "
                 "run the other parts, then the same once more without a part"
             )

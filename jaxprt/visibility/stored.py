@@ -70,7 +70,9 @@ class StoredVisibility(eqx.Module):
         for number in np.unique(block):  # A block is contiguous, and one of its vertices alone is not.
             own = np.flatnonzero(block == number)
             pair = np.ascontiguousarray(held[number].T)
-            level[own] = np.where(place[own, None] < _HALF, pair[place[own] % _HALF] & 15, pair[place[own] % _HALF] >> 4)
+            level[own] = np.where(
+                place[own, None] < _HALF, pair[place[own] % _HALF] & 15, pair[place[own] % _HALF] >> 4
+            )
         level += level > _MIDDLE
         return level
 

@@ -273,6 +273,11 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--elevation", "95"], "--elevation must be from -90 to 90 degrees, got 95"),
         (["--azimuth", "nan"], "--azimuth must be finite, got nan"),
         (["--table", "-3"], "--table must be at least 1, got -3"),
+        *(
+            ([f"--part={part}"], f"--part must be K/N.* got {part}")
+            for part in ("0/4", "5/4", "a/b", "2", "-1/2", "1/0")
+        ),
+        (["--part", "1/2", "--system", "dynamic"], "--part needs systems other than dynamic"),
     ],
 )
 def test_bad_numbers_are_named_on_stderr_with_status_2(place, tmp_path, capsys, options, message):
@@ -285,6 +290,25 @@ def assert_told(capsys, message):
     assert "Traceback" not in err
     assert [line for line in err.splitlines() if line.startswith("jaxprt: error: ")], err
     assert re.search(message, err), err
+
+
+def test_parts_share_a_folder_and_a_call_without_one_goes_on_to_the_pictures(place, tmp_path, monkeypatch, capsys):
+    told = []
+    for part in ("1/2", "2/2"):
+        assert run(place, "--ground", "--part", part, output=tmp_path) == 0
+        told.append(capsys.readouterr().out)
+    # Each part of the scene is a block, which the first of two parts leaves to the second.
+    assert told[0].count("1 of its 1 blocks are missing: run the other parts") == 2
+    assert "all parts are done: the same command without --part" in told[1]
+    assert not (tmp_path / "report.json").exists()
+    monkeypatch.setattr(prt.separable.wavelets, "compress", None)  # Nothing is computed again.
+
+    def draw(*_):
+        raise RuntimeError("it would draw")
+
+    monkeypatch.setattr(cli_report, "draw", draw)
+    assert run(place, "--ground", output=tmp_path) == 2
+    assert_told(capsys, "it would draw")
 
 
 @pytest.mark.parametrize("options", [["--size", "many"], ["--brdf", "velvet"], ["--unknown"], ["--diffuse"]])

@@ -159,7 +159,9 @@ def test_a_store_without_one_of_its_arrays_is_refused_by_name(path, name):
         open_store(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"no array", b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'sh"])
+@pytest.mark.parametrize(
+    "content", [b"", b"no array", b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'sh"]
+)
 def test_arrays_whose_headers_are_damaged_are_refused(path, content):
     (path / "index.npy").write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.prt exists but is not a readable store"):

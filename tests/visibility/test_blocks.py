@@ -2,10 +2,12 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
 import warnings
+import weakref
 import zlib
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -21,6 +23,7 @@ import jaxprt as prt
 from jaxprt import bounces, harmonic, lobe, separable, visibility
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.systems.separable import precompute
+from jaxprt.visibility import Part, UnfinishedError
 
 SIZE = 4  # Vertices to a block.
 
@@ -190,6 +193,108 @@ def test_a_killed_worker_process_is_told_and_a_second_call_goes_on(tmp_path, sto
         visibility.blocks.compute(job, path=path, executor=mortal, progress=False)
     assert not trap.exists()
     check(visibility.blocks.compute(job, path=path, progress=False))
+
+
+def test_parts_in_any_order_make_the_whole_and_the_last_of_them_returns_it(tmp_path):
+    path, log = tmp_path / "a.prt", []
+    for number, left in ((2, 5), (3, 2)):
+        with (
+            Part(number, 3) as part,
+            pytest.raises(UnfinishedError, match=rf"part {number}/3 .*; {left} of its 8 blocks"),
+        ):
+            visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False)
+    with Part(1, 3) as part:
+        check(visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False))
+    assert sorted(log) == list(range(8))
+    assert [list(Part(number, 3).of(8)) for number in (1, 2, 3)] == [[0, 1], [2, 3, 4], [5, 6, 7]]
+
+
+def test_two_parts_of_one_number_write_at_once_and_the_same_part_twice_is_refused(tmp_path):
+    job, path = Counting(), tmp_path / "a.prt"
+    store = BlockStore(path, job.header, job.layout, 8)
+    with store.writing((2, 3)), Part(1, 3) as one, Part(2, 3) as two, Part(1, 2) as half:
+        with pytest.raises(UnfinishedError):
+            visibility.blocks.compute(job, path=path, executor=one, progress=False)
+        for executor in (two, half, None):
+            with pytest.raises(BlockingIOError, match=r"a\.prt is being written by another process"):
+                visibility.blocks.compute(job, path=path, executor=executor, progress=False)
+    assert sorted(job.log) == [0, 1]
+
+
+@pytest.mark.parametrize(("number", "count"), [(0, 4), (5, 4), (1, 0), (-1, -1)])
+def test_parts_that_are_not_there_are_refused(number, count):
+    with pytest.raises(ValueError, match=f"the part must be from 1/.*, got {number}/{count}"):
+        Part(number, count)
+
+
+def test_a_part_without_a_folder_is_refused():
+    with Part(1, 2) as part, pytest.raises(ValueError, match="part 1/2 must have a path"):
+        visibility.blocks.compute(Squares(), executor=part, progress=False)
+
+
+class Slow(ThreadPoolExecutor):
+    """Counts the blocks that are on their way."""
+
+    most = now = 0
+
+    def submit(self, *arguments, **options):
+        self.now += 1
+        self.most = max(self.most, self.now)
+        future = super().submit(*arguments, **options)
+        future.add_done_callback(lambda _: setattr(self, "now", self.now - 1))
+        return future
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_blocks_on_their_way_are_few_and_dropped_when_they_have_arrived(tmp_path, monkeypatch, stored):
+    living, most = [0], [0]
+
+    class Traced(Squares):
+        def run(self, block):
+            array, count = super().run(block)
+            living[0] += 1
+            most[0] = max(most[0], living[0])
+            weakref.finalize(array["index"], lambda: living.__setitem__(0, living[0] - 1))
+            return array, count
+
+    monkeypatch.setattr(visibility.blocks, "_HELD", 1)
+    job = Traced(vertices=400)
+    with Slow(1) as executor:
+        path = tmp_path / "a.prt" if stored else None
+        check(visibility.blocks.compute(job, path=path, executor=executor, progress=False), job)
+        assert executor.most <= 2 * visibility.blocks.cores()
+    assert 0 < most[0] <= 2 * visibility.blocks.cores() + 2
+
+
+def test_workers_write_their_blocks_themselves_where_they_see_the_folder(tmp_path, monkeypatch, pool):
+    path = tmp_path / "a.prt"
+
+    def write(*_):
+        raise AssertionError("the workers should have written this block")
+
+    monkeypatch.setattr(BlockStore, "write", write)
+    check(visibility.blocks.compute(Squares(), path=path, executor=pool, progress=False))
+    monkeypatch.undo()
+    # Workers that see another folder, or none, send their blocks.
+    monkeypatch.setattr(BlockStore, "__getstate__", lambda self: {**vars(self), "_key": "another"}, raising=False)
+    check(visibility.blocks.compute(Squares(), path=tmp_path / "b.prt", executor=pool, progress=False))
+
+
+def test_a_full_disk_is_told_and_a_second_call_goes_on(tmp_path):
+    path, job = tmp_path / "a.prt", Squares(name="full", vertices=4000)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"a\.prt cannot grow \(.*\); finished blocks are kept: call again"):
+            visibility.blocks.compute(job, path=path, progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    kept = finished(path)
+    assert 100 < len(kept) < 1000
+    again = Counting(name="full", vertices=4000)
+    check(visibility.blocks.compute(again, path=path, progress=False), job)
+    assert sorted({*again.log, *kept}) == list(range(1000))
+    assert len(again.log) == 1000 - len(kept)
 
 
 def test_an_error_in_a_worker_is_passed_on_and_finished_blocks_stay(tmp_path):
