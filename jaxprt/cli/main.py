@@ -116,11 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--azimuth", type=float, default=20.0, help="of the camera, degrees from +z to +x (default 20)")
     parser.add_argument("--elevation", type=float, default=15.0, help="of the camera, degrees (default 15)")
     parser.add_argument("--table", type=int, nargs="?", const=4000, metavar="N", help="add errors on N vertices (4000)")
-    parser.add_argument(
-        "--part",
-        metavar="K/N",
-        help="precompute the K-th of N parts into a shared --output, and draw nothing; without --part the rest is done",
-    )
+    parser.add_argument("--part", metavar="K/N", help="only precompute the K-th of N parts into a shared --output")
     parser.add_argument("--output", type=Path, default=Path("output"), help="folder for pictures and report.json")
     return parser
 

@@ -1,6 +1,6 @@
 """Objects of the package on disk and between processes: transports, BRDFs, plans, lights, meshes.
 
-A saved object is a folder: a zarr group with one array for each array of the object, and a description in JSON of the
+A saved object is a folder: one file in NumPy's format for each array of the object, and a description in JSON of the
 classes and fields that these belong to. There is no pickle in it. Loading creates objects of this package's own
 classes and fills their fields; it calls nothing that a file names.
 """
@@ -19,12 +19,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import zarr
 from jax.core import Tracer
 
-VERSION = 1
+from jaxprt.files import mapped
+
+VERSION = 2
 _FORMAT = "jaxprt object"
-_CHUNK = 1 << 27  # bytes of a file, about at most
+_HEADER = "object.json"
 # Functions that fields may hold. Files and pickles have their names.
 _FUNCTIONS = {
     "jaxprt.sphere.hemisphere:disk_coordinates",
@@ -63,14 +64,13 @@ def save(path: str | os.PathLike, object: Any) -> None:
     aside = path.with_name(f"{path.name}.{os.getpid()}.new")
     shutil.rmtree(aside, ignore_errors=True)
     try:
-        group = zarr.create_group(aside, attributes=header)
+        aside.mkdir(parents=True)
         for number, (_, each) in enumerate(arrays):
             stored = _storable(each)
-            made = group.create_array(
-                str(number), shape=stored.shape, chunks=_chunks(stored), dtype=stored.dtype, compressors=None
-            )
-            if stored.size:
-                made[...] = stored
+            with (aside / f"{number}.npy").open("xb") as file:
+                mapped.write_header(file, stored.shape, stored.dtype.str)
+                file.write(stored.reshape(-1).view(np.uint8).data)
+        (aside / _HEADER).write_text(json.dumps(header))
         if path.exists():
             raise FileExistsError(f"{path} exists; remove it or name another path")
         aside.rename(path)
@@ -85,7 +85,10 @@ def load(path: str | os.PathLike) -> Any:
         path: The folder.
 
     Returns:
-        The object. Arrays that were on a device are on the default device, and NumPy arrays are NumPy arrays.
+        The object. Arrays that were on a device are on the default device, and NumPy arrays are NumPy arrays. On CPUs
+        the former are maps of their files, which take memory only where they are used: an object larger than the memory
+        can be loaded, and `jaxprt.systems.ranges.vertices` takes a range of its vertices. The files may be deleted
+        meanwhile, but must not be changed.
 
     Raises:
         FileNotFoundError: There is nothing at `path`.
@@ -96,8 +99,7 @@ def load(path: str | os.PathLike) -> Any:
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such folder")
     try:
-        group = zarr.open_group(path, mode="r")
-        header = dict(group.attrs)
+        header = _header(path)
     except Exception as error:
         raise ValueError(
             f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read"
@@ -120,7 +122,7 @@ def load(path: str | os.PathLike) -> Any:
                 f"{path} was made by version {algorithm} of the algorithm in {name}, this jaxprt has version "
                 f"{_algorithm(name)}, which gives other results: compute it again"
             )
-    arrays: list[Any] = [_read(path, group, number, each) for number, each in enumerate(content["array"])]
+    arrays: list[Any] = [_read(path, number, each) for number, each in enumerate(content["array"])]
     return _make(path, content["tree"], arrays)
 
 
@@ -218,6 +220,8 @@ def _array(path: Path, arrays: list[Any], number: int, kind: str) -> Any:
     value = arrays[number]
     if kind == "scalar":
         return value[()]
+    if kind == "numpy" and isinstance(value, np.ndarray) and not value.flags.writeable:
+        arrays[number] = value = np.array(value)
     if kind == "jax" and isinstance(value, np.ndarray):
         if jax.dtypes.canonicalize_dtype(value.dtype) != value.dtype:
             raise ValueError(
@@ -227,14 +231,22 @@ def _array(path: Path, arrays: list[Any], number: int, kind: str) -> Any:
     return value
 
 
-def _read(path: Path, group: zarr.Group, number: int, entry: dict[str, Any]) -> np.ndarray:
+def _header(path: Path) -> dict[str, Any]:
+    """The header of a saved object, of this version or of the first, which zarr wrote."""
+    if (path / _HEADER).exists():
+        return dict(json.loads((path / _HEADER).read_text()))
+    if (path / "zarr.json").exists():
+        return dict(json.loads((path / "zarr.json").read_text()).get("attributes", {}))
+    return {}
+
+
+def _read(path: Path, number: int, entry: dict[str, Any]) -> np.ndarray:
+    """An array as a map, compared with its checksum."""
     dtype, shape = jnp.dtype(entry["dtype"]), tuple(entry["shape"])
+    kind = _storable(np.empty(0, dtype)).dtype.str
+    file = path / f"{number}.npy"
     try:
-        found = group[str(number)]
-        assert isinstance(found, zarr.Array)
-        # Without elements there is nothing to read.
-        value = np.asarray(found[...]) if 0 not in shape else np.zeros(shape, dtype)
-        value = np.ascontiguousarray(value).view(dtype).reshape(shape)
+        value = mapped.open_array(file, mapped.read_header(file, shape, kind), shape, kind).view(dtype)
         if _checksum(value) == entry["checksum"]:
             return value
     except Exception as error:
@@ -292,16 +304,8 @@ def _is_extended(dtype: np.dtype) -> bool:
 
 
 def _storable(value: np.ndarray) -> np.ndarray:
-    """The array in a type that zarr has: the bits of those that it has not."""
+    """The array in a type that NumPy has: the bits of those that it has not."""
     return value.view(f"uint{8 * value.dtype.itemsize}") if _is_extended(value.dtype) else value
-
-
-def _chunks(value: np.ndarray) -> tuple[int, ...]:
-    """Parts along the first axis."""
-    if not value.ndim:
-        return ()
-    rows = max(1, min(len(value), _CHUNK * len(value) // max(1, value.nbytes)))
-    return (rows, *(max(1, each) for each in value.shape[1:]))
 
 
 def _checksum(value: np.ndarray) -> int:

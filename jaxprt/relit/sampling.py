@@ -90,7 +90,7 @@ class Sample:
         mesh = shading.mesh
         count = len(mesh.position)
         clusters = max(1, round(count / MEMBERS))
-        member = separable.clustered.cluster(mesh.position, mesh.normal, clusters=clusters)
+        member = separable.members.cluster(mesh.position, mesh.normal, clusters=clusters)
         some = min(clusters, max(2, round(_CLUSTERS * count / total)))
         vertex = np.unique(member[np.random.default_rng(0).permutation(clusters)[:some]])
         start = time.perf_counter()

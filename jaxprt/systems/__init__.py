@@ -1,6 +1,17 @@
 """The systems, their yardstick, and single bright texels beside any of them."""
 
-from jaxprt.systems import adaptive, bounces, bright_texels, dynamic, harmonic, lobe, protocol, reference, separable
+from jaxprt.systems import (
+    adaptive,
+    bounces,
+    bright_texels,
+    dynamic,
+    harmonic,
+    lobe,
+    protocol,
+    ranges,
+    reference,
+    separable,
+)
 
 __all__ = [
     "adaptive",
@@ -10,6 +21,7 @@ __all__ = [
     "harmonic",
     "lobe",
     "protocol",
+    "ranges",
     "reference",
     "separable",
 ]

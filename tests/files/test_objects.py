@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import zarr
 
 import jaxprt as prt
 from jaxprt import separable
 from jaxprt.brdf import navigation
+from jaxprt.files import mapped
 from jaxprt.sphere import hemisphere
 
 # Host records of the command line and of reports; they hold functions and file names.
@@ -150,7 +150,7 @@ def test_arrays_that_two_fields_share_are_saved_once_and_shared_again(tmp_path):
     prt.files.save(tmp_path / "a.prt", {"one": whole, "other": (whole, np.arange(3))})
     again = prt.files.load(tmp_path / "a.prt")
     assert again["one"] is again["other"][0]
-    assert len(list(zarr.open_group(tmp_path / "a.prt", mode="r").array_keys())) == 2
+    assert len(list((tmp_path / "a.prt").glob("*.npy"))) == 2
 
 
 LINE, DIFFUSE = navigation.Line(jnp.arange(2.0)), jnp.zeros((1, 3))
@@ -199,7 +199,7 @@ def test_nothing_is_replaced_and_a_save_that_fails_leaves_nothing(tmp_path, monk
         assert not other.exists()
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(zarr.Group, "create_array", full)
+    monkeypatch.setattr(mapped, "write_header", full)
     with pytest.raises(OSError, match="no space"):
         prt.files.save(other, jnp.zeros(3))
     assert [file.name for file in tmp_path.iterdir()] == ["a.prt"]
@@ -207,12 +207,17 @@ def test_nothing_is_replaced_and_a_save_that_fails_leaves_nothing(tmp_path, monk
 
 def rewritten(path, **change):
     """Changes what the header says, its checksum made to fit."""
-    group = zarr.open_group(path, mode="r+")
-    content = json.loads(str(group.attrs["content"]))
+    content = json.loads(json.loads((path / "object.json").read_text())["content"])
     for place, new in change.items():
         content[place] = new
     text = json.dumps(content)
-    group.attrs.update({"content": text, "checksum": zlib.crc32(text.encode())})
+    headed(path, content=text, checksum=zlib.crc32(text.encode()))
+
+
+def headed(path, **change):
+    """Changes the header."""
+    header = json.loads((path / "object.json").read_text())
+    (path / "object.json").write_text(json.dumps(header | change))
 
 
 def test_damage_is_found_and_told(tmp_path, scene):
@@ -224,8 +229,7 @@ def test_damage_is_found_and_told(tmp_path, scene):
         return path
 
     path = saved()
-    file = next(file for file in path.rglob("c/*") if file.is_file() or (file / "0").exists())
-    file = next(each for each in (file, *file.rglob("*")) if each.is_file())
+    file = path / "0.npy"
     content = file.read_bytes()
     for damaged in (content[:9], content[:-1] + bytes([content[-1] ^ 1])):
         file.write_bytes(damaged)
@@ -235,15 +239,15 @@ def test_damage_is_found_and_told(tmp_path, scene):
     with pytest.raises(ValueError, match="is damaged"):
         prt.files.load(path)
     path = saved()
-    zarr.open_group(path, mode="r+").attrs["content"] = "{}"
+    headed(path, content="{}")
     with pytest.raises(ValueError, match="is damaged: its description"):
         prt.files.load(path)
-    (path / "zarr.json").write_text("{")
+    (path / "object.json").write_text("{")
     with pytest.raises(ValueError, match="wrote, got one that cannot be read"):
         prt.files.load(path)
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
         prt.files.load(tmp_path / "missing")
-    zarr.create_group(tmp_path / "other")
+    (tmp_path / "other").mkdir()
     with pytest.raises(ValueError, match="got another kind of folder"):
         prt.files.load(tmp_path / "other")
 
@@ -255,12 +259,11 @@ def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_p
     with pytest.raises(ValueError, match=r"algorithm in jaxprt.systems.separable.sparse, this jaxprt has version 77"):
         prt.files.load(path)
     monkeypatch.undo()
-    group = zarr.open_group(path, mode="r+")
     for version, cure in ((99, "update jaxprt"), (0, "load it with the version of jaxprt that saved it")):
-        group.attrs["version"] = version
-        with pytest.raises(ValueError, match=f"must have format version 1, got {version}: {cure}"):
+        headed(path, version=version)
+        with pytest.raises(ValueError, match=f"must have format version 2, got {version}: {cure}"):
             prt.files.load(path)
-    group.attrs["version"] = 1
+    headed(path, version=2)
     rewritten(path, tree={"class": "jaxprt.scene.environment:Environment", "field": {"light": {"value": 1}}})
     with pytest.raises(ValueError, match="with the fields light, this jaxprt's has radiance"):
         prt.files.load(path)
@@ -295,3 +298,21 @@ def test_numbers_of_64_bits_are_loaded_with_x64_and_refused_without(tmp_path):
         same(prt.files.load(tmp_path / "a.prt"), light)
     with pytest.raises(ValueError, match="holds arrays of float64, which JAX has only with jax_enable_x64"):
         prt.files.load(tmp_path / "a.prt")
+
+
+def test_arrays_of_devices_are_maps_of_their_files_on_cpus_and_those_of_the_host_are_not(tmp_path):
+    both = jnp.arange(4096.0), np.arange(4096.0)
+    prt.files.save(tmp_path / "a.prt", both)
+    device, host = prt.files.load(tmp_path / "a.prt")
+    there = mapped.reference(np.asarray(device))
+    assert isinstance(there, mapped.Reference)
+    assert there.path == str(tmp_path / "a.prt" / "0.npy")
+    host[0] = 7
+    same(prt.files.load(tmp_path / "a.prt"), both)
+
+
+def test_objects_that_zarr_saved_are_refused_by_their_version(tmp_path):
+    header = {"zarr_format": 3, "attributes": {"format": "jaxprt object", "version": 1, "content": "{}"}}
+    (tmp_path / "zarr.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match="must have format version 2, got 1: load it with the version of jaxprt that"):
+        prt.files.load(tmp_path)

@@ -58,7 +58,7 @@ class ResponseJob(visibility.rays.VisibilityJob):
 
 
 @dataclass(frozen=True)
-class _PathJob(separable.clustered.ClusterJob, visibility.rays.VisibilityJob):
+class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
     """What surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
 
     Attributes:

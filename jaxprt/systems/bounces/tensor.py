@@ -210,7 +210,7 @@ def precompute(
         os.makedirs(path, exist_ok=True)
     run = _Run(path, executor, progress)
     region = np.asarray(mesh.region)
-    member = separable.clustered.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
+    member = separable.members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
     job = jobs.TransferJob.make(
         mesh,
         None,
@@ -239,7 +239,7 @@ def precompute(
         worth.append(brought)
     if progress:
         _tell(contribution, function, worth, second, bounces)
-    rows = (separable.clustered.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
+    rows = (separable.members.places(member), job.region.astype(np.int32), _areas(mesh).astype(weight.dtype))
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
     judged = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
     return TransferTensor(*arrays, factor=factor, second=second, **judged, mesh=visibility.blocks.scene_key(mesh))

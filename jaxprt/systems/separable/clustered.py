@@ -21,17 +21,18 @@ from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, mapped
-from jaxprt.decompose import clustering, eigen
-from jaxprt.files import mapped
+from jaxprt.decompose import eigen
+from jaxprt.files.mapped import Reference, reference
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import haar
-from jaxprt.systems.separable import wavelets
+from jaxprt.systems.separable import members, wavelets
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
 from jaxprt.visibility import StoredVisibility
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}
 SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
+_COMPONENTS, _MODES, _KEEP = 16, 128, 1024  # of a cluster, if nothing else is asked for
 _SAMPLE = 24  # vertices of a cluster that choose its coefficients
 
 
@@ -168,11 +169,11 @@ def precompute(
     direct: StoredVisibility,
     brdf: SeparableBrdf,
     *,
-    clusters: int = 160,
+    clusters: int | None = None,
     member: Int[np.ndarray, "p m"] | None = None,
-    components: int = 16,
-    modes: int = 128,
-    keep: int = 1024,
+    components: int | None = None,
+    modes: int | None = None,
+    keep: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -185,11 +186,11 @@ def precompute(
     Args:
         direct: Visibility of the vertices.
         brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.separable.factor` makes them.
-        clusters: Number of clusters, made by `cluster`; a few hundred vertices in each pay best.
+        clusters: Number of clusters, made by `members.cluster`; by `members.clusters_for` if None.
         member: Vertices of each cluster, in place of `clusters`; a vertex may be in one cluster several times.
-        components: Principal components of the vertices of a cluster.
-        modes: Principal components of the light that it meets.
-        keep: Wavelet coefficients kept per cluster.
+        components: Principal components of the vertices of a cluster; 16, or as many as it has vertices, if None.
+        modes: Principal components of the light that it meets; 128, or as many as there are, if None.
+        keep: Wavelet coefficients kept per cluster; 1024, or all of them, if None.
         path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
         executor: Where clusters are computed; this machine's cores if None.
         progress: Whether to show a progress bar.
@@ -211,13 +212,17 @@ def precompute(
     if brdf.light_map.shape[-1] != 1:
         raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
     if member is None:
-        member = cluster(direct.position, direct.frame[:, 2], clusters=clusters)
+        count = members.clusters_for(len(direct.position)) if clusters is None else clusters
+        member = members.cluster(direct.position, direct.frame[:, 2], clusters=count)
     missing = np.setdiff1d(np.arange(len(direct.position)), member).size
     if missing or member.min() < 0 or member.max() >= len(direct.position):
         raise ValueError(
             f"member must name all {len(direct.position)} vertices and no others, got {missing} missing and "
             f"numbers from {member.min()} to {member.max()}"
         )
+    components = min(_COMPONENTS, member.shape[1]) if components is None else components
+    keep = min(_KEEP, direct.texels) if keep is None else keep
+    modes = min(_MODES, keep, components * brdf.terms) if modes is None else modes
     if not 1 <= components <= member.shape[1]:
         raise ValueError(
             f"components must be between 1 and the {member.shape[1]} vertices of a cluster, got {components}"
@@ -231,47 +236,10 @@ def precompute(
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
     index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
     weight = jax.device_put(result["weight"]).reshape(*member.shape, components)
-    row, place = member.ravel(), places(member)
+    row, place = member.ravel(), members.places(member)
     rms = _rms(index, mode, core, weight, size=direct.texels)
     same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
     return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(marked(brdf.light_map)))
-
-
-def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:
-    """Vertices of each cluster, alike in position and normal, by `jaxprt.decompose.clustering.bisect`."""
-    coordinate = []
-    for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
-        offset = each - each.mean(0)
-        coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
-    return clustering.bisect(np.concatenate(coordinate, 1), clusters=clusters)
-
-
-def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:
-    """A row of each vertex among the members of all clusters, one after another; those in several are in the last."""
-    row = member.ravel()
-    result = np.zeros(row.max() + 1, np.int32)
-    result[row] = np.arange(row.size)
-    return result
-
-
-class ClusterJob(visibility.blocks.Job):
-    """A job whose blocks are clusters.
-
-    Attributes:
-        member: Vertices of each cluster.
-    """
-
-    member: np.ndarray
-
-    @property
-    def vertices(self) -> int:
-        """Number of members of all clusters."""
-        return self.member.size
-
-    @property
-    def step(self) -> int:
-        """Number of members of a cluster."""
-        return self.member.shape[1]
 
 
 @partial(jit, static_argnames=("components", "modes", "keep"))
@@ -353,11 +321,11 @@ def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) ->
 
 
 def _is_reference(value: Any) -> bool:
-    return isinstance(value, mapped.Reference)
+    return isinstance(value, Reference)
 
 
 @dataclass(frozen=True)
-class _Job(ClusterJob):
+class _Job(members.ClusterJob):
     """Transport of the terms of a BRDF; see `blocks.Job`."""
 
     direct: StoredVisibility
@@ -369,13 +337,13 @@ class _Job(ClusterJob):
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields; visibility that is mapped from a store travels as the name of its file."""
-        level = mapped.reference(self.direct.level)  # pyright: ignore[reportArgumentType]
+        level = reference(self.direct.level)  # pyright: ignore[reportArgumentType]
         return {**vars(self), "direct": eqx.tree_at(lambda each: each.level, self.direct, level)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Maps the visibility here."""
         direct = state["direct"]
-        if isinstance(direct.level, mapped.Reference):
+        if isinstance(direct.level, Reference):
             direct = eqx.tree_at(lambda each: each.level, direct, direct.level.open(), is_leaf=_is_reference)
         vars(self).update(state, direct=direct)
 

@@ -15,7 +15,8 @@ from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable import SeparableBrdf, factor
-from jaxprt.systems.separable.clustered import cluster, precompute
+from jaxprt.systems.separable.clustered import precompute
+from jaxprt.systems.separable.members import cluster
 from jaxprt.systems.separable.wavelets import project
 
 SIZE = 8
@@ -103,12 +104,12 @@ class Strangers(Executor):
     def __init__(self):
         self.count = 0
 
-    def submit(self, work, key, job, block):
+    def submit(self, work, key, sent, block):
         """Answers at once."""
         future = Future()
-        if job is not None:
+        if sent is not None:
             self.count += 1
-        future.set_result(None if job is None else pickle.loads(pickle.dumps(job)).run(block))
+        future.set_result(None if sent is None else pickle.loads(sent)[0].run(block))
         return future
 
 
@@ -315,7 +316,7 @@ def test_workers_of_any_kind_give_the_same_bits_and_a_store_is_resumed(seen, brd
     path = tmp_path / "a.prt"
     for lost, count in (((), CLUSTERS), ((), 0), ((1, 3), 2)):
         for block in lost:
-            (path / "checksum" / "c" / str(block)).unlink()
+            np.load(path / "checksum.npy", mmap_mode="r+")[block] = 0
         executor = Strangers()
         same(precompute(seen, brdf, path=path, executor=executor, progress=False, **SMALL), small)
         assert executor.count == count
@@ -441,3 +442,30 @@ def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
     for transport, wrong in ((small, other), (fewer, other.truncate(2))):
         with pytest.raises(ValueError, match="must be the one that the transport was made for, got another"):
             separable.radiance(transport, wrong, light, eye=EYE)
+
+
+def test_clusters_grow_with_the_root_of_the_vertices_and_sizes_fit_any_mesh(brdf):
+    assert [separable.members.clusters_for(count) for count in (1, 3, 100, 36_000, 1_000_000)] == [1, 1, 8, 159, 840]
+    triangle = visibility.precompute(builtin.plane(cells=1), size=2, progress=False)
+    few = precompute(triangle, brdf, progress=False)
+    assert (few.core.shape[2], few.index.shape) == (2, (2, 24))
+    light = builtin.daylight(size=2)
+    exact = project(jnp.asarray(triangle.seen(np.arange(4))), triangle.frame, brdf)[..., 0]
+    expected = np.einsum("vdr,dc->vrc", exact, separable.project(light))
+    np.testing.assert_allclose(few.apply(separable.project(light)), expected, atol=3e-3 * np.abs(expected).max())
+
+
+def test_jobs_send_mapped_visibility_by_the_name_of_its_file(brdf, tmp_path):
+    mesh = builtin.sphere(rings=12, sectors=14)
+    mapped = visibility.precompute(mesh, size=8, path=tmp_path / "a.prt", progress=False)
+    held, jobs = visibility.precompute(mesh, size=8, progress=False), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(visibility.blocks, "compute", lambda job, **_: jobs.append(job) or {}["stop"])
+        for seen in (mapped, held):
+            with pytest.raises(KeyError):
+                precompute(seen, brdf, keep=9, progress=False)
+    sent = [pickle.dumps(job) for job in jobs]
+    assert len(sent[0]) < len(sent[1]) - mapped.nbytes + 1000
+    for there in map(pickle.loads, sent):
+        for name, value in jobs[1].run(1)[0].items():
+            np.testing.assert_array_equal(there.run(1)[0][name], value)

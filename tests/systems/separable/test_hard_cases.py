@@ -298,7 +298,7 @@ def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
 @pytest.mark.parametrize("which", ["one vertex", "a cluster", "all"])
 def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, light, close, which):
     brdf = factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5), terms=3, resolution=12)
-    member = separable.clustered.cluster(seen.position, seen.frame[:, 2], clusters=4)
+    member = separable.members.cluster(seen.position, seen.frame[:, 2], clusters=4)
     vertex = {"one vertex": member[1, :1], "a cluster": member[1], "all": np.arange(len(seen.position))}[which]
     color = clustered_radiance(blind(seen, vertex), brdf, light)
     expected = all_texels(seen, brdf, light).copy()

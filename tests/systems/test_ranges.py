@@ -1,0 +1,83 @@
+"""Ranges of vertices: each gives the rows that the whole gives, and what is mapped is read by ranges."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import harmonic, lobe, separable, visibility
+from jaxprt.scene import builtin
+from jaxprt.systems import ranges
+
+SIZE = 8
+EYE = jnp.array([0.3, 0.8, 3.0])
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    """Visibility of three blocks of vertices, mapped from its store."""
+    path = tmp_path_factory.mktemp("ranges") / "a.prt"
+    return visibility.precompute(builtin.sphere(rings=12, sectors=14), size=SIZE, path=path, progress=False)
+
+
+@pytest.fixture(scope="module")
+def brdf():
+    return separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
+
+
+@pytest.fixture(scope="module")
+def sparse(brdf):
+    return separable.precompute(builtin.sphere(rings=12, sectors=14), brdf, keep=9, size=SIZE, progress=False)
+
+
+def pieces(value, function):
+    """Rows of three ranges, one after another."""
+    cut = (0, 64, 128, len(value.position))
+    return [function(ranges.take(value, *each)) for each in itertools.pairwise(cut)]
+
+
+def test_ranges_of_a_saved_transport_relight_to_the_rows_of_the_whole(sparse, brdf, tmp_path):
+    prt.files.save(tmp_path / "a.prt", sparse)
+    mapped = prt.files.load(tmp_path / "a.prt")
+    light = builtin.daylight(size=SIZE)
+    rows = pieces(mapped, lambda part: separable.radiance(part, brdf, light, eye=EYE))
+    whole = separable.radiance(sparse, brdf, light, eye=EYE)
+    np.testing.assert_allclose(np.concatenate(rows), whole, rtol=1e-5, atol=1e-6)
+
+
+def test_ranges_of_every_kind_of_transport_are_the_rows_of_its_arrays(sparse, seen):
+    mesh = builtin.sphere(rings=12, sectors=14)
+    matrices = harmonic.precompute(mesh, degree=1, size=SIZE, progress=False)
+    vectors = harmonic.precompute_diffuse(mesh, degree=1, size=SIZE, progress=False)
+    pyramids = lobe.compress(seen)
+    for value, field, axis in (
+        (sparse, "value", 1),
+        (matrices, "matrix", 0),
+        (vectors, "vector", 2),
+        (pyramids, "pyramid", 0),
+        (pyramids, "vector", 1),
+    ):
+        rows = np.concatenate(pieces(value, lambda part, field=field: getattr(part, field)), axis)
+        np.testing.assert_array_equal(rows, getattr(value, field))
+    texel = jnp.arange(5)
+    np.testing.assert_array_equal(
+        np.concatenate(pieces(seen, lambda part: part.visible(texel)), 1), seen.visible(texel)
+    )
+
+
+def test_ranges_beyond_the_vertices_empty_or_within_a_block_are_refused(sparse, seen):
+    for start, stop in ((0, 157), (5, 5), (-1, 4), (9, 3)):
+        with pytest.raises(ValueError, match=f"the range must be within 156 vertices, got {start} to {stop}"):
+            ranges.take(sparse, start, stop)
+    with pytest.raises(ValueError, match="must begin at a multiple of 64 vertices, got 5"):
+        ranges.take(seen, 5, 70)
+    assert ranges.take(sparse, 5, 70).position.shape == (65, 3)
+
+
+def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
+    clustered = separable.clustered.precompute(seen, brdf, progress=False, keep=20)
+    for value, name in ((brdf, "SeparableBrdf"), (clustered, "ClusteredTransport")):
+        with pytest.raises(TypeError, match=f"has vertices and no clusters, got {name}"):
+            ranges.take(value, 0, 3)
