@@ -27,6 +27,7 @@ MOST_ERROR = {
     "interreflection": 0.65,
     "inverse": 0.1,
     "lobes": 0.15,
+    "million": 1e-5,
     "pictures": 0.6,
     "precompute_separable": 3e-3,
     "rasterize": 0.03,  # of the coverage at edges

@@ -164,16 +164,15 @@ class BlockStore:
         their own: pages are read when they are first used. Others are gathered into memory.
         """
         at = self._layout[name]
-        shape = _stored(at, self._blocks)
-        found = mapped.open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)
         if not at.axis:
-            return found[:count]
-        size = at.shape[at.axis]
+            shape = _stored(at, self._blocks)
+            return mapped.open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)[:count]
+        size, before = at.shape[at.axis], (slice(None),) * at.axis
         result = mapped.empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
         for block in range(self._blocks):
             first = block * size
-            place = (slice(None),) * at.axis
-            result[(*place, slice(first, first + size))] = found[block][(*place, slice(count - first))]
+            found = self._get(name, block, at.shape, at.dtype)
+            result[(*before, slice(first, first + size))] = found[(*before, slice(count - first))]
         return result
 
     def _put(self, name: str, block: int, value: np.ndarray) -> None:

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +28,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*"),
 ]
 WORKERS = 4
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,33 @@ class Dawdling(_Job):
         return super().run(block)
 
 
-def started():
-    """Four worker processes, and a client."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Dask warns of ports, and of packages that it would like.
-        cluster = distributed.LocalCluster(
-            n_workers=WORKERS, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=50
-        )
-        return cluster, distributed.Client(cluster)
+class Cluster:
+    """A scheduler and four workers, each a process, and a client."""
+
+    def __init__(self, folder):
+        self.file = str(folder / "scheduler.json")
+        place = ["--scheduler-file", self.file, "--no-dashboard"]
+        self.scheduler = self._start("scheduler", *place, "--port", "0")
+        worker = [*place, "--nthreads", "1", "--no-nanny", "--local-directory", str(folder), "--death-timeout", "10"]
+        self.workers = [self._start("worker", *worker) for _ in range(WORKERS)]
+        while not os.path.exists(self.file):
+            time.sleep(0.05)
+        self.client = distributed.Client(scheduler_file=self.file)
+        self.client.wait_for_workers(WORKERS)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for each in (*self.workers, self.scheduler):
+            each.kill()
+            each.wait()
+        self.client.close(timeout=1)
+        os.unlink(self.file)
+
+    def _start(self, kind, *options):
+        command = [sys.executable, "-W", "ignore", "-m", f"distributed.cli.dask_{kind}", *options]
+        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
 
 
 def after(store, blocks, action):
@@ -78,31 +97,20 @@ def test_a_killed_worker_a_slow_one_and_a_scheduler_that_starts_again_leave_the_
     path, blocks = tmp_path / "a.prt", -(-job.vertices // job.step)
     store = BlockStore(path, job.header, job.layout, blocks, job.near)
 
-    cluster, client = started()
-    try:
-        victim = next(iter(cluster.workers.values())).pid
-        killing = after(store, blocks // 4, lambda: os.kill(victim, signal.SIGKILL))
-        dropping = after(store, blocks // 2, client.restart)
-        told = None
-        try:
-            visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False)
-        except RuntimeError as error:
-            told = str(error)
-        killing.join()
-        dropping.join()
-        assert told is None or f"they are kept in {path}: call again to go on" in told
-    finally:
-        client.close()
-        cluster.close()
-
-    kept = int(store.written().sum())
-    assert kept >= blocks // 2
-    cluster, client = started()
-    try:
-        result = visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False)
-    finally:
-        client.close()
-        cluster.close()
+    with Cluster(tmp_path) as cluster:
+        accidents = [
+            after(store, blocks // 4, cluster.workers[0].kill),
+            after(store, blocks // 2, cluster.scheduler.kill),
+        ]
+        with pytest.raises(
+            RuntimeError, match=r"a worker died after .* they are kept in .*a\.prt: call again to go on"
+        ):
+            visibility.blocks.compute(job, path=path, executor=cluster.client.get_executor(), progress=False)
+        for each in accidents:
+            each.join()
+    assert blocks // 2 <= store.written().sum() < blocks
+    with Cluster(tmp_path) as cluster:
+        result = visibility.blocks.compute(job, path=path, executor=cluster.client.get_executor(), progress=False)
     np.testing.assert_array_equal(result["level"], alone.level)
     assert (tmp_path / "turtle").exists()
 
@@ -136,3 +144,25 @@ def test_processes_that_share_nothing_but_a_folder_make_the_whole(tmp_path):
         patch.setattr(_Job, "run", None)  # Nothing is computed again.
         found = visibility.precompute(mesh, size=8, path=path, progress=False)
     np.testing.assert_array_equal(found.level, alone.level)
+
+
+OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
+
+
+@pytest.mark.long
+def test_the_examples_run_here(tmp_path):
+    (tmp_path / "mesh.obj").write_text(OBJ)
+    (tmp_path / "sbatch").write_text('#!/bin/bash\necho "${@: -1}" > wrapped\n')  # Slurm would run its last word.
+    (tmp_path / "sbatch").chmod(0o755)
+    folders = [str(tmp_path), str(pathlib.Path(sys.executable).parent), os.environ["PATH"]]
+    path = {**os.environ, "PATH": ":".join(folders), "PYTHONPATH": str(ROOT)}
+    both = {"cwd": tmp_path, "check": True, "capture_output": True, "text": True}
+    for task in ("2", "1"):
+        slurm = {"SLURM_ARRAY_TASK_ID": task, "SLURM_ARRAY_TASK_COUNT": "2", "SLURM_ARRAY_JOB_ID": "7"}
+        command = ["bash", str(ROOT / "examples" / "slurm_array.sh"), "mesh.obj", "shared"]
+        done = subprocess.run(command, env=path | slurm, **both)
+    assert "all parts are done" in done.stdout
+    assert (tmp_path / "wrapped").read_text() == "python -m jaxprt --mesh mesh.obj --output shared --system lobe \n"
+    command = ["python", str(ROOT / "examples" / "cluster.py"), "mesh.obj", "scene"]
+    subprocess.run([sys.executable, *command[1:]], env=path, **both)
+    assert len(prt.files.load(tmp_path / "scene.saved").scene.parts) == 1
