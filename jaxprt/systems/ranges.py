@@ -59,7 +59,8 @@ def _part(axes: list[str], leaf: Any, start: int, stop: int) -> Any:
 def _leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
     """The leaves, in order, each with the names of its axes by the annotation of the field that holds it."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
-        hint, node = None, value  # type: Any, Any
+        hint: Any = None
+        node: Any = value
         for key in path:
             if isinstance(key, jax.tree_util.GetAttrKey) and dataclasses.is_dataclass(node):
                 hint = {each.name: each.type for each in dataclasses.fields(node)}[key.name]
