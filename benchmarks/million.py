@@ -5,7 +5,7 @@
 The mesh is two scans of JAXPRT_DATA beside each other, simplified and then subdivided to 10,000, 100,000 and 1,000,000
 vertices, or a sphere without them. Each count has a process of its own, whose `peak_bytes` are those beyond the mesh's
 `mesh_bytes`, JAX and all else included that was there before. Precomputation is that of the separable system into a
-store, at 6 x 8 x 8 texels so that it ends in minutes; memory depends on the texels by a block alone, as the last case
+store, at 6 x 4 x 4 texels so that it ends in minutes; memory depends on the texels by a block alone, as the last case
 shows: a two-hundredth of the visibility of the largest mesh at 6 x 64 x 64. The error of precomputation is against
 some vertices computed alone, without a store.
 
@@ -37,7 +37,7 @@ from jaxprt.systems import ranges
 
 SCANS = "dragon_100k", "happy_buddha_100k"
 COUNTS = 10_000, 100_000, 1_000_000
-SIZE, FINE, TERMS, KEEP = 8, 64, 4, 16
+SIZE, FINE, TERMS, KEEP = 4, 64, 4, 16
 RANGE = 1 << 16
 PARTS = 200
 SAMPLE = 64
