@@ -87,7 +87,7 @@ def load(path: str | os.PathLike) -> Any:
     Returns:
         The object. Arrays that were on a device are on the default device, and NumPy arrays are NumPy arrays. On CPUs
         the former are maps of their files, which take memory only where they are used: an object larger than the memory
-        can be loaded, and `jaxprt.systems.ranges.vertices` takes a range of its vertices. The files may be deleted
+        can be loaded, and `jaxprt.systems.ranges.take` takes a range of its vertices. The files may be deleted
         meanwhile, but must not be changed.
 
     Raises:

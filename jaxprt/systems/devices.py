@@ -4,9 +4,7 @@ Fields of the package's classes say what their axes are. Arrays of vertices are 
 clusters of vertices along ``p`` or ``g``; all else lies whole on every device. The same functions then run on it.
 """
 
-import dataclasses
-import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -19,12 +17,13 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
+from jaxprt.systems.axes import leaves
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility.rays import BLOCK
 
 Laid = TypeVar("Laid", bound=PyTree)
 
-_AXES = "v", "pair", "p", "g"  # vertices, pairs of them, clusters of them
+_AXES = "v", "block", "p", "g"  # vertices, blocks of them, clusters of them
 
 
 class Padded(System):
@@ -98,17 +97,17 @@ def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignor
             do not divide.
     """
     across = _mesh(devices)
-    if not any(_axis(hint, leaf, "v") is not None for hint, leaf in _leaves(value)):
+    if not any("v" in axes for axes, _ in leaves(value)):
         raise TypeError(f"only transports, systems and scenes of jaxprt have vertices, got {type(value).__name__}")
     even = jax.tree.map(lambda each: _even(each, across.size), value, is_leaf=lambda x: isinstance(x, VertexSystem))
     if not isinstance(value, System):
         _check_shares(value, across.size)
     made: dict[int, Any] = {}  # What is held twice stays one array.
-    leaves = list(_leaves(even))
-    for hint, leaf in leaves:
+    every = list(leaves(even))
+    for axes, leaf in every:
         if id(leaf) not in made:
-            made[id(leaf)] = _put(hint, leaf, across)
-    return jax.tree.unflatten(jax.tree.structure(even), [made[id(leaf)] for _, leaf in leaves])
+            made[id(leaf)] = _put(axes, leaf, across)
+    return jax.tree.unflatten(jax.tree.structure(even), [made[id(leaf)] for _, leaf in every])
 
 
 def _mesh(devices: Any) -> jax.sharding.Mesh:
@@ -120,85 +119,39 @@ def _mesh(devices: Any) -> jax.sharding.Mesh:
 
 def _even(value: Any, shares: int) -> Any:
     """A system whose vertices divide."""
-    if not isinstance(value, VertexSystem) or value.points is not None or value.vertices % shares == 0:
+    if not isinstance(value, VertexSystem) or value.points is not None:
         return value
+    step = shares * (BLOCK if any("block" in axes for axes, _ in leaves(value)) else 1)
     count = value.vertices
-    return Padded(_padded(value, count, count + -count % shares), count)
+    return value if count % step == 0 else Padded(_padded(value, count, count + -count % step), count)
 
 
 def _padded(value: Laid, count: int, size: int) -> Laid:
     """What has so many vertices, with more that repeat the last."""
 
-    def longer(hint: Any, leaf: Any) -> Any:
-        for name, before, after in (("v", count, size), ("pair", _pairs(count), _pairs(size))):
-            axis = _axis(hint, leaf, name)
-            if axis is not None and leaf.shape[axis] == before:
-                return jnp.pad(leaf, [(0, after - before if n == axis else 0) for n in range(leaf.ndim)], mode="edge")
+    def longer(axes: list[str], leaf: Any) -> Any:
+        for name, before, after in (("v", count, size), ("block", -(-count // BLOCK), -(-size // BLOCK))):
+            if name in axes and leaf.shape[axes.index(name)] == before:
+                return jnp.pad(leaf, [(0, after - before if each == name else 0) for each in axes], mode="edge")
         return leaf
 
-    return jax.tree.unflatten(jax.tree.structure(value), [longer(*each) for each in _leaves(value)])
-
-
-def _pairs(vertices: int) -> int:
-    """Bytes that `StoredVisibility` has for so many vertices."""
-    return -(-vertices // BLOCK) * BLOCK // 2
-
-
-def _leaves(value: PyTree) -> Iterator[tuple[Any, Any]]:
-    """The leaves, in order, each with the annotation of the field that holds it; None where none does."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(value):
-        yield _hint(value, path), leaf
-
-
-def _hint(node: Any, path: Sequence[Any]) -> Any:
-    """The annotation of the last field on a path."""
-    hint = None
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey) and dataclasses.is_dataclass(node):
-            hint = {each.name: each.type for each in dataclasses.fields(node)}[key.name]
-            node = getattr(node, key.name)
-        elif isinstance(key, jax.tree_util.SequenceKey):
-            node = node[key.idx]
-        elif isinstance(key, jax.tree_util.DictKey):
-            node = node[key.key]
-        else:  # of a class that is not the package's
-            return None
-    return hint
-
-
-def _axis(hint: Any, leaf: Any, name: str) -> int | None:
-    """Which axis of an array is called so by the annotation of its field; None if none is."""
-    if not isinstance(leaf, jax.Array | np.ndarray):
-        return None
-    for names in _names(hint):
-        if name in names and len(names) == leaf.ndim:
-            return names.index(name)
-    return None
-
-
-def _names(hint: Any) -> Iterator[list[str]]:
-    """Names of axes that an annotation has."""
-    if hasattr(hint, "dim_str"):
-        yield hint.dim_str.split()
-    for each in typing.get_args(hint):
-        yield from _names(each)
+    return jax.tree.unflatten(jax.tree.structure(value), [longer(*each) for each in leaves(value)])
 
 
 def _check_shares(value: PyTree, shares: int) -> None:
     """Refuses a transport whose vertices do not divide."""
-    for hint, leaf in _leaves(value):
-        axis = _axis(hint, leaf, "v")
-        if axis is not None and leaf.shape[axis] % shares:
+    for axes, leaf in leaves(value):
+        if "v" in axes and leaf.shape[axes.index("v")] % shares:
             raise ValueError(
-                f"the transport's {leaf.shape[axis]} vertices must divide by {shares} devices; "
+                f"the transport's {leaf.shape[axes.index('v')]} vertices must divide by {shares} devices; "
                 "lay a system over them, which may have any number"
             )
 
 
-def _put(hint: Any, leaf: Any, across: jax.sharding.Mesh) -> Any:
+def _put(axes: list[str], leaf: Any, across: jax.sharding.Mesh) -> Any:
     if not isinstance(leaf, jax.Array):  # Numbers and tables of the host stay there.
         return leaf
-    axes = [axis for name in _AXES if (axis := _axis(hint, leaf, name)) is not None and leaf.shape[axis]]
-    cut = [axis for axis in axes if leaf.shape[axis] % across.size == 0][:1]
-    spec = PartitionSpec(*("vertex" if n in cut else None for n in range(leaf.ndim)))
+    cut = [name for name in _AXES if name in axes and leaf.shape[axes.index(name)]]
+    cut = [name for name in cut if leaf.shape[axes.index(name)] % across.size == 0][:1]
+    spec = PartitionSpec(*("vertex" if name in cut else None for name in axes))
     return jax.device_put(leaf, NamedSharding(across, spec))

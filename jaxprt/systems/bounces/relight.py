@@ -143,7 +143,7 @@ def arriving(
     return _arriving(transport, tensor, light, weight)
 
 
-@jax.jit
+@jit
 def _arriving(transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight) -> tuple[Arriving, ...]:
     whole = collect(tensor, light, weight)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
@@ -225,7 +225,7 @@ def view_side(
     return _view_side(transport, surfaces, eye, points)
 
 
-@jax.jit
+@jit
 def _view_side(transport: DynamicTransport, surfaces, eye: Array, points) -> tuple[ReflectedView, ...]:
     result = []
     for own, each, at in zip(transport.region, surfaces, points or [None] * len(surfaces), strict=True):

@@ -190,7 +190,7 @@ def view_side(
     return _view_side(transport, brdfs, materials, eye, points)
 
 
-@jax.jit
+@jit
 def _view_side(transport: DynamicTransport, brdfs, materials, eye: Array, points) -> DynamicView:
     region = []
     several = [None] * len(transport.region) if points is None else points
@@ -233,7 +233,7 @@ def _mix(transport: DynamicTransport, brdfs, materials, points: Sequence[Points 
     return tuple(result)
 
 
-@partial(jax.jit, static_argnames=("samples",))
+@partial(jit, static_argnames=("samples",))
 def combine(
     transport: DynamicTransport, light: DynamicLight, view: DynamicView, *, samples: int = 1
 ) -> Float[Array, "v c"]:

@@ -160,7 +160,7 @@ def view_lobes(
     return _view_lobes(transport, brdf, parameter, eye, points)
 
 
-@jax.jit
+@jit
 def _view_lobes(
     transport: LobeTransport, brdf: LobeBrdf, parameter: tuple[Array, ...], eye: Array, points: Points | None
 ) -> LobeView:
