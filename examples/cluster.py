@@ -7,6 +7,7 @@ Workers write what they compute into the folder themselves if they see it; witho
 process. Stop the script, or lose workers, whenever you like: the same command goes on from there.
 """
 
+import pathlib
 import sys
 
 import distributed
@@ -28,6 +29,9 @@ def cluster():
 
 def main(mesh: str, folder: str) -> None:
     """Makes the scene ready; without `system` a plan would be made first, on this machine."""
+    if pathlib.Path(f"{folder}.saved").exists():
+        print(f"{folder}.saved is finished")
+        return
     with cluster() as workers, distributed.Client(workers) as client:
         relit = prt.precompute(prt.load_scene(mesh), system="lobe", path=folder, executor=client.get_executor())
     prt.files.save(f"{folder}.saved", relit)

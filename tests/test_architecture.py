@@ -27,8 +27,14 @@ ROOMS = ["__main__", "cli", "inverse", "relit", "systems", "image", "visibility"
 ROOMS += ["decompose", "sphere", "files", "compile", "require"]
 
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.
-LADDER = [{"bounces"}, {"dynamic"}, {"separable", "lobe"}, {"harmonic"}, {"reference", "bright_texels", "devices"}]
-LADDER += [{"adaptive", "protocol", "ranges"}, {"axes"}]
+LADDER = [
+    {"bounces", "ranges"},
+    {"dynamic"},
+    {"separable", "lobe"},
+    {"harmonic"},
+    {"reference", "bright_texels", "devices"},
+]
+LADDER += [{"adaptive", "protocol"}, {"axes"}]
 RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 
 # Libraries that only some modules touch: everything that reads files, and the rays.

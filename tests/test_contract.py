@@ -64,6 +64,8 @@ HOST = {
     "visibility.blocks": "runs workers and writes files",
     "visibility.refinement": "traces rays, and chooses by values",
     "systems.separable.wavelets.precompute": "traces rays",
+    "systems.axes": "reads annotations",
+    "systems.ranges": "cuts objects",
     "visibility.stored.precompute": "traces rays",
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",

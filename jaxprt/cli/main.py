@@ -148,9 +148,9 @@ def _check(options: argparse.Namespace) -> None:
 
 def _part(text: str | None) -> blocks.Part | None:
     """The part K/N of all blocks that is asked for; None for all of them."""
-    number, _, count = (text or "1/1").partition("/")
+    number, _, count = ("1/1" if text is None else text).partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise ValueError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
+        raise ValueError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text!r}")
     return None if text is None else blocks.Part(int(number), int(count))
 
 

@@ -28,6 +28,7 @@ VERSION = 4
 _FORMAT = "jaxprt blocks"
 _HEADER = "store.json"
 _CHECKSUM = "checksum"
+_PATIENCE = 2.0  # seconds
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SUMS = 32
 _PART = 1 << 20  # values that are summed at a time
@@ -104,12 +105,14 @@ class BlockStore:
                 # Writers of other parts of the same number have other blocks; all others may have the same ones.
                 for other in self.path.glob(".lock.*-of-*"):
                     if not other.name.endswith(f"-of-{count}"):
-                        with filelock.FileLock(other, timeout=0):
+                        # Another writer may be looking at it in the same way, for an instant.
+                        with filelock.FileLock(other, timeout=_PATIENCE):
                             pass
                 yield
         except filelock.Timeout:
+            what = "" if count == 1 else f", or part {number}/{count} of it runs already"
             raise BlockingIOError(
-                f"{self.path} is being written by another process; wait for it or name another path"
+                f"{self.path} is being written by another process{what}; wait for it or name another path"
             ) from None
 
     def write(self, block: int, array: Mapping[str, np.ndarray]) -> None:
@@ -125,7 +128,7 @@ class BlockStore:
         try:
             for name, each in value.items():
                 self._put(name, block, each)
-            self._put(_CHECKSUM, block, np.array(_checksum(value), np.uint32))
+            self._put(_CHECKSUM, block, np.array(self._checksum(block, value), np.uint32))
         except OSError as error:
             if error.errno not in _FULL:
                 raise
@@ -143,7 +146,7 @@ class BlockStore:
             array = {name: self._get(name, block, at.shape, at.dtype) for name, at in self._layout.items()}
         except (EOFError, OSError):
             return None
-        return array if _checksum(array) == expected else None
+        return array if self._checksum(block, array) == expected else None
 
     def written(self) -> np.ndarray:
         """Which blocks have a checksum, as a mask; whether it is right only `read` knows."""
@@ -151,7 +154,8 @@ class BlockStore:
         try:
             with (self.path / f"{_CHECKSUM}.npy").open("rb") as file:
                 file.seek(self._offset[_CHECKSUM])
-                there = np.frombuffer(file.read(found.nbytes // 4 * 4), np.uint32)
+                data = file.read(found.nbytes)
+                there = np.frombuffer(data[: len(data) // 4 * 4], np.uint32)
         except OSError:
             return found > 0
         found[: len(there)] = there
@@ -174,6 +178,13 @@ class BlockStore:
             found = self._get(name, block, at.shape, at.dtype)
             result[(*before, slice(first, first + size))] = found[(*before, slice(count - first))]
         return result
+
+    def _checksum(self, block: int, array: Mapping[str, np.ndarray]) -> int:
+        """CRC-32 of a block in its place in this store; never 0, which stands for not written."""
+        value = zlib.crc32(f"{self._key} {block}".encode())
+        for name in sorted(array):
+            value = zlib.crc32(array[name].reshape(-1).view(np.uint8).data, value)
+        return value or 1
 
     def _put(self, name: str, block: int, value: np.ndarray) -> None:
         """Writes a block of one array; the file is closed, so that other machines see it."""
@@ -301,11 +312,3 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
 def _stored(at: Layout, blocks: int) -> tuple[int, ...]:
     """Shape of an array's file: of the array itself where blocks follow each other in memory too."""
     return (blocks, *at.shape) if at.axis else (blocks * at.shape[0], *at.shape[1:])
-
-
-def _checksum(array: Mapping[str, np.ndarray]) -> int:
-    """CRC-32 of a block, never 0, which stands for not written."""
-    value = 0
-    for name in sorted(array):
-        value = zlib.crc32(array[name].reshape(-1).view(np.uint8).data, value)
-    return value or 1

@@ -6,6 +6,7 @@ multiple of 64 bytes; on other devices it copies.
 """
 
 import mmap
+import os
 import weakref
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -48,12 +49,13 @@ def open_array(path: Path, offset: int, shape: tuple[int, ...], dtype: str) -> n
         return np.zeros(shape, dtype)
     end = offset + int(np.prod(shape)) * np.dtype(dtype).itemsize
     with path.open("rb") as file:
+        status = os.fstat(file.fileno())
         try:
             memory = mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ)
         except ValueError as error:
             raise ValueError(f"{path} must have {end} bytes, got {path.stat().st_size}: it is cut off") from error
     result = np.frombuffer(memory, dtype, int(np.prod(shape)), offset).reshape(shape)
-    _maps[result.ctypes.data] = str(path.absolute()), offset
+    _maps[result.ctypes.data] = str(path.absolute()), offset, (status.st_dev, status.st_ino)
     weakref.finalize(memory, _maps.pop, result.ctypes.data)
     return result
 
@@ -86,12 +88,24 @@ class Reference(NamedTuple):
 
 
 def reference(array: np.ndarray) -> np.ndarray | Reference:
-    """A reference to the file of which an array is a map from its first value on; the array itself if it is none."""
+    """A reference to the file of which an array is a map from its first value on.
+
+    The array itself if it is no map, or if the file is not there any more or was replaced by another.
+    """
     found = _maps.get(array.ctypes.data) if array.size and array.flags.c_contiguous else None
-    return array if found is None else Reference(*found, array.shape, array.dtype.str)
+    if found is None:
+        return array
+    path, offset, file = found
+    try:
+        status = os.stat(path)
+    except OSError:
+        return array
+    same = (status.st_dev, status.st_ino) == file
+    return Reference(path, offset, array.shape, array.dtype.str) if same else array
 
 
-_maps: dict[int, tuple[str, int]] = {}  # files and first bytes of living maps, by their addresses
+# Files, first bytes, and devices and numbers of these files, of living maps, by their addresses.
+_maps: dict[int, tuple[str, int, tuple[int, int]]] = {}
 
 
 def empty(shape: tuple[int, ...], dtype: str) -> np.ndarray:

@@ -3,6 +3,7 @@
 import abc
 import collections
 import hashlib
+import operator
 import os
 import pickle
 import queue
@@ -72,10 +73,12 @@ class Part(ThreadPoolExecutor):
         count: Number of parts.
 
     Raises:
+        TypeError: Numbers that are not whole.
         ValueError: No such part.
     """
 
     def __init__(self, number: int, count: int):
+        number, count = operator.index(number), operator.index(count)
         if not 1 <= number <= count:
             raise ValueError(f"the part must be from 1/{count} to {count}/{count}, got {number}/{count}")
         super().__init__(cores())

@@ -119,7 +119,8 @@ def precompute(
 
 def _unpack(pair: UInt8[Array, "g t w"]) -> UInt8[Array, "t v"]:
     """Levels in sixteenths, two to each byte."""
-    level = jnp.concatenate([pair & 15, pair >> 4], 2).swapaxes(0, 1).reshape(pair.shape[1], -1)
+    level = jnp.concatenate([pair & 15, pair >> 4], 2).swapaxes(0, 1)
+    level = level.reshape(pair.shape[1], pair.shape[0] * rays.BLOCK)
     return level + (level > _MIDDLE)
 
 

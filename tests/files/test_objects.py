@@ -67,7 +67,7 @@ def value(hint, random, name=""):
     plain = {int: 3, float: 0.1, str: "name", np.ndarray: np.arange(3), typing.Any: {"a": [1.5, None, (True,)]}}
     if hint in plain:
         return plain[hint]
-    if hint is prt.System:
+    if hint in (prt.System, prt.systems.protocol.VertexSystem):
         hint = prt.harmonic.DiffuseSystem  # Any system will do.
     if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
         return filled(hint, random)

@@ -2,13 +2,14 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxprt as prt
 from jaxprt import harmonic, lobe, separable, visibility
-from jaxprt.scene import builtin
+from jaxprt.scene import Environment, builtin
 from jaxprt.systems import ranges
 
 SIZE = 8
@@ -79,5 +80,25 @@ def test_ranges_beyond_the_vertices_empty_or_within_a_block_are_refused(sparse, 
 def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
     clustered = separable.clustered.precompute(seen, brdf, progress=False, keep=20)
     for value, name in ((brdf, "SeparableBrdf"), (clustered, "ClusteredTransport")):
-        with pytest.raises(TypeError, match=f"has vertices and no clusters, got {name}"):
+        with pytest.raises(TypeError, match=f"ranges are of .*, got {name}"):
             ranges.take(value, 0, 3)
+
+
+def test_ranges_of_transport_with_its_transpose_have_the_gradients_of_their_rows(sparse, brdf, close):
+    light = builtin.daylight(size=SIZE)
+
+    def slope(transport, rows):
+        system = separable.SeparableSystem(transport, brdf)
+        return jax.grad(lambda r: jnp.sum(prt.radiance(system, Environment(r), eye=EYE)[rows] ** 2))(light.radiance)
+
+    part = ranges.take(sparse.with_transpose(), 64, 128)
+    close(slope(part, slice(None)), slope(sparse, slice(64, 128)), tolerance=1e-4)
+
+
+def test_what_is_no_system_of_one_mesh_has_no_ranges(sparse, brdf):
+    mesh = builtin.sphere(rings=12, sectors=14)
+    system = separable.SeparableSystem(sparse, brdf)
+    points = prt.scene.points.on_triangles(mesh.face, np.array([0, 1]), np.full((2, 3), 1 / 3, np.float32))
+    for value in (mesh, prt.systems.protocol.Joined((system, system)), system.at(points)):
+        with pytest.raises(TypeError, match="ranges are of"):
+            ranges.take(value, 0, 2)

@@ -288,7 +288,7 @@ def _edge(width: float, size: int, *, least: int) -> int:
     return edge
 
 
-def _blurs(radiance: Float[Array, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
+def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
     """For each width the texels [tile, m, face] that make a tile of the blurred faces, and their weights [tile, o, m].
 
     What is blurred is made in tiles, so that a small dense product makes each, and weights are the same on all faces.
