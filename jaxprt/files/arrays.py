@@ -216,7 +216,7 @@ def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
         The tolerance, the norm and the sums.
     """
     flat = np.asarray(array).reshape(-1)
-    sign = _signs()
+    sign = _signs(2 * _PART)
     total, square = np.zeros(_SUMS), 0.0
     for number, first in enumerate(range(0, len(flat), _PART)):
         part = flat[first : first + _PART].astype(np.float64)
@@ -228,9 +228,9 @@ def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
 
 
 @functools.cache
-def _signs() -> np.ndarray:
+def _signs(count: int) -> np.ndarray:
     """The signs of all sketches; making them takes longer than most sums."""
-    return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), 2 * _PART)
+    return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), count)
 
 
 def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
