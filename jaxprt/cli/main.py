@@ -150,7 +150,7 @@ def _part(text: str | None) -> blocks.Part | None:
     """The part K/N of all blocks that is asked for; None for all of them."""
     number, _, count = ("1/1" if text is None else text).partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise ValueError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text!r}")
+        raise ValueError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
     return None if text is None else blocks.Part(int(number), int(count))
 
 
