@@ -56,7 +56,7 @@ class Maker:
         self.random = np.random.default_rng(0)
 
     def normal(self, *shape: int) -> jax.Array:
-        """Of any sign, around 1."""
+        """Random values of either sign, of the order of 1."""
         return jnp.asarray(self.random.standard_normal(shape, np.float32))
 
     def half(self, *shape: int) -> jax.Array:

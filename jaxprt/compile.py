@@ -32,7 +32,7 @@ def jit(function: Callable, **options: Any) -> Any:
     Holds for whatever the function calls while it is traced, BRDFs of users included, and for its derivatives.
 
     Args:
-        function: Of arrays and pytrees of them.
+        function: A function whose arguments are arrays and pytrees of arrays.
         options: As `jax.jit` has them.
     """
     return jax.jit(_exact(function), **options)
@@ -51,7 +51,7 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
     """Decorates a step that is compiled by itself: like `jit`, and on CPUs also where another program holds it.
 
     Args:
-        function: Of arrays and pytrees of them, and of static options by name.
+        function: A function whose arguments are arrays and pytrees of arrays; static options are passed by name.
         static: Names of the options.
     """
     compiled = jit(function, static_argnames=static)

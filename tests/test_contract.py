@@ -206,7 +206,7 @@ class Draw:
         return jax.device_put(np.asarray(value, jnp.result_type(float)))
 
     def normal(self, *shape):
-        """Of any sign, around 1."""
+        """Random values of either sign, of the order of 1."""
         return self.array(self.random.normal(size=shape))
 
     def uniform(self, *shape, low=0.1, high=0.9):

@@ -67,7 +67,7 @@ class Reference(NamedTuple):
         path: The file, by its whole path.
         offset: First byte.
         shape: Shape of the array.
-        dtype: Its type.
+        dtype: Element type of the array, as NumPy names it.
     """
 
     path: str

@@ -44,7 +44,7 @@ class Narrow(eqx.Module):
         Args:
             pixel: From the number of a pixel of a patch to its sample in each patch, and the depth there.
             count: Number of pixels of a patch.
-            number: Of the triangle of each patch.
+            number: The number of the triangle that each patch belongs to.
         """
 
         def one(nearest, k):

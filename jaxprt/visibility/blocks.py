@@ -85,7 +85,7 @@ class Part(ThreadPoolExecutor):
         self.number, self.count = number, count
 
     def of(self, blocks: int) -> range:
-        """Its blocks: neighbors, so that writers rarely meet in a file."""
+        """The blocks that this part computes. They are neighbors, so that two writers rarely meet in a file."""
         return range((self.number - 1) * blocks // self.count, self.number * blocks // self.count)
 
 

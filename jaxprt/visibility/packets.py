@@ -90,16 +90,7 @@ class Packets:
         point: Integer[np.ndarray, " n"],
         way: Integer[np.ndarray, " n"],
     ) -> Bool[np.ndarray, " n"]:
-        """Whether rays meet a triangle. Sixteen rays that follow each other should be near each other.
-
-        Releases the interpreter lock.
-
-        Args:
-            origin: Points.
-            direction: Directions.
-            point: The point from which each ray starts.
-            way: The direction in which it goes.
-        """
+        """Whether each ray meets a triangle: `Occluder.blocked`, which has the same arguments."""
         found = np.empty(len(point), np.bool_)
         _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
         return found
