@@ -4,8 +4,7 @@ GPUs round the factors of float32 products to ten bits unless told otherwise: `j
 for each of its uses where it fuses the two; gathers, and loops over vertices, are then done many times over. JAX makes
 gradients of linear maps by transposing what it was given, step by step; that of a gather is a scatter, which is five
 times as slow. `isolated` and `linear` are the cures, under all transformations. CPUs like loops whose steps stay in the
-cache, GPUs few kernels with much to do: `total` and `mapped` are such loops, each in the form that suits the device,
-by `by_platform`.
+cache, GPUs few kernels with much to do: `total` and `mapped` are such loops, each in the form that suits the device.
 """
 
 import functools
@@ -18,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.backend import backends
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
@@ -71,7 +69,7 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
         first = next(each for each in jax.tree.leaves((argument, named)) if each.size)
         # Branches are not fused with what is around them. CPUs' compiler does not see that this one is always taken;
         # others see it, and no branch is left.
-        taken = by_platform(
+        taken = jax.lax.platform_dependent(
             jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32), cpu=lambda x: (x | 1) != 0, default=_always
         )
         return jax.lax.cond(taken, own, never, argument, named)
@@ -89,25 +87,6 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
 def _always(_: Array) -> Array:
     return jnp.asarray(True)
-
-
-def by_platform(*argument: PyTree, cpu: Callable, default: Callable) -> Any:
-    """One function on CPUs, another elsewhere, chosen where the program is compiled.
-
-    In a process that has nothing but CPUs the other one is not traced: programs for GPUs are made where there is one.
-
-    Args:
-        argument: Arguments of both.
-        cpu: The form for CPUs.
-        default: The form for all other platforms, with the same results.
-    """
-    if _only_cpus():
-        return cpu(*argument)
-    return jax.lax.platform_dependent(*argument, cpu=cpu, default=default)
-
-
-def _only_cpus() -> bool:
-    return set(backends()) == {"cpu"}
 
 
 def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
@@ -132,7 +111,7 @@ def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
             return at_once(rest)
         return jax.lax.scan(lambda carry, rows: (carry + at_once(rows), None), at_once(rest), block)[0]
 
-    return by_platform(rows, cpu=by_row, default=by_block)
+    return jax.lax.platform_dependent(rows, cpu=by_row, default=by_block)
 
 
 def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
@@ -150,7 +129,7 @@ def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
     def by_block(rows):
         return jax.vmap(function)(rows) if most >= count else jax.lax.map(function, rows, batch_size=most)
 
-    return by_platform(rows, cpu=partial(jax.lax.map, function), default=by_block)
+    return jax.lax.platform_dependent(rows, cpu=partial(jax.lax.map, function), default=by_block)
 
 
 def _first(rows: PyTree) -> PyTree:

@@ -165,10 +165,7 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The programs of GPUs, run here: what depends on the platform takes the form for others than CPUs."""
-    from jaxprt import compile as compiled
-
     jax.clear_caches()
-    monkeypatch.setattr(compiled, "_only_cpus", lambda: False)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, default, **forms: default(*arguments))
     yield
     jax.clear_caches()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxprt import compile as compiled
-from jaxprt.compile import by_platform, isolated, jit, linear, mapped, total
+from jaxprt.compile import isolated, jit, linear, mapped, total
 
 
 def product(fixed, x):
@@ -182,7 +182,6 @@ def rows(x64):
 @pytest.mark.parametrize("form", ["cpu", "default"])
 def test_loops_give_the_same_in_the_form_of_every_device(form, room, rows, monkeypatch):
     monkeypatch.setattr(compiled, "_ROOM", room)  # All rows at once, some, or one.
-    monkeypatch.setattr(compiled, "_only_cpus", lambda: False)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, **forms: forms[form](*arguments))
     index, value, table = rows
     one = np.asarray(table)[index] * np.asarray(value)[..., None]
@@ -203,19 +202,7 @@ def test_loops_give_the_same_in_the_form_of_every_device(form, room, rows, monke
     assert not np.any(summed(index[:0], value[:0], table))
 
 
-def test_where_there_are_only_cpus_the_form_for_others_is_not_traced(monkeypatch):
-    def traced(cpus: bool) -> str:
-        monkeypatch.setattr(compiled, "_only_cpus", lambda: cpus)
-        return str(jax.make_jaxpr(lambda x: by_platform(x, cpu=jnp.sin, default=jnp.cos))(1.0))
-
-    assert "sin" in traced(True)
-    assert "cos" not in traced(True)
-    assert "sin" in traced(False)
-    assert "cos" in traced(False)
-
-
-def test_programs_for_gpus_have_no_loops_over_rows_no_branches_to_choose_and_exact_products(rows, loose, monkeypatch):
-    monkeypatch.setattr(compiled, "_only_cpus", lambda: False)
+def test_programs_for_gpus_have_no_loops_over_rows_no_branches_to_choose_and_exact_products(rows, loose):
     step = isolated(lambda x: jnp.sin(x) @ x.T)
 
     def both(index, value, table):

@@ -980,16 +980,6 @@ def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
         return result, lambda moving: program(moving, still)[0][0], moving, gradient
 
 
-@pytest.fixture(scope="module", autouse=True)
-def every_form():
-    """Functions are traced with their forms for GPUs too."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jaxprt.compile, "_only_cpus", lambda: False)
-        jax.clear_caches()
-        yield
-    jax.clear_caches()
-
-
 @each_pure
 def test_products_and_those_of_gradients_are_exact_on_gpus(name, loose):
     function, arrays, _ = single(name)

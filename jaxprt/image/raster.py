@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxprt.compile import by_platform, jit
+from jaxprt.compile import jit
 from jaxprt.image import depths
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
@@ -255,7 +255,7 @@ def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Arra
         nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
         return nearest.depth(x.dtype).reshape(shape), nearest.triangle().reshape(shape)
 
-    return by_platform(cpu=lambda: drawn(depths.Narrow), default=lambda: drawn(depths.Wide))
+    return jax.lax.platform_dependent(cpu=lambda: drawn(depths.Narrow), default=lambda: drawn(depths.Wide))
 
 
 def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:

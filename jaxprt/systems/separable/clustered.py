@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 
 from jaxprt import require, visibility
-from jaxprt.compile import by_platform, jit, linear, mapped
+from jaxprt.compile import jit, linear, mapped
 from jaxprt.decompose import eigen
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.files.mapped import Reference, reference
@@ -133,7 +133,7 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
 
     start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
     clusters = (transport.mode, transport.core, transport.weight, light)
-    result = by_platform(
+    result = jax.lax.platform_dependent(
         (at, clusters),
         cpu=lambda each: jax.lax.scan(lambda out, row: (written(out, row[0], one(row[1])), None), start, each)[0],
         default=lambda each: written(start, each[0], mapped(one, each[1])),
