@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -22,6 +21,7 @@ from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.systems import reference
+from jaxprt.visibility import blocks
 
 _SIDE = 4  # places along the edge of a pixel
 _MOST = 1 << 14  # points of a picture to look at: half a minute of two cores
@@ -208,8 +208,7 @@ def _sum(
         return np.asarray(reference.radiance(mesh, model, lights, progress=told, **where, **options))
 
     count = len(place)
-    cores = os.cpu_count() or 1
-    parts = np.array_split(np.arange(count), min(cores, max(count // 64, 1)))
+    parts = np.array_split(np.arange(count), min(blocks.cores(), max(count // 64, 1)))
     # The threads of numpy's products would wait by spinning.
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
         return np.concatenate(list(pool.map(some, range(len(parts)), parts)), 1)

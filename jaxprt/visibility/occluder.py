@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Integer
 from jaxprt.scene.mesh import Mesh
 
 _NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
+_SMALLEST, _LARGEST = 1e-12, 1e13  # diagonals between which Embree's products of three lengths stay within float32
 
 
 class Occluder:
@@ -20,7 +21,8 @@ class Occluder:
         mesh: The triangles; those of zero area cast nothing.
 
     Raises:
-        ValueError: No triangles, positions that are not finite, or faces that name missing vertices.
+        ValueError: No triangles, positions that are not finite, faces that name missing vertices, or a size at which
+            float32 loses triangles.
     """
 
     def __init__(self, mesh: Mesh):
@@ -29,7 +31,11 @@ class Occluder:
         self.face = np.asarray(mesh.face, np.int32)
         used = self.position[self.face.ravel()]
         low, high = used.min(0), used.max(0)
-        self.diagonal = float(np.linalg.norm(high - low)) or 1.0
+        self.diagonal = float(np.linalg.norm(high.astype(np.float64) - low)) or 1.0
+        if not _SMALLEST <= self.diagonal <= _LARGEST:
+            raise ValueError(
+                f"what casts shadows must be {_SMALLEST:g} to {_LARGEST:g} units across, got {self.diagonal:.3g}: scale it"
+            )
         # Far from the origin float32 itself is coarser than the share of the diagonal.
         self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
         self._building = threading.Lock()

@@ -6,7 +6,6 @@ mean squared difference; triangles with the largest parts are divided first.
 """
 
 import bisect
-import os
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +19,7 @@ from jaxprt.scene import light_samples, subdivision
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.subdivision import Division, Edges
+from jaxprt.visibility import blocks
 from jaxprt.visibility.diffuse import DiffuseTracer
 
 _DIRECTIONS = 1024  # to each light: penumbrae have steps of a thousandth of its power
@@ -99,7 +99,7 @@ def divisions(
     result: list[Division] = []
     with (
         threadpool_limits(limits=1, user_api="blas"),
-        ThreadPoolExecutor(os.cpu_count()) as pool,
+        ThreadPoolExecutor(blocks.cores()) as pool,
         tqdm.tqdm(desc="refine", unit="vertex", unit_scale=True, disable=not progress) as bar,
     ):
         surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points)

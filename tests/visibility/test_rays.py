@@ -209,6 +209,12 @@ def test_scaling_leaves_visibility_as_it_is(make, scale):
     assert difference(trace(moved(mesh, scale=scale)), trace(mesh)) < RESAMPLED
 
 
+@pytest.mark.parametrize("scale", [1e-13, 1e14, 1e30])
+def test_sizes_at_which_triangles_get_lost_are_refused(scale):
+    with pytest.raises(ValueError, match=r"must be 1e-12 to 1e\+13 units across, got 6\.07e.*: scale it"):
+        trace(moved(scene(), scale=scale))
+
+
 @pytest.mark.parametrize("make", [scene, torus])
 def test_moving_a_thousand_sizes_away_leaves_visibility_nearly_as_it_is(make):
     mesh = make()
