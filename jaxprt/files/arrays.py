@@ -296,8 +296,13 @@ def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
 
 def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
     """Refuses a store whose arrays were made from others than these by more than rounding."""
-    if sorted(found) != sorted(near):
-        raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {sorted(found)}; delete it")
+    if not isinstance(found, Mapping) or sorted(found) != sorted(near):
+        told = sorted(found) if isinstance(found, Mapping) else found
+        raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {told}; delete it")
+    for name, now in near.items():
+        kept = found[name]
+        if not (isinstance(kept, list) and len(kept) == len(now) and all(isinstance(x, int | float) for x in kept)):
+            raise ValueError(f"{path} is damaged: the sketch of {name} must have {len(now)} numbers; delete it")
     for name, now in near.items():
         norm = max(now[1], found[name][1])
         distance = float(np.linalg.norm(np.subtract(now[2:], found[name][2:])))

@@ -339,3 +339,13 @@ def test_stores_compare_sketches_up_to_rounding_and_headers_by_the_version_of_th
         ValueError, match=r"was made by version {'test': 1} of the algorithm, this package has version {'test': 2}"
     ):
         open_store(path, header={"algorithm": {"test": 2}}, near=near)
+
+
+@pytest.mark.parametrize("damaged", [None, 3, ["brdf"], {"brdf": None}, {"brdf": [0.1]}, {"brdf": ["x"] * 66}])
+def test_damaged_sketches_are_told(tmp_path, damaged):
+    path, near = tmp_path / "a.prt", {"brdf": arrays.sketch(np.ones(9))}
+    open_store(path, header={}, near=near)
+    file = path / arrays._HEADER
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"near": damaged}))
+    with pytest.raises(ValueError, match=r"a\.prt is damaged: .* must have"):
+        open_store(path, header={}, near=near)
