@@ -34,7 +34,8 @@ class Occluder:
         self.diagonal = float(np.linalg.norm(high.astype(np.float64) - low)) or 1.0
         if not _SMALLEST <= self.diagonal <= _LARGEST:
             raise ValueError(
-                f"what casts shadows must be {_SMALLEST:g} to {_LARGEST:g} units across, got {self.diagonal:.3g}: scale it"
+                f"what casts shadows must be {_SMALLEST:g} to {_LARGEST:g} units across, got {self.diagonal:.3g}: "
+                "scale it"
             )
         # Far from the origin float32 itself is coarser than the share of the diagonal.
         self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
