@@ -58,16 +58,21 @@ def pytest_unconfigure() -> None:
 
 # These files take minutes each. One that came last would leave the other process idle.
 LONG = ("test_notebooks.py", "test_benchmarks.py", "cli/test_main.py")
+COARSE = pytest.StashKey[set[pathlib.Path]]()  # files with tests that ask for `coarse`
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts the tests of the longest files first."""
-    items.sort(key=lambda item: not str(item.path).endswith(LONG))
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Puts the tests of the longest files first, then those at coarse directions: changing over forgets programs."""
+    coarse = {item.path for item in items if "coarse" in getattr(item, "fixturenames", ())}
+    config.stash[COARSE] = coarse
+    items.sort(key=lambda item: (not str(item.path).endswith(LONG), item.path not in coarse))
 
 
 @pytest.fixture(autouse=True, scope="module")
-def room() -> Iterator[None]:
+def room(request: pytest.FixtureRequest) -> Iterator[None]:
     """Forgets what is compiled when the process nears the limit of mappings; until then, files share programs."""
+    if request.path not in request.config.stash[COARSE]:
+        set_coarse(False)
     yield
     mappings = pathlib.Path("/proc/self/maps")
     if not mappings.exists() or mappings.read_bytes().count(b"\n") > MAPPINGS:
@@ -93,10 +98,27 @@ def data() -> pathlib.Path:
 
 
 @pytest.fixture(scope="module")
-def coarse() -> Iterator[None]:
+def coarse() -> None:
     """For one file, BRDFs are fitted and tabulated at fewer directions; the code that does it is the same."""
+    set_coarse(True)
+
+
+_finer: dict[tuple[Any, str], Any] = {}  # what `set_coarse` has replaced
+
+
+def set_coarse(on: bool) -> None:
+    """Sets numbers of directions, fewer or those of the package. Files that ask for fewer share their programs."""
+    if on == bool(_finer):
+        return
     from jaxprt import bounces, dynamic, harmonic, lobe
 
+    jax.clear_caches()  # Programs hold the numbers that they were compiled with.
+    dynamic.reflected._dual.cache_clear()
+    if not on:
+        for (room, name), value in _finer.items():
+            setattr(room, name, value)
+        _finer.clear()
+        return
     fewer = {
         lobe.em: {"RINGS": 20, "SECTORS": 28},
         dynamic.reflected: {"_RINGS": 20, "_SECTORS": 28},
@@ -109,15 +131,10 @@ def coarse() -> Iterator[None]:
             "_ERROR": 0.5,
         },
     }
-    with pytest.MonkeyPatch.context() as patch:
-        jax.clear_caches()  # Programs hold the numbers that they were compiled with.
-        dynamic.reflected._dual.cache_clear()
-        for room, values in fewer.items():
-            for name, value in values.items():
-                patch.setattr(room, name, value)
-        yield
-    jax.clear_caches()
-    dynamic.reflected._dual.cache_clear()
+    for room, values in fewer.items():
+        for name, value in values.items():
+            _finer[room, name] = getattr(room, name)
+            setattr(room, name, value)
 
 
 @pytest.fixture(scope="session")

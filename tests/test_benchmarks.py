@@ -6,6 +6,7 @@ import pathlib
 import subprocess
 import sys
 
+import jax
 import pytest
 
 import jaxprt as prt
@@ -60,7 +61,8 @@ def small(coarse, bound):
             (raster.depths, "CHUNK", 1024),
         ):
             patch.setattr(room, name, value)
-        yield  # Benchmarks share compiled programs, which have these sizes in them; `coarse` forgets them at the end.
+        yield  # Benchmarks share compiled programs, which have these sizes in them.
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
