@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.brdf.models import Lambert, Model, both_above, color, half_vector, scalar
+from jaxprt.compile import jit
 
 _SMOOTHEST = 1e-3  # least alpha: a perfect mirror has no density
 
@@ -246,7 +247,7 @@ class MetallicRoughness(Model):
 
     def coefficient(self) -> Float[Array, "*b 4 c"]:
         """Weights of the four `terms`, none of them negative for colors up to 1."""
-        return jnp.stack(jnp.broadcast_arrays(*self._coefficients()), -2)
+        return _stacked(self)
 
     def needed(self) -> tuple[int, ...]:
         """Indices of the `terms` whose weight is not zero everywhere. All, where values are traced by JAX.
@@ -257,7 +258,7 @@ class MetallicRoughness(Model):
             term = [material.terms()[k] for k in keep]
             weight = material.coefficient()[..., keep, :]
         """
-        each = enumerate(self._coefficients())
+        each = enumerate(_separate(self))
         return tuple(k for k, weight in each if isinstance(weight, Tracer) or np.any(np.asarray(weight)))
 
     def _alphas(self) -> tuple[Array, Array]:
@@ -275,3 +276,13 @@ class MetallicRoughness(Model):
         mirror = layer * f0 + metallic * base
         rim = layer * (1 - f0) + metallic * (1 - base)
         return under, mirror, rim, dielectric * (1 - specular) * base
+
+
+@jit
+def _separate(material: MetallicRoughness) -> tuple[Array, ...]:
+    return material._coefficients()
+
+
+@jit
+def _stacked(material: MetallicRoughness) -> Array:
+    return jnp.stack(jnp.broadcast_arrays(*material._coefficients()), -2)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
+from jaxprt.compile import jit
 
 
 class PerVertex(eqx.Module):
@@ -35,11 +36,16 @@ class PerVertex(eqx.Module):
 
     def of(self, vertex: Int[Array, "*b"]) -> Callable:
         """The model of some vertices; of one vertex it has no leading axis."""
-        return jax.tree.map(lambda each: each[vertex], self.model)
+        return _rows(self.model, vertex)
 
     def __call__(self, wi: Float[Array, "v *b 3"], wo: Float[Array, "v *b 3"]) -> Float[Array, "v *b c"]:
         """Value in 1/sr, of each vertex for its own directions."""
         return jax.vmap(lambda model, wi, wo: model(wi, wo))(self.model, wi, wo)
+
+
+@jit
+def _rows(model: Callable, vertex: Array) -> Callable:
+    return jax.tree.map(lambda each: each[vertex], model)
 
 
 class Channels(eqx.Module):

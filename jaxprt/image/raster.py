@@ -119,6 +119,7 @@ def ray_direction(camera: Camera) -> Float[Array, "h w 3"]:
     return jnp.stack([(x * axis[0, i] + y * axis[1, i] + axis[2, i]) / length for i in range(3)], -1)
 
 
+@jit
 def view_axes(camera: Camera) -> Float[Array, "3 3"]:
     """Right, up and forward of the camera as rows of unit vectors in the world.
 

@@ -172,10 +172,10 @@ def exact_picture(
         points = shown.points(index, number)
         if smooth[number]:
             vertex = np.unique(points.corner)
-            every = jnp.zeros((len(color), len(part.mesh.position), color.shape[-1]))
-            every = every.at[:, vertex].set(_sum(shading.mesh, shading.brdf, lights, vertex, **options))
+            every = np.zeros((len(color), len(part.mesh.position), color.shape[-1]), color.dtype)
+            every[:, vertex] = _sum(shading.mesh, shading.brdf, lights, vertex, **options)
             look = at_points(part, shading, None, points)
-            value, emitted = points.carry(every, axis=1), look.emitted
+            value, emitted = points.carry(jnp.asarray(every), axis=1), look.emitted
             value = value if look.blend is None else value * look.blend.weight[:, 0]
         else:
             brdf, emitted = exact_at(part, shading, points)
@@ -201,7 +201,9 @@ def _sum(
     def some(number: int, own: np.ndarray) -> np.ndarray:
         told, model = progress and number == 0, brdf
         if isinstance(place, Points):
-            where: dict[str, Any] = {"points": jax.tree.map(lambda each: each[..., own], place)}
+            where: dict[str, Any] = {
+                "points": jax.tree.map(lambda each: jnp.asarray(np.asarray(each)[..., own]), place)
+            }
             model = PerVertex(brdf.of(jnp.asarray(own))) if isinstance(brdf, PerVertex) else brdf
         else:
             where = {"vertex": place[own]}
@@ -233,8 +235,8 @@ class _Shown(NamedTuple):
     def points(self, index: Int[np.ndarray, " m"], part: int) -> Points:
         """Some points, all of one part."""
         corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
-        slope = jnp.moveaxis(self.pixels.slope[index], 0, -1)
-        return Points(jnp.asarray(corner.T), self.pixels.barycentric[index].T, slope)
+        weight, slope = (np.asarray(each)[index] for each in (self.pixels.barycentric, self.pixels.slope))
+        return Points(*map(jnp.asarray, (corner.T, weight.T, np.moveaxis(slope, 0, -1))))
 
 
 def _is_smooth(shading: Shading, shown: _Shown, part: int) -> bool:

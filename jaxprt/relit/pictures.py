@@ -191,7 +191,7 @@ def make(
         samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
     """
-    bend = jnp.stack([each.curvature for each in surfaces])[mesh.region]
+    bend = _bends([each.curvature for each in surfaces], mesh.region)
     fragments = rasterize(mesh, camera, samples=samples)
     pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
     owner, wrong = _judged(mesh, bend, pixels, camera)
@@ -266,6 +266,12 @@ def _drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> F
     flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
     color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])  # Not empty where nothing is seen.
     return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)
+
+
+@jit
+def _bends(curvature: Sequence[Array], region: Int[Array, " v"]) -> Float[Array, " v"]:
+    """Curvature of the BRDF of each vertex."""
+    return jnp.stack(curvature)[region]
 
 
 @jit

@@ -1,6 +1,7 @@
 """Points on the triangles of a mesh: where radiance is asked for between the vertices."""
 
 import functools
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Num
 
 from jaxprt import require
+from jaxprt.compile import jit
 from jaxprt.sphere import directions
 
 _ROUNDED = 1e-4  # by which weights may miss the triangle
@@ -34,15 +36,7 @@ class Points(eqx.Module):
 
     def carry(self, attribute: Num[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
         """An attribute of the vertices, along an axis, interpolated at the points: linear in it."""
-        wide = [1] * attribute.ndim
-        wide[axis] = len(self)
-        floating = jnp.issubdtype(attribute.dtype, jnp.inexact)
-        parts = [
-            jnp.take(attribute, corner, axis, mode="clip")
-            * (weight.astype(attribute.dtype) if floating else weight).reshape(wide)
-            for corner, weight in zip(self.corner, self.weight, strict=True)
-        ]
-        return functools.reduce(jnp.add, parts)
+        return _carried(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array, "v c"]) -> Float[Array, "2 p c"]:
         """Change of an attribute of the vertices from one pixel to the next, to the right and down."""
@@ -72,8 +66,26 @@ class Points(eqx.Module):
         Args:
             frame: Those of the vertices; rows are tangent, bitangent, normal.
         """
-        rows = self.carry(frame[:, ::2].reshape(len(frame), 6))
-        return directions.frame(directions.normalize(rows[:, 3:]), rows[:, :3])
+        return _frames(self.corner, self.weight, frame)
+
+
+@partial(jit, static_argnames="axis")
+def _carried(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Array:
+    wide = [1] * attribute.ndim
+    wide[axis] = corner.shape[1]
+    floating = jnp.issubdtype(attribute.dtype, jnp.inexact)
+    parts = [
+        jnp.take(attribute, corner, axis, mode="clip")
+        * (weight.astype(attribute.dtype) if floating else weight).reshape(wide)
+        for corner, weight in zip(corner, weight, strict=True)
+    ]
+    return functools.reduce(jnp.add, parts)
+
+
+@jit
+def _frames(corner: Array, weight: Array, frame: Array) -> Array:
+    rows = _carried(corner, weight, frame[:, ::2].reshape(len(frame), 6), axis=0)
+    return directions.frame(directions.normalize(rows[:, 3:]), rows[:, :3])
 
 
 def placed(

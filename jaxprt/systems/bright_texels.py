@@ -17,12 +17,14 @@ from jaxprt.compile import jit, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
+from jaxprt.systems import adaptive
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels of which the brightest is looked at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _FINE = 32
+_value = jit(adaptive.value)
 
 
 @runtime_checkable
@@ -322,14 +324,14 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     first = np.cumsum([0, *(len(x) ** 2 for x, _ in rule[:-1])])
     offset = np.random.default_rng(0).uniform(-2, 2, (12, 1, 2))  # middles of texels, in texels
     s, t = np.moveaxis((2 * offset + place) / size, -1, 0)[..., None]
-    evaluate = jit(lambda wi, wo: brdf(wi, jnp.broadcast_to(wo, wi.shape)))
+    brdf = grid.as_argument(brdf)
     need = 0
     for angle, turn in itertools.product(np.radians([0, 30, 60, 75]), np.pi / 4 * np.arange(4)):
         wo = np.array([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
         axes = np.asarray(directions.frame(jnp.asarray(wo * [-1, -1, 1]), jnp.zeros(3)), np.float64)
         wi = s * axes[0] + t * axes[1] + axes[2]
         wi = (wi / np.linalg.norm(wi, axis=-1, keepdims=True)).reshape(-1, 3)
-        value = evaluate(*(jnp.asarray(each, jnp.result_type(float)) for each in (wi, wo)))
+        value = _value(brdf, *(jnp.asarray(each, jnp.result_type(float)) for each in (wi, wo)))
         sent = np.asarray(value, np.float64).mean(-1) * np.maximum(wi[:, 2], 0)
         mean = np.add.reduceat(sent.reshape(len(offset), -1) * weight, first, axis=1)
         off = np.linalg.norm(mean - mean[:, -1:], axis=0)

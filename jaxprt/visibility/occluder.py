@@ -104,6 +104,7 @@ def check(mesh: Mesh, name: str) -> None:
             raise ValueError(
                 f"the {name}'s {field}s must be finite, got {broken.size} that are not, first at {broken[0]}: {value}"
             )
-    low, high = int(mesh.face.min()), int(mesh.face.max())
+    face = np.asarray(mesh.face)
+    low, high = int(face.min()), int(face.max())
     if low < 0 or high >= len(mesh.position):
         raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")

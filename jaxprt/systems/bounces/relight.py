@@ -175,8 +175,13 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
 
 def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "q c"]:
     """Weights of the functions that the tensor keeps, given those of all functions of each region."""
+    return _gathered(tensor.function, rows)
+
+
+@jit
+def _gathered(function: Array, rows: Sequence[Array]) -> Array:
     colors = max(each.shape[1] for each in rows)
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[tensor.function]
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])[function]
 
 
 @jit

@@ -187,10 +187,7 @@ def factor(
     light_map, view_map = _maps(table, solid_angle, flux, matrix, covariance, value, vector)
     # Transport that another machine made serves the same factors here.
     turn = eigen.orientation(np.asarray(value), np.asarray(vector))[:, :terms].T.astype(value.dtype)
-    shape = (terms, resolution, resolution, -1)
-    light_map, view_map = (
-        jnp.tensordot(turn, each, 1, precision="highest").reshape(shape) for each in (light_map, view_map)
-    )
+    light_map, view_map = _turned(turn, light_map, view_map, resolution=resolution)
     return SeparableBrdf(light_map, view_map, jnp.asarray(remainder[terms - 1]), hemisphere.parabolic_coordinates)
 
 
@@ -200,6 +197,12 @@ def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array)
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
     return flux, matrix, light_covariance(direction[inside], degree=_DEGREE)
+
+
+@partial(jit, static_argnames="resolution")
+def _turned(turn: Array, *value: Array, resolution: int) -> tuple[Array, ...]:
+    """Maps [r n n c] of singular vectors turned among each other."""
+    return tuple(jnp.tensordot(turn, each, 1).reshape(len(turn), resolution, resolution, -1) for each in value)
 
 
 @jit
