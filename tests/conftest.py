@@ -3,8 +3,10 @@
 They are ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked``, ``close``, ``loose`` and ``elsewhere``.
 """
 
+import ctypes
 import functools
 import gc
+import mmap
 import os
 import pathlib
 import sys
@@ -40,8 +42,8 @@ sys.dont_write_bytecode = False
 # Rounding error that a few thousand operations may leave, relative to the norm of the result.
 TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
-# Linux gives a process 65,530 memory mappings, and each compiled program takes several.
-MAPPINGS = 40_000
+# Linux gives a process 65,530 memory mappings, and each compiled program takes several, and 2 MB.
+MAPPINGS, RESIDENT = 40_000, 4e9
 
 
 def pytest_collection_finish() -> None:
@@ -70,14 +72,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True, scope="module")
 def room(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Forgets what is compiled when the process nears the limit of mappings; until then, files share programs."""
+    """Forgets what is compiled when the process has too many mappings or bytes; until then, files share programs."""
     if request.path not in request.config.stash[COARSE]:
         set_coarse(False)
     yield
-    mappings = pathlib.Path("/proc/self/maps")
-    if not mappings.exists() or mappings.read_bytes().count(b"\n") > MAPPINGS:
-        jax.clear_caches()
-        gc.collect()
+    mappings, pages = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/self/statm")
+    if (
+        not mappings.exists()
+        or mappings.read_bytes().count(b"\n") > MAPPINGS
+        or int(pages.read_text().split()[1]) * mmap.PAGESIZE > RESIDENT
+    ):
+        forget()
+
+
+def forget() -> None:
+    """Forgets what is compiled, and gives its memory back, which glibc would keep."""
+    jax.clear_caches()
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)
 
 
 @pytest.fixture(scope="session")
@@ -112,7 +126,7 @@ def set_coarse(on: bool) -> None:
         return
     from jaxprt import bounces, dynamic, harmonic, lobe
 
-    jax.clear_caches()  # Programs hold the numbers that they were compiled with.
+    forget()  # Programs hold the numbers that they were compiled with.
     dynamic.reflected._dual.cache_clear()
     if not on:
         for (room, name), value in _finer.items():
