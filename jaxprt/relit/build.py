@@ -30,6 +30,7 @@ def precompute(
     environments: Sequence[Environment] | None = None,
     rate: float = 30.0,
     bounces: int | None = None,
+    roughness: tuple[float, float] | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -49,6 +50,8 @@ def precompute(
         rate: Frames per second with new light and new view, for the plan.
         bounces: How many times parts reflect light onto each other and themselves, 0 to 2; if None as many as the plan
             finds worth it, and none with `system`.
+        roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` may get later,
+            beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and memory in tables.
         size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None. A `jaxprt.visibility.Part` computes its part
@@ -61,8 +64,9 @@ def precompute(
     Raises:
         TypeError: No scene, a system of another kind, bounces that are no whole number, or a material that no system
             can have.
-        ValueError: There is no such system or part, the size is no power of two, bounces are not from 0 to 2, a
-            part's material is not one that its system can have, or the store at `path` was made from something else.
+        ValueError: There is no such system or part, the size is no power of two, bounces are not from 0 to 2,
+            roughness is not two numbers from 0 to 1, the smaller one first, or is given without a system, a part's
+            material is not one that its system can have, or the store at `path` was made from something else.
         NotADirectoryError: There is a file at `path`.
         jaxprt.visibility.UnfinishedError: The executor's part is done, and other parts are not.
     """
@@ -72,6 +76,10 @@ def precompute(
     if bounces is not None and not (type(bounces) is int or isinstance(bounces, np.integer)):
         raise TypeError(f"bounces must be a whole number, got {bounces!r}")
     require.between("bounces", bounces, 0, reflection.MOST)
+    if roughness is not None and not (len(roughness) == 2 and 0 <= roughness[0] <= roughness[1] <= 1):
+        raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
+    if roughness is not None and system is None:
+        raise ValueError("roughness needs a system: the plan is for the materials that the scene has")
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():
@@ -83,7 +91,7 @@ def precompute(
         bounces = wanted.bounces if bounces is None else bounces
     size = 64 if size is None else size
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
-    shadings = [_checked(part, recipes[part.name]) for part in scene.parts]
+    shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
     mesh = scene.mesh
     systems, unfinished = [], []
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
@@ -103,9 +111,9 @@ def precompute(
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
 
 
-def _checked(part: Part, recipe: Recipe) -> Shading:
+def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:
     """The part as systems take it, refused before any rays are traced if its system cannot have it."""
-    shading = of_part(part)
+    shading = of_part(part, roughness)
     try:
         check(recipe, shading)
     except ValueError as error:

@@ -90,10 +90,14 @@ class Appearance(eqx.Module):
     emitted: Float[Array, "v 3"] | None = None
 
 
-def of_part(part: Part) -> Shading:
+def of_part(part: Part, roughness: tuple[float, float] | None = None) -> Shading:
     """A part of a scene, as systems take it.
 
     A texture of anisotropy is replaced by its mean, with a warning.
+
+    Args:
+        part: The part.
+        roughness: Least and largest roughness of materials that it may have later, beside those of its own.
 
     Raises:
         TypeError: The material is a BRDF of another form: a table that holds the cosine, or one BRDF for each vertex.
@@ -113,7 +117,7 @@ def of_part(part: Part) -> Shading:
     if term == _BARE:
         brdf, knot, scale = Lambert(1.0), (), jnp.ones(1)
     else:
-        knot = _knots(material.roughness)
+        knot = _knots(material.roughness if roughness is None else jnp.append(material.roughness, jnp.array(roughness)))
         scale = jnp.mean(jnp.abs(material.coefficient()[:, np.asarray(term)]), (0, 2))
         scale = jnp.maximum(scale, _RARE * jnp.max(scale))
         brdf = RoughnessFamily(term, scale, material.anisotropy[0])
@@ -193,8 +197,7 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
     fits = ~jnp.any(new.coefficient()[:, missing] != 0, (1, 2))
     if shading.term == _BARE:
         return fits
-    old = _old(shading).roughness
-    low, high = jnp.min(old), jnp.max(old)
+    low, high = roughness_range(shading)
     inside = (new.roughness >= low - _EQUAL) & (new.roughness <= high + _EQUAL)
     if _known(inside) and not np.all(np.asarray(inside)):
         raise ValueError(
@@ -202,6 +205,17 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
             f"{jnp.min(new.roughness):.3f} to {jnp.max(new.roughness):.3f}: precompute it with a material of both"
         )
     return fits & inside
+
+
+def roughness_range(shading: Shading) -> tuple[Array, Array]:
+    """Least and largest roughness that a part was precomputed for."""
+    old = _old(shading).roughness
+    if not shading.knot:
+        return jnp.min(old), jnp.max(old)
+    (knot,) = shading.knot
+    # What is smoother than the first knot has the BRDF of that.
+    least, most = jnp.exp(knot[0]), jnp.exp(knot[-1])
+    return jnp.where(least <= _SMOOTHEST + _EQUAL, 0, least), most
 
 
 def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRoughness) -> None:

@@ -166,6 +166,27 @@ def test_knots_cover_the_roughness_in_steps_of_less_than_one_and_a_half(low, hig
     assert np.diff(knot).max() <= np.log(1.5) + 1e-6
 
 
+def test_a_part_may_be_made_ready_for_more_roughness_than_it_has():
+    part = patch(TexturedMaterial(roughness=0.3, metallic=0.5))
+    shading = of_part(part, (0.1, 0.6))
+    (knot,) = shading.knot
+    np.testing.assert_allclose(np.exp(knot[[0, -1]]), (0.1, 0.6), rtol=1e-6)
+    np.testing.assert_allclose(shading.blend.parameter[0], np.log(0.3), rtol=1e-6)
+    other = appearance(part, shading, TexturedMaterial(roughness=0.1, metallic=0.5)).blend
+    np.testing.assert_allclose(other.parameter[0], np.log(0.1), rtol=1e-6)
+    wi, wo = pairs()
+    right = evaluated(at_vertices({"roughness": 0.1, "metallic": 0.5}, {}), wi, wo)
+    np.testing.assert_allclose(blended(shading, other, wi, wo), right, rtol=2e-4, atol=1e-5)
+    with pytest.raises(ValueError, match=r"roughness from 0.100 to 0.600, got a material from 0.700"):
+        appearance(part, shading, TexturedMaterial(roughness=0.7, metallic=0.5))
+
+
+def test_a_part_made_ready_from_no_roughness_on_takes_all_below_its_smoothest_table():
+    part = patch(TexturedMaterial(roughness=0.3, metallic=1.0))
+    shading = of_part(part, (0.0, 0.3))
+    appearance(part, shading, TexturedMaterial(roughness=0.0, metallic=1.0))
+
+
 def test_roughness_of_one_value_needs_no_knots():
     shading = of_part(patch(textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})))
     assert shading.knot == shading.blend.parameter == ()

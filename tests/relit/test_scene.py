@@ -439,6 +439,11 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for size in (0, 12, -8):
         with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
             prt.precompute(scene(), system="harmonic", size=size)
+    for rough in ((0.5, 0.1), (-0.1, 0.2), (0.1, 1.2), (0.1,), (float("nan"), 1.0)):
+        with pytest.raises(ValueError, match="roughness must be two numbers from 0 to 1, the smaller one first, got"):
+            prt.precompute(scene(), system="harmonic", roughness=rough)
+    with pytest.raises(ValueError, match="roughness needs a system"):
+        prt.precompute(scene(), roughness=(0.1, 0.5))
     for count in (-1, 3):
         with pytest.raises(ValueError, match=f"bounces must be between 0 and 2, got {count}"):
             prt.precompute(scene(), system="harmonic", bounces=count)
