@@ -1,0 +1,203 @@
+"""What browser and Python tell each other: messages with arrays beside them, checked where they enter."""
+
+import json
+import math
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+MOST_BYTES = 1 << 29  # of a message with a picture of an environment in it
+_LARGEST_HALF = 65504.0
+
+
+class Reply(NamedTuple):
+    """An answer: what JSON holds, and arrays as bytes."""
+
+    content: dict[str, Any]
+    buffers: list[bytes]
+
+
+class Lamp(NamedTuple):
+    """Light put by hand: a disk on the sphere.
+
+    Attributes:
+        direction: Of its middle in the environment before it is turned.
+        angle: From its middle to its rim, in radians.
+        radiance: Linear radiance.
+    """
+
+    direction: tuple[float, ...]
+    angle: float
+    radiance: tuple[float, ...]
+
+
+class Look(NamedTuple):
+    """All that a picture depends on; hashable, so that what is made from a piece of it can be kept.
+
+    Attributes:
+        system: Name of one of the systems.
+        light: Number of one of the lights.
+        turn: Angle by which the light is turned about +y, in radians.
+        lamps: Lights put by hand.
+        eye: Position of the viewer in world units.
+        target: What the viewer looks at.
+        field_of_view: Full vertical angle of view in radians.
+        bounces: Whether parts reflect light onto each other.
+        material: For names of parts, values of those of `MATERIAL` that were changed.
+    """
+
+    system: str
+    light: int
+    turn: float
+    lamps: tuple[Lamp, ...]
+    eye: tuple[float, ...]
+    target: tuple[float, ...]
+    field_of_view: float
+    bounces: bool
+    material: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]
+
+
+# What of a material can change: how many numbers it has, and the largest of them.
+MATERIAL = {"roughness": (1, 1.0), "f0": (1, 1.0), "diffuse": (3, 1.0), "specular": (3, 1.0)}
+
+
+def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> Look:
+    """The look that a message asks for.
+
+    Raises:
+        ValueError: A piece is missing, is no finite number in its range, or names what there is not.
+    """
+    system = message.get("system")
+    if system not in systems:
+        raise ValueError(f"the system must be one of {', '.join(systems)}, got {system!r}")
+    light = message.get("light")
+    if type(light) is not int or not 0 <= light < lights:
+        raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {light!r}")
+    eye, target = (numbers(message, name, 3) for name in ("eye", "target"))
+    if eye == target:
+        raise ValueError(f"eye and target must be two places, got {list(eye)} for both")
+    return Look(
+        system,
+        light,
+        number(message, "turn", -math.inf, math.inf),
+        tuple(_lamp(each) for each in _items(message, "lamps")),
+        eye,
+        target,
+        number(message, "field_of_view", 1e-3, math.pi - 1e-3),
+        bool(message.get("bounces", False)),
+        _materials(message.get("materials", {})),
+    )
+
+
+def number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
+    """A finite number of a message.
+
+    Raises:
+        ValueError: It is none, or out of its range.
+    """
+    value = message.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}")
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be from {low:g} to {high:g}, got {value:g}")
+    return float(value)
+
+
+def numbers(
+    message: Mapping[str, Any], name: str, count: int, low: float = -1e30, high: float = 1e30
+) -> tuple[float, ...]:
+    """Some finite numbers of a message.
+
+    Raises:
+        ValueError: They are not so many, or out of their range.
+    """
+    value = _items(message, name)
+    if len(value) != count:
+        raise ValueError(f"{name} must be {count} numbers, got {len(value)}")
+    return tuple(number({name: each}, name, low, high) for each in value)
+
+
+def pack(content: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> bytes:
+    """A message and its arrays as one string of bytes: the length of the JSON, the JSON, the arrays."""
+    head = json.dumps({"content": content, "lengths": [len(each) for each in buffers]}, allow_nan=False).encode()
+    head += b" " * (-(len(head) + 4) % 8)  # arrays begin at multiples of eight
+    return b"".join([struct.pack("<I", len(head)), head, *(each + bytes(-len(each) % 8) for each in buffers)])
+
+
+def unpack(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """The message and the arrays that `pack` has made one string of.
+
+    Raises:
+        ValueError: It is none.
+    """
+    try:
+        (length,) = struct.unpack_from("<I", data)
+        head = json.loads(data[4 : 4 + length])
+        content, lengths, buffers, place = dict(head["content"]), head["lengths"], [], 4 + length
+        for each in lengths:
+            if type(each) is not int or not 0 <= each <= len(data) - place:
+                raise ValueError(each)
+            buffers.append(data[place : place + each])
+            place += each + -each % 8
+    except (struct.error, ValueError, KeyError, TypeError, RecursionError):
+        raise ValueError(f"a message must be what the viewer sends, got {len(data)} other bytes") from None
+    return content, buffers
+
+
+def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
+    """Linear colors as bytes.
+
+    Args:
+        color: Three channels in the last axis.
+        stops: None for half floats. Otherwise colors are exposed by these, and become bytes as displays take them,
+            compressed with zlib.
+
+    Returns:
+        The bytes, and the factor that half floats must be multiplied by: 1 but where the brightest is beyond them.
+    """
+    value = np.asarray(color, np.float32)
+    if stops is None:
+        scale = max(1.0, float(np.max(value, initial=0.0)) / _LARGEST_HALF)
+        return np.clip(value / np.float32(scale), 0, _LARGEST_HALF).astype("<f2").tobytes(), scale
+    exposed = np.clip(value * np.float32(2.0**stops), 0, 1)
+    display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
+    level = np.round(255 * display).astype(np.uint8)
+    # Channel by channel, differences from entry to entry: neighbours are alike.
+    flat = np.moveaxis(level.reshape(-1, level.shape[-1]), -1, 0)
+    return zlib.compress(np.diff(flat, axis=1, prepend=np.uint8(0)).tobytes(), 1), 1.0
+
+
+def _items(message: Mapping[str, Any], name: str) -> Sequence[Any]:
+    value = message.get(name, [])
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"{name} must be a list, got {value!r}")
+    return value
+
+
+def _lamp(message: Any) -> Lamp:
+    if not isinstance(message, Mapping):
+        raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {message!r}")
+    direction = numbers(message, "direction", 3)
+    if not 1e-6 < math.hypot(*direction) < 1e6:
+        raise ValueError(f"the direction of a lamp must have a length, got {list(direction)}")
+    return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, 0, 1e9))
+
+
+def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
+    if not isinstance(message, Mapping):
+        raise ValueError(f"materials must be a dictionary from names of parts, got {message!r}")
+    return tuple(sorted((str(name), _material(name, value)) for name, value in message.items()))
+
+
+def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
+    if not isinstance(message, Mapping) or not set(message) <= set(MATERIAL):
+        raise ValueError(f"the material of part {part!r} must have some of {', '.join(MATERIAL)}, got {message!r}")
+    result = []
+    for name in sorted(message):
+        count, most = MATERIAL[name]
+        result.append((name, number(message, name, 0, most) if count == 1 else numbers(message, name, count, 0, most)))
+    return tuple(result)

@@ -1,0 +1,210 @@
+"""One viewer's questions and their answers."""
+
+import os
+import pathlib
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxprt import require
+from jaxprt.relit import exact
+from jaxprt.relit.channels import of_part
+from jaxprt.relit.measuring import lights_of
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Environment, load_environment
+from jaxprt.scene.mesh import bounds
+from jaxprt.view import messages, stages
+from jaxprt.view.messages import Look, Reply
+from jaxprt.view.stages import Stages
+
+_LARGEST = 2048  # pixels along an edge of a picture
+_PIXELS = 400  # of a picture that the exact sum is compared at
+
+
+class Session:
+    """What a viewer shows, and how it answers: the same for notebooks and for browsers.
+
+    Nothing queues: the browser asks for one look at a time. Looks are answered beside pictures at rest, which are given
+    up when a later look has come.
+
+    Attributes:
+        stages: Lights, materials and views.
+    """
+
+    def __init__(
+        self, systems: RelitScene | Mapping[str, RelitScene], environments: Mapping[str, Environment] | None = None
+    ):
+        """Checks that all systems are of one scene, and all lights of one size.
+
+        Args:
+            systems: The scene, made ready; or several systems of it, by names.
+            environments: Lights by names; the scene's own, or the two embedded ones.
+
+        Raises:
+            TypeError: One of them is no relit scene, or no environment.
+            ValueError: There are none, they are of different scenes, or lights are of several sizes or batches.
+        """
+        every = {"system": systems} if isinstance(systems, RelitScene) else dict(systems)
+        if not every:
+            raise ValueError("a viewer must have a system, got none")
+        for name, each in every.items():
+            require.kind(f"the system {name!r}", each, RelitScene, source="jaxprt.precompute")
+        scene = next(iter(every.values()))
+        shape = [(part.name, part.mesh.position.shape) for part in scene.scene.parts]
+        for name, each in every.items():
+            if [(part.name, part.mesh.position.shape) for part in each.scene.parts] != shape:
+                raise ValueError(f"systems must be of one scene, got another one for {name!r}")
+        lights = _named(lights_of(scene.scene)) if environments is None else dict(environments)
+        _check_lights(lights)
+        self.stages = Stages(every, lights)
+        self._lock, self._newest = threading.Lock(), 0
+
+    def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
+        """The answer to a message of the browser. A message that is wrong is answered by one that says why."""
+        kinds: dict[str, Callable[[Mapping[str, Any], Sequence[bytes]], Reply]] = {
+            "scene": self._scene,
+            "look": self._look,
+            "still": self._still,
+            "exact": self._exact,
+            "sky": self._sky,
+            "drop": self._drop,
+        }
+        try:
+            kind = message.get("kind")
+            if kind not in kinds:
+                raise ValueError(f"the kind of a message must be one of {', '.join(kinds)}, got {kind!r}")
+            return kinds[kind](message, buffers)
+        except (ValueError, TypeError, OSError, MemoryError) as error:
+            return Reply({"kind": "error", "of": message.get("kind"), "message": str(error)}, [])
+
+    def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        scene = self.stages.scene
+        mesh, low, high = scene.mesh, *bounds(scene.mesh)
+        parts = [
+            {"name": part.name, "free": stages.freedom(shading, part.material)}
+            for part, shading in zip(scene.scene.parts, scene.shading, strict=True)
+        ]
+        camera = scene.camera
+        content = {
+            "kind": "scene",
+            "parts": parts,
+            "lights": self.stages.name,
+            "systems": {name: {"bounces": each.bounces is not None} for name, each in self.stages.systems.items()},
+            "vertices": len(mesh.position),
+            "triangles": len(mesh.face),
+            "center": ((low + high) / 2).tolist(),
+            "radius": float(np.linalg.norm(high - low) / 2) or 1.0,
+            "eye": np.asarray(camera.eye, float).tolist(),
+            "target": np.asarray(camera.target, float).tolist(),
+            "field_of_view": float(camera.field_of_view),
+        }
+        arrays = np.asarray(mesh.position, "<f4"), np.asarray(mesh.face, "<u4")
+        return Reply(content, [each.tobytes() for each in arrays])
+
+    def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
+        look = messages.look(message, systems=list(self.stages.systems), lights=len(self.stages.lights))
+        return look, int(messages.number(message, "seq", 0, 2**53))
+
+    def _look(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        look, seq = self._parse(message)
+        with self._lock:
+            self._newest = max(self._newest, seq)
+        began = time.perf_counter()
+        self.stages.light_side(look)
+        lit = time.perf_counter()
+        self.stages.view_side(look)
+        viewed = time.perf_counter()
+        data, scale = messages.encode(self.stages.color(look), stops=_stops(message))
+        done = time.perf_counter()
+        spent = {"light": lit - began, "view": viewed - lit, "combine": done - viewed}
+        times = {name: 1000 * each for name, each in spent.items()}
+        return Reply({"kind": "color", "seq": seq, "scale": scale, "ms": times}, [data])
+
+    def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        look, seq = self._parse(message)
+        width, height = (int(messages.number(message, each, 1, _LARGEST)) for each in ("width", "height"))
+        began = time.perf_counter()
+        if self._is_late(seq):
+            return Reply({"kind": "late", "seq": seq}, [])
+        picture = self.stages.picture(look, width, height)
+        data, scale = messages.encode(picture, stops=_stops(message))
+        spent = 1000 * (time.perf_counter() - began)
+        size = {"width": width, "height": height}
+        return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
+
+    def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """The exact picture in direct light, and the error of the picture at rest against some exact pixels."""
+        look, seq = self._parse(message)
+        width, height = (int(messages.number(message, each, 1, _LARGEST)) for each in ("width", "height"))
+        look = look._replace(bounces=False)
+        scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
+        shadings = [of_part(part) for part in scene.parts]
+        given = scene, shadings, [self.stages.environment(look)], camera
+        if self._is_late(seq):
+            return Reply({"kind": "late", "seq": seq}, [])
+        pixels = exact.exact_pixels(*given, pixels=_PIXELS)
+        if self._is_late(seq):
+            return Reply({"kind": "late", "seq": seq}, [])
+        error, spread = pixels.relative_l2(self.stages.picture(look, width, height))
+        if self._is_late(seq):
+            return Reply({"kind": "late", "seq": seq}, [])
+        truth = exact.exact_picture(*given)
+        data, scale = messages.encode(truth.color[0], stops=_stops(message))
+        size = {"width": truth.camera.width, "height": truth.camera.height}
+        told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
+        return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
+
+    def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """A picture of a light as it is before it is turned."""
+        look, seq = self._parse(message)
+        sky = np.asarray(self.stages.sky(look.light, look.lamps))
+        data, scale = messages.encode(np.broadcast_to(sky, (*sky.shape[:2], 3)), stops=None)
+        size = {"width": sky.shape[1], "height": sky.shape[0]}
+        return Reply({"kind": "sky", "seq": seq, "scale": scale, **size}, [data])
+
+    def _drop(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """A file that was dropped on the viewer becomes a light."""
+        file = pathlib.PurePath(str(message.get("name") or "light.hdr"))
+        if len(buffers) != 1 or not len(buffers[0]):
+            raise ValueError(f"{file.name} must hold an environment, got no bytes")
+        handle, path = tempfile.mkstemp(suffix=file.suffix)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(buffers[0])
+            light = load_environment(path, size=self.stages.size)
+        except (ValueError, OSError) as error:
+            raise ValueError(str(error).replace(path, file.name)) from None
+        finally:
+            os.unlink(path)
+        with self._lock:
+            self.stages.lights.append(light)
+            self.stages.name.append(file.stem)
+            return Reply({"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}, [])
+
+    def _is_late(self, seq: int) -> bool:
+        with self._lock:
+            return seq < self._newest
+
+
+def _named(lights: Sequence[Environment]) -> dict[str, Environment]:
+    return {f"light {number}": each for number, each in enumerate(lights, 1)}
+
+
+def _stops(message: Mapping[str, Any]) -> float | None:
+    return None if message.get("stops") is None else messages.number(message, "stops", -60, 60)
+
+
+def _check_lights(lights: Mapping[str, Environment]) -> None:
+    if not lights:
+        raise ValueError("a viewer must have a light, got none")
+    for name, each in lights.items():
+        require.kind(f"the light {name!r}", each, Environment, source="jaxprt.load_environment")
+        if each.radiance.ndim != 4:
+            raise ValueError(f"the light {name!r} must be one light, [6, n, n, c], got {list(each.radiance.shape)}")
+    sizes = {each.radiance.shape[-2] for each in lights.values()}
+    if len(sizes) > 1:
+        raise ValueError(f"lights must be of one size, got faces of {', '.join(map(str, sorted(sizes)))} texels")

@@ -1,0 +1,212 @@
+"""What pictures are made of, stage by stage, kept until what it depends on changes."""
+
+import dataclasses
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import Lambert
+from jaxprt.relit.channels import Appearance, Shading, roughness_range
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Camera, Environment, Scene, TexturedMaterial
+from jaxprt.scene.environment import background, rotate
+from jaxprt.sphere import cubemap
+from jaxprt.view.messages import Lamp, Look
+
+_KEPT = 4  # results of each stage
+_FINE = 4  # parts along the edge of a texel, by which the rim of a lamp is found
+_SKY = 128  # rows of the picture of an environment
+
+Made = TypeVar("Made")
+
+
+class Stages:
+    """Lights, materials, views and pictures of some systems of one scene. Threads may share it.
+
+    Attributes:
+        systems: The scene, made ready by each system, by names.
+        lights: Environments of one size.
+        name: Names of the lights.
+    """
+
+    def __init__(self, systems: Mapping[str, RelitScene], environments: Mapping[str, Environment]):
+        """Keeps what there is; a light more may come."""
+        self.systems = dict(systems)
+        self.name, self.lights = list(environments), list(environments.values())
+        self._bare = {name: RelitScene(each.scene, each.direct, each.shading) for name, each in systems.items()}
+        self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def scene(self) -> RelitScene:
+        """The scene by its first system."""
+        return next(iter(self.systems.values()))
+
+    @property
+    def size(self) -> int:
+        """Edge of the lights' cubemap faces in texels."""
+        return self.lights[0].radiance.shape[-2]
+
+    def system(self, look: Look) -> RelitScene:
+        """The system that a look wants."""
+        return (self.systems if look.bounces else self._bare)[look.system]
+
+    def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
+        """A light with the lamps in it."""
+        return self._once("unturned", (number, lamps), lambda: _with(self.lights[number], lamps))
+
+    def environment(self, look: Look) -> Environment:
+        """The light of a look, turned."""
+        unturned = self.unturned(look.light, look.lamps)
+        if look.turn == 0:
+            return unturned
+        key = look.light, look.lamps, look.turn
+        return self._once("environment", key, lambda: rotate(unturned, about(look.turn)))
+
+    def sky(self, number: int, lamps: tuple[Lamp, ...]) -> Float[Array, "h w 3"]:
+        """A picture of a light, not turned: +y on top, +z in the middle."""
+        latitude = np.pi * (0.5 - (np.arange(_SKY) + 0.5) / _SKY)[:, None]
+        longitude = np.pi * (1 - 2 * (np.arange(2 * _SKY) + 0.5) / (2 * _SKY))
+        ring = np.cos(latitude)
+        way = [ring * np.sin(longitude), np.sin(latitude) + 0 * longitude, ring * np.cos(longitude)]
+        return background(self.unturned(number, lamps), jnp.asarray(np.stack(way, -1), jnp.result_type(float)))
+
+    def materials(self, look: Look) -> dict[str, TexturedMaterial]:
+        """The changed materials of a look."""
+        parts = {part.name: part for part in self.scene.scene.parts}
+        unknown = [name for name, _ in look.material if name not in parts]
+        if unknown:
+            raise ValueError(f"materials must be of the parts {', '.join(parts)}, got one of {unknown[0]!r}")
+        return {name: changed(parts[name].material, name, dict(values)) for name, values in look.material if values}
+
+    def appearances(self, look: Look) -> dict[str, Appearance]:
+        """The same at the vertices."""
+        key = look.system, look.material
+        return self._once("material", key, lambda: self.system(look).appearances(self.materials(look)))
+
+    def light_side(self, look: Look) -> Any:
+        """What the light is to the system, and what of it arrives."""
+        system = self.system(look)
+        light_key = look.system, look.bounces, look.light, look.lamps, look.turn
+        light = self._once("light", light_key, lambda: system.light(self.environment(look)))
+        if not look.bounces:
+            return light
+        key = (*light_key, look.material)
+        return self._once("shade", key, lambda: system.shade(light, self.appearances(look)))
+
+    def view_side(self, look: Look) -> Any:
+        """What the eye and the materials are to the system."""
+        key = look.system, look.bounces, look.eye, look.material
+        eye = jnp.asarray(look.eye, jnp.result_type(float))
+        return self._once("view", key, lambda: self.system(look).view(eye, self.appearances(look)))
+
+    def color(self, look: Look) -> Float[np.ndarray, "v 3"]:
+        """Radiance of the vertices."""
+        color = np.asarray(self.system(look).combine(self.light_side(look), self.view_side(look)))
+        return np.broadcast_to(color, (len(color), 3))  # gray ones have one channel
+
+    def picture(self, look: Look, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
+        """The picture at pixels."""
+        environment = self.environment(look)
+        found = self.system(look).picture(environment, camera(look, width, height), materials=self.materials(look))
+        return np.broadcast_to(np.asarray(found), (height, width, 3))
+
+    def changed_scene(self, look: Look) -> Scene:
+        """The scene with the changed materials in it."""
+        new, scene = self.materials(look), self.scene.scene
+        parts = [dataclasses.replace(part, material=new.get(part.name, part.material)) for part in scene.parts]
+        return dataclasses.replace(scene, parts=parts)
+
+    def _once(self, stage: str, key: Hashable, make: Callable[[], Made]) -> Made:
+        """What was made from the same before, or else is made now."""
+        with self._lock:
+            kept = self._kept.setdefault(stage, OrderedDict())
+            if key in kept:
+                kept.move_to_end(key)
+                return kept[key]
+        made = jax.block_until_ready(make())
+        with self._lock:
+            kept[key] = made
+            while len(kept) > _KEPT:
+                kept.popitem(last=False)
+        return made
+
+
+def about(angle: float) -> Float[Array, "3 3"]:
+    """The turn about +y by an angle in radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
+
+
+def camera(look: Look, width: int, height: int) -> Camera:
+    """The camera of a look."""
+    return Camera(list(look.eye), list(look.target), [0.0, 1.0, 0.0], look.field_of_view, width, height)
+
+
+def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
+    """What of a part's material can change, with its values now; None for a BRDF, which stays."""
+    if not isinstance(material, TexturedMaterial):
+        return None
+    free: dict[str, Any] = {"diffuse": np.asarray(material.base_color).tolist()}
+    if isinstance(shading.brdf, Lambert):
+        return free
+    low, high = (float(each) for each in roughness_range(shading))
+    tint = np.asarray(material.specular_color)
+    if high > low and material.roughness_texture is None:
+        free |= {"roughness": float(material.roughness), "roughness_range": [low, high]}
+    if float(material.metallic) < 1:
+        free |= {"f0": min(float(tint.max()) * _f0(material), 1.0), "specular": (tint / max(tint.max(), 1e-6)).tolist()}
+    return free
+
+
+def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial:
+    """A material of other roughness, reflectance and colors.
+
+    Raises:
+        ValueError: It is a BRDF, which cannot change.
+    """
+    if not isinstance(material, TexturedMaterial):
+        raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change while it is looked at")
+    new: dict[str, Any] = {}
+    if "roughness" in values:
+        new["roughness"] = values["roughness"]
+    if "diffuse" in values:
+        new["base_color"] = jnp.asarray(values["diffuse"])
+    if "f0" in values or "specular" in values:
+        old = np.asarray(material.specular_color)
+        strength = values["f0"] / _f0(material) if "f0" in values else float(old.max())
+        tint = np.asarray(values["specular"]) if "specular" in values else old / max(old.max(), 1e-6)
+        new["specular_color"] = jnp.asarray(strength * tint)
+    return dataclasses.replace(material, **new)
+
+
+def _f0(material: TexturedMaterial) -> float:
+    """Reflectance at normal incidence of a white dielectric of the material's index of refraction."""
+    ior = float(material.ior)
+    return 1.0 if ior == 0 else max(((ior - 1) / (ior + 1)) ** 2, 1e-6)
+
+
+def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
+    """A light with disks of light in it; one that is smaller than a texel keeps its flux."""
+    size = light.radiance.shape[-2]
+    radiance = np.asarray(light.radiance, np.float64)
+    if not lamps:
+        return light
+    radiance = np.broadcast_to(radiance, (*radiance.shape[:-1], 3)).copy()
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64)
+    part = np.asarray(cubemap.direction(size=size * _FINE), np.float64)
+    part_area = np.asarray(cubemap.solid_angle(size=size * _FINE), np.float64)
+    for each in lamps:
+        middle = np.asarray(each.direction) / np.linalg.norm(each.direction)
+        toward = part @ middle
+        inside = part_area * (toward >= min(np.cos(each.angle), toward.max()))
+        flux = inside.reshape(6, size, _FINE, size, _FINE).sum((2, 4))
+        flux *= 2 * np.pi * (1 - np.cos(each.angle)) / flux.sum()
+        radiance += (flux / area)[..., None] * np.asarray(each.radiance)
+    return Environment(jnp.asarray(radiance, light.radiance.dtype))
