@@ -1,0 +1,153 @@
+"""The viewer without a notebook: a server on this machine alone, and the browser's page."""
+
+import http.server
+import pathlib
+import secrets
+import threading
+from typing import Any
+
+from jaxprt.view import messages
+from jaxprt.view.session import Session
+
+MODULE = pathlib.Path(__file__).with_name("viewer.js")
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>jaxprt</title><link rel="icon" href="data:,">
+<body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
+<script type="module">
+import { mount } from "./viewer.js";
+async function ask(content, buffers = []) {
+  const lengths = buffers.map((each) => each.byteLength);
+  let head = new TextEncoder().encode(JSON.stringify({ content, lengths }));
+  const padded = new Uint8Array(head.length + ((8 - ((head.length + 4) % 8)) % 8)).fill(32);
+  padded.set(head);
+  const length = new Uint8Array(new Uint32Array([padded.length]).buffer);
+  const pieces = buffers.flatMap((each) => [each, new Uint8Array((8 - (each.byteLength % 8)) % 8)]);
+  const response = await fetch("./ask", { method: "POST", body: new Blob([length, padded, ...pieces]) });
+  if (!response.ok) throw new Error(`the server says ${response.status}`);
+  const data = await response.arrayBuffer(), size = new DataView(data).getUint32(0, true);
+  const found = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
+  let place = 4 + size;
+  const arrays = found.lengths.map((each) => {
+    const view = new DataView(data, place, each);
+    place += each + ((8 - (each % 8)) % 8);
+    return view;
+  });
+  return { content: found.content, buffers: arrays };
+}
+const close = mount(document.getElementById("viewer"), ask);
+window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
+</script></body></html>
+"""
+# Nothing from elsewhere is loaded, and no other page may show or read this one.
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' data: blob:; frame-ancestors 'none'",
+}
+
+
+class Server:
+    """A viewer at an address of this machine, until it is closed. Its address holds a random token.
+
+    Attributes:
+        url: The address.
+    """
+
+    def __init__(self, session: Session, *, port: int = 0):
+        """Starts to serve, in a thread of its own.
+
+        Args:
+            session: What to show.
+            port: Of this machine; a free one if 0.
+
+        Raises:
+            OSError: The port is taken, or may not be.
+        """
+        token = secrets.token_urlsafe(16)
+        self._server = _Listener(("127.0.0.1", port), _handler(session, token))
+        self.url = f"http://127.0.0.1:{self._server.server_port}/{token}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stops to serve, and gives the port back."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Waits until the server is closed."""
+        self._thread.join()
+
+
+class _Listener(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Says nothing: a tab that was closed takes no answer."""
+
+
+def _handler(session: Session, token: str) -> type[http.server.BaseHTTPRequestHandler]:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        timeout = 600
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Nothing is logged: addresses hold the token."""
+
+        def do_GET(self) -> None:  # noqa: N802
+            """The page and its module."""
+            if not self._allowed():
+                return
+            pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
+            pages["viewer.js"] = MODULE.read_bytes(), "text/javascript; charset=utf-8"
+            found = pages.get(self.path.split("?")[0].removeprefix(f"/{token}/"))
+            if found is None:
+                self._send(404, b"there is no such page", "text/plain")
+            else:
+                self._send(200, *found)
+
+        def do_POST(self) -> None:  # noqa: N802
+            """A message of the page."""
+            if not self._allowed():
+                return
+            length = self.headers.get("Content-Length", "")
+            if not length.isdecimal() or int(length) > messages.MOST_BYTES:
+                self.close_connection = True
+                self._send(413, b"a message must say its length, and be less than 512 MiB", "text/plain")
+                return
+            data = self.rfile.read(int(length))
+            if self.path != f"/{token}/ask":
+                self._send(404, b"there is no such page", "text/plain")
+                return
+            try:
+                content, buffers = messages.unpack(data)
+            except ValueError as error:
+                self._send(400, str(error).encode(), "text/plain")
+                return
+            self._send(200, messages.pack(*session.answer(content, buffers)), "application/octet-stream")
+
+        def _allowed(self) -> bool:
+            """Refuses wrong tokens, other names for this machine, and pages of other origins."""
+            port = self.server.server_address[1]
+            hosts = [f"127.0.0.1:{port}", f"localhost:{port}"]
+            origin = self.headers.get("Origin")
+            right = secrets.compare_digest(self.path.encode()[: len(token) + 2], f"/{token}/".encode())
+            known = self.headers.get("Host") in hosts and (origin is None or origin in [f"http://{x}" for x in hosts])
+            if right and known:
+                return True
+            self.close_connection = True
+            self._send(403, b"this address is not the viewer's", "text/plain")
+            return False
+
+        def _send(self, status: int, data: bytes, kind: str) -> None:
+            self.send_response(status)
+            for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(data)
+
+    return Handler

@@ -1,0 +1,45 @@
+"""The viewer in a notebook, by anywidget."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import anywidget
+import traitlets
+
+from jaxprt.view.server import MODULE
+from jaxprt.view.session import Session
+
+
+class Viewer(anywidget.AnyWidget):
+    """A viewer in a cell.
+
+    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel.
+
+    Attributes:
+        session: What it shows.
+        height: Of the viewer in the page's pixels.
+    """
+
+    _esm = MODULE
+    height = traitlets.Int(480, min=1).tag(sync=True)
+
+    def __init__(self, session: Session, *, height: int = 480):
+        """Shows a session."""
+        super().__init__(height=height)
+        self.session = session
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="jaxprt-view")
+        self.on_msg(self._heard)
+
+    def close(self) -> None:
+        """Takes the viewer out of the notebook."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        super().close()
+
+    def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
+        if isinstance(message, dict) and isinstance(message.get("content"), dict):
+            self._threads.submit(self._answer, message, [bytes(each) for each in buffers])
+
+    def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:
+        content, arrays = self.session.answer(message["content"], buffers)
+        self.send({"id": message.get("id"), "content": content}, arrays)
