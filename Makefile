@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo check test test-long bench tables notebooks clean
+.PHONY: help setup demo view check test test-long bench tables notebooks clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -16,6 +16,9 @@ help: ## this list
 setup: $(VENV)/.setup ## install the package, with what the demo needs
 demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
 	$(BIN)/python -m jaxprt --output output/demo
+
+view: $(VENV)/.setup ## play with the embedded scene in the browser: ARGS="mesh.ply light.hdr" for files
+	$(BIN)/python -m jaxprt view $(ARGS)
 
 check: $(VENV)/.setup-test ## format, lint and types
 	$(BIN)/ruff format --check

@@ -16,7 +16,7 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, visibility
+from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
 from jaxprt.relit import RelitScene, plan, precompute, refine
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
@@ -56,6 +56,7 @@ __all__ = [
     "shard",
     "sphere",
     "total",
+    "view",
     "visibility",
 ]
 __version__ = "0.1.0"

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 import jaxprt as prt
-from jaxprt.cli import animation, report
+from jaxprt.cli import animation, play, report
 from jaxprt.cli.report import Made, View
 from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Environment, Part, Scene
@@ -49,10 +49,15 @@ _RANGES = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    plays = arguments[:1] == ["view"]
+    options = None if plays else _parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"jaxprt: {message}", file=sys.stderr)
     try:
-        _run(options)
+        if options is None:
+            play.main(arguments[1:])
+        else:
+            _run(options)
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"jaxprt: error: {error}", file=sys.stderr)
         return 2

@@ -72,7 +72,7 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
         ValueError: A piece is missing, is no finite number in its range, or names what there is not.
     """
     system = message.get("system")
-    if system not in systems:
+    if not isinstance(system, str) or system not in systems:
         raise ValueError(f"the system must be one of {', '.join(systems)}, got {system!r}")
     light = message.get("light")
     if type(light) is not int or not 0 <= light < lights:

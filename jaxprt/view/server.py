@@ -66,7 +66,7 @@ class Server:
             OSError: The port is taken, or may not be.
         """
         token = secrets.token_urlsafe(16)
-        self._server = _Listener(("127.0.0.1", port), _handler(session, token))
+        self._server = _Listener(port, session, token)
         self.url = f"http://127.0.0.1:{self._server.server_port}/{token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
         self._thread.start()
@@ -86,68 +86,72 @@ class _Listener(http.server.ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
+    def __init__(self, port: int, session: Session, token: str):
+        self.session, self.token = session, token
+        super().__init__(("127.0.0.1", port), _Handler)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing: a tab that was closed takes no answer."""
 
 
-def _handler(session: Session, token: str) -> type[http.server.BaseHTTPRequestHandler]:
-    class Handler(http.server.BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-        timeout = 600
+class _Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = 600
+    server: _Listener  # pyright: ignore[reportIncompatibleVariableOverride]
 
-        def log_message(self, format: str, *args: Any) -> None:
-            """Nothing is logged: addresses hold the token."""
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing is logged: addresses hold the token."""
 
-        def do_GET(self) -> None:  # noqa: N802
-            """The page and its module."""
-            if not self._allowed():
-                return
-            pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
-            pages["viewer.js"] = MODULE.read_bytes(), "text/javascript; charset=utf-8"
-            found = pages.get(self.path.split("?")[0].removeprefix(f"/{token}/"))
-            if found is None:
-                self._send(404, b"there is no such page", "text/plain")
-            else:
-                self._send(200, *found)
+    def do_GET(self) -> None:
+        """The page and its module."""
+        if not self._allowed():
+            return
+        pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
+        pages["viewer.js"] = MODULE.read_bytes(), "text/javascript; charset=utf-8"
+        found = pages.get(self.path.split("?")[0].removeprefix(f"/{self.server.token}/"))
+        if found is None:
+            self._send(404, b"there is no such page", "text/plain")
+        else:
+            self._send(200, *found)
 
-        def do_POST(self) -> None:  # noqa: N802
-            """A message of the page."""
-            if not self._allowed():
-                return
-            length = self.headers.get("Content-Length", "")
-            if not length.isdecimal() or int(length) > messages.MOST_BYTES:
-                self.close_connection = True
-                self._send(413, b"a message must say its length, and be less than 512 MiB", "text/plain")
-                return
-            data = self.rfile.read(int(length))
-            if self.path != f"/{token}/ask":
-                self._send(404, b"there is no such page", "text/plain")
-                return
-            try:
-                content, buffers = messages.unpack(data)
-            except ValueError as error:
-                self._send(400, str(error).encode(), "text/plain")
-                return
-            self._send(200, messages.pack(*session.answer(content, buffers)), "application/octet-stream")
-
-        def _allowed(self) -> bool:
-            """Refuses wrong tokens, other names for this machine, and pages of other origins."""
-            port = self.server.server_address[1]
-            hosts = [f"127.0.0.1:{port}", f"localhost:{port}"]
-            origin = self.headers.get("Origin")
-            right = secrets.compare_digest(self.path.encode()[: len(token) + 2], f"/{token}/".encode())
-            known = self.headers.get("Host") in hosts and (origin is None or origin in [f"http://{x}" for x in hosts])
-            if right and known:
-                return True
+    def do_POST(self) -> None:
+        """A message of the page."""
+        if not self._allowed():
+            return
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > messages.MOST_BYTES:
             self.close_connection = True
-            self._send(403, b"this address is not the viewer's", "text/plain")
-            return False
+            self._send(413, b"a message must say its length, and be less than 512 MiB", "text/plain")
+            return
+        data = self.rfile.read(int(length))
+        if self.path != f"/{self.server.token}/ask":
+            self._send(404, b"there is no such page", "text/plain")
+            return
+        try:
+            content, buffers = messages.unpack(data)
+        except ValueError as error:
+            self._send(400, str(error).encode(), "text/plain")
+            return
+        self._send(200, messages.pack(*self.server.session.answer(content, buffers)), "application/octet-stream")
 
-        def _send(self, status: int, data: bytes, kind: str) -> None:
-            self.send_response(status)
-            for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(data)
+    def _allowed(self) -> bool:
+        """Refuses wrong tokens, other names for this machine, and pages of other origins."""
+        port = self.server.server_port
+        hosts = [f"127.0.0.1:{port}", f"localhost:{port}"]
+        origin = self.headers.get("Origin")
+        right = secrets.compare_digest(
+            self.path.encode()[: len(self.server.token) + 2], f"/{self.server.token}/".encode()
+        )
+        known = self.headers.get("Host") in hosts and (origin is None or origin in [f"http://{x}" for x in hosts])
+        if right and known:
+            return True
+        self.close_connection = True
+        self._send(403, b"this address is not the viewer's", "text/plain")
+        return False
 
-    return Handler
+    def _send(self, status: int, data: bytes, kind: str) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)

@@ -1,0 +1,247 @@
+"""Answers of a session: colors and pictures of the state that is asked for, and words where it is wrong."""
+
+import dataclasses
+import json
+import threading
+import zlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import files, image
+from jaxprt.scene import Camera, Environment
+from jaxprt.scene.environment import rotate
+from jaxprt.sphere import cubemap
+from jaxprt.view import Session, messages, stages
+
+EYE = jnp.array([2.0, 1.5, 4.0])
+
+
+def halves(reply) -> np.ndarray:
+    """Colors of an answer, in linear radiance."""
+    assert reply.content["kind"] in ("color", "still", "sky"), reply.content
+    return reply.content["scale"] * np.frombuffer(reply.buffers[0], "<f2").astype(np.float32).reshape(-1, 3)
+
+
+def turned(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def near(value, expected):
+    np.testing.assert_allclose(value, expected, rtol=2e-3, atol=2e-3 * np.max(expected))
+
+
+def test_a_scene_is_told_with_what_can_change(session, systems):
+    reply = session.answer({"kind": "scene"})
+    scene = systems["lobes"]
+    json.dumps(reply.content, allow_nan=False)
+    position, face = (np.frombuffer(data, kind) for data, kind in zip(reply.buffers, ("<f4", "<u4"), strict=True))
+    np.testing.assert_array_equal(position.reshape(-1, 3), scene.mesh.position)
+    np.testing.assert_array_equal(face.reshape(-1, 3), scene.mesh.face)
+    ball, ground = reply.content["parts"]
+    assert ball["free"]["roughness_range"] == pytest.approx([0.4, 0.8])
+    assert ball["free"]["f0"] == pytest.approx(0.04)
+    assert set(ground["free"]) == {"diffuse"}
+    assert reply.content["systems"] == {"lobes": {"bounces": True}, "harmonics": {"bounces": False}}
+
+
+@pytest.mark.parametrize("system", ["lobes", "harmonics"])
+@pytest.mark.parametrize("bounces", [False, True])
+def test_a_look_is_the_radiance_of_its_state(session, systems, lights, look, system, bounces):
+    look |= {"system": system, "bounces": bounces, "turn": 0.7, "eye": [1.0, 2.0, 3.0]}
+    scene = systems[system]
+    if not bounces:
+        scene = prt.RelitScene(scene.scene, scene.direct, scene.shading)
+    expected = scene.radiance(rotate(lights["lamp"], turned(0.7)), eye=jnp.array([1.0, 2.0, 3.0]))
+    near(halves(session.answer(look)), expected)
+
+
+def test_materials_of_a_look_are_those_of_the_scene_with_them(session, systems, lights, look):
+    scene = systems["lobes"]
+    old = scene.scene["ball"].material
+    look["materials"] = {"ball": {"roughness": 0.7, "f0": 0.5, "diffuse": [0.1, 0.2, 0.3], "specular": [1, 0.5, 0.2]}}
+    new = dataclasses.replace(
+        old,
+        roughness=0.7,
+        base_color=jnp.array([0.1, 0.2, 0.3]),
+        specular_color=jnp.array([1, 0.5, 0.2]) * 0.5 / 0.04,
+    )
+    direct = prt.RelitScene(scene.scene, scene.direct, scene.shading)
+    near(halves(session.answer(look)), direct.radiance(lights["lamp"], eye=EYE, materials={"ball": new}))
+
+
+def test_a_light_that_turns_leaves_the_view_alone(session, look, monkeypatch):
+    made = []
+    once = stages.Stages._once
+
+    def counted(self, stage, key, make):
+        return once(self, stage, key, lambda: (made.append(stage), make())[1])
+
+    monkeypatch.setattr(stages.Stages, "_once", counted)
+    session.answer(look | {"bounces": True})
+    made.clear()
+    session.answer(look | {"bounces": True, "turn": 0.3})
+    assert made == ["environment", "light", "shade"]
+    made.clear()
+    session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0]})
+    assert made == ["view"]
+    made.clear()
+    session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0], "materials": {"ball": {"f0": 0.3}}})
+    assert made == ["material", "shade", "view"]
+
+
+def test_pictures_at_rest_are_those_of_the_scene(session, systems, lights, look):
+    scene = systems["lobes"]
+    reply = session.answer(look | {"kind": "still", "width": 48, "height": 32})
+    camera = Camera(EYE, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.7, 48, 32)
+    expected = prt.RelitScene(scene.scene, scene.direct, scene.shading).picture(lights["lamp"], camera)
+    near(halves(reply).reshape(32, 48, 3), expected)
+
+
+def test_the_exact_picture_comes_with_the_error_of_the_other(session, look):
+    reply = session.answer(look | {"kind": "exact", "width": 24, "height": 24})
+    assert reply.content["exact"]
+    assert 0 < reply.content["error"] < 0.5
+    still = session.answer(look | {"kind": "still", "width": 24, "height": 24})
+    assert image.relative_l2(halves(still), halves(reply)) < 0.5
+
+
+def test_pictures_are_given_up_when_a_later_look_has_come(session, look):
+    session.answer(look | {"seq": 5})
+    for kind in ("still", "exact"):
+        reply = session.answer(look | {"kind": kind, "seq": 4, "width": 16, "height": 16})
+        assert reply.content == {"kind": "late", "seq": 4}
+
+
+def test_bytes_are_exposed_and_encoded_for_a_display(session, look):
+    linear = halves(session.answer(look))
+    data = zlib.decompress(session.answer(look | {"stops": 1.5}).buffers[0])
+    level = np.cumsum(np.frombuffer(data, np.uint8).reshape(3, -1), axis=1, dtype=np.uint8).T
+    expected = image.display(image.expose(jnp.asarray(linear), stops=1.5))
+    np.testing.assert_allclose(level / 255, expected, atol=0.6 / 255)
+
+
+def test_radiance_beyond_half_floats_keeps_its_ratios(systems, look):
+    bright = {"bright": Environment(np.full((6, 8, 8, 3), 1e7))}
+    plain = {"bright": Environment(np.ones((6, 8, 8, 3)))}
+    value, unit = (halves(Session(systems, light).answer(look)) for light in (bright, plain))
+    near(value, 1e7 * unit)
+
+
+def test_a_small_lamp_has_its_flux_in_its_direction(session, lights, look):
+    lamp = {"direction": [0.3, 1.0, 0.2], "angle": 0.05, "radiance": [100.0, 50.0, 25.0]}
+    found = messages.look(look | {"light": 1, "lamps": [lamp]}, systems=["lobes"], lights=2)
+    added = np.asarray(session.stages.environment(found).radiance - lights["gray"].radiance)
+    area = np.asarray(cubemap.solid_angle(size=8))[..., None]
+    flux = (area * added).sum((0, 1, 2))
+    np.testing.assert_allclose(flux, 2 * np.pi * (1 - np.cos(0.05)) * np.array([100, 50, 25]), rtol=1e-5)
+    middle = (area[..., 0] * added[..., 0])[..., None] * np.asarray(cubemap.direction(size=8))
+    toward = middle.sum((0, 1, 2)) / np.linalg.norm(middle.sum((0, 1, 2)))
+    assert toward @ np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2]) > np.cos(0.12)
+
+
+def test_the_picture_of_the_sky_has_up_on_top_and_z_in_the_middle(systems, look):
+    side = np.zeros((6, 8, 8, 3))
+    side[0], side[2], side[4] = [1, 0, 0], [0, 1, 0], [0, 0, 1]  # +x red, +y green, +z blue
+    reply = Session(systems, {"axes": Environment(side)}).answer(look | {"kind": "sky"})
+    sky = halves(reply).reshape(reply.content["height"], reply.content["width"], 3)
+    near(sky[0, 100], [0, 1, 0])
+    near(sky[64, 128], [0, 0, 1])
+    near(sky[64, 64], [1, 0, 0])
+
+
+def test_a_dropped_file_becomes_a_light(session, look, tmp_path):
+    path = tmp_path / "gray.exr"
+    files.write_exr(path, np.full((8, 16, 3), 0.25, np.float32))
+    reply = session.answer({"kind": "drop", "name": "gray.exr"}, [path.read_bytes()])
+    assert reply.content == {"kind": "lights", "lights": ["lamp", "gray", "gray"], "light": 2}
+    near(halves(session.answer(look | {"light": 2})) * 2, halves(session.answer(look | {"light": 1})))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [("notes.txt", b"no light", "notes.txt"), ("a.exr", b"\x76\x2f\x31\x01 cut", "a.exr"), ("b.hdr", b"", "no bytes")],
+)
+def test_files_that_are_no_environment_are_refused_by_name(session, look, name, data, words):
+    reply = session.answer({"kind": "drop", "name": name}, [data])
+    assert reply.content["kind"] == "error"
+    assert words in reply.content["message"]
+    assert session.answer(look).content["kind"] == "color"
+
+
+WRONG = {
+    "kind": ({"kind": "dance"}, "the kind of a message must be one of scene, look"),
+    "system": ({"system": "magic"}, "the system must be one of lobes, harmonics, got 'magic'"),
+    "light": ({"light": 2}, "the light must be a number from 0 to 1, got 2"),
+    "light of truth": ({"light": True}, "the light must be a number from 0 to 1, got True"),
+    "turn": ({"turn": float("nan")}, "turn must be a finite number, got nan"),
+    "text": ({"turn": "1"}, "turn must be a finite number, got '1'"),
+    "eye": ({"eye": [0, 0]}, "eye must be 3 numbers, got 2"),
+    "target": ({"target": [2.0, 1.5, 4.0]}, "eye and target must be two places"),
+    "angle": ({"field_of_view": 4}, "field_of_view must be from 0.001 to"),
+    "size": ({"kind": "still", "width": 0, "height": 4}, "width must be from 1 to 2048, got 0"),
+    "part": ({"materials": {"cat": {"f0": 0.1}}}, "materials must be of the parts ball, ground, got one of 'cat'"),
+    "range": ({"materials": {"ball": {"f0": 2}}}, "f0 must be from 0 to 1, got 2"),
+    "name": ({"materials": {"ball": {"fur": 1}}}, "must have some of roughness, f0, diffuse, specular"),
+    "rough": ({"materials": {"ball": {"roughness": 0.1}}}, "precomputed for roughness from 0.400 to 0.800"),
+    "gloss": ({"materials": {"ground": {"f0": 0.1, "specular": [1, 1, 1]}}}, None),
+    "lamp": ({"lamps": [{"direction": [0, 0, 0], "angle": 1, "radiance": [1, 1, 1]}]}, "must have a length"),
+    "lamps": ({"lamps": 3}, "lamps must be a list, got 3"),
+    "stops": ({"stops": 1e9}, "stops must be from -60 to 60"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_message_is_answered_by_what_was_required(session, look, name):
+    fields, words = WRONG[name]
+    reply = session.answer(look | fields)
+    if words is None:  # without a specular weight its color means nothing
+        assert reply.content["kind"] == "color"
+        return
+    assert reply.content["kind"] == "error"
+    assert words in reply.content["message"]
+    assert session.answer(look).content["kind"] == "color"
+
+
+def test_threads_get_the_answers_to_their_own_questions(session, look):
+    asked = [look | {"seq": k, "turn": 0.4 * (k % 3), "materials": {"ball": {"f0": 0.1 * (k % 2)}}} for k in range(12)]
+    alone = [halves(session.answer(each)) for each in asked]
+    found: dict[int, np.ndarray] = {}
+    threads = [
+        threading.Thread(target=lambda k=k, each=each: found.update({k: halves(session.answer(each))}))
+        for k, each in enumerate(asked)
+    ]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    for k, expected in enumerate(alone):
+        np.testing.assert_array_equal(found[k], expected)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_scenes_and_lights_that_do_not_fit_are_refused(systems, lights):
+    with pytest.raises(ValueError, match="must have a system, got none"):
+        Session({}, lights)
+    with pytest.raises(TypeError, match=r"the system 'a' must be of class RelitScene, which jaxprt.precompute makes"):
+        Session({"a": systems["lobes"].scene}, lights)
+    with pytest.raises(ValueError, match="must have a light, got none"):
+        Session(systems, {})
+    with pytest.raises(ValueError, match="lights must be of one size, got faces of 4, 8 texels"):
+        Session(systems, lights | {"small": Environment(np.ones((6, 4, 4, 3)))})
+    with pytest.raises(ValueError, match=r"the light 'two' must be one light"):
+        Session(systems, {"two": Environment(np.ones((2, 6, 8, 8, 3)))})
+
+
+def test_messages_come_through_as_they_went():
+    content, buffers = {"kind": "look", "x": [1, 2.5]}, [b"abc", b"", bytes(range(16))]
+    assert messages.unpack(messages.pack(content, buffers)) == (content, buffers)
+
+
+@pytest.mark.parametrize("data", [b"", b"abc", b"\xff\xff\xff\xff{}", messages.pack({"a": 1}, [bytes(64)])[:-40]])
+def test_bytes_that_are_no_message_are_refused(data):
+    with pytest.raises(ValueError, match=f"what the viewer sends, got {len(data)} other bytes"):
+        messages.unpack(data)
