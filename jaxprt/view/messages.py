@@ -161,8 +161,8 @@ def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
     """
     value = np.asarray(color, np.float32)
     if stops is None:
-        scale = max(1.0, float(np.max(value, initial=0.0)) / _LARGEST_HALF)
-        return np.clip(value / np.float32(scale), 0, _LARGEST_HALF).astype("<f2").tobytes(), scale
+        scale = max(1.0, float(np.max(np.abs(value), initial=0.0)) / _LARGEST_HALF)
+        return np.clip(value / np.float32(scale), -_LARGEST_HALF, _LARGEST_HALF).astype("<f2").tobytes(), scale
     exposed = np.clip(value * np.float32(2.0**stops), 0, 1)
     display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
     level = np.round(255 * display).astype(np.uint8)
@@ -184,7 +184,7 @@ def _lamp(message: Any) -> Lamp:
     direction = numbers(message, "direction", 3)
     if not 1e-6 < math.hypot(*direction) < 1e6:
         raise ValueError(f"the direction of a lamp must have a length, got {list(direction)}")
-    return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, 0, 1e9))
+    return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, 0.0, 1e9))
 
 
 def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
@@ -199,5 +199,7 @@ def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     result = []
     for name in sorted(message):
         count, most = MATERIAL[name]
-        result.append((name, number(message, name, 0, most) if count == 1 else numbers(message, name, count, 0, most)))
+        result.append(
+            (name, number(message, name, 0.0, most) if count == 1 else numbers(message, name, count, 0.0, most))
+        )
     return tuple(result)

@@ -1,8 +1,10 @@
 """The viewer without a notebook: a server on this machine alone, and the browser's page."""
 
+import contextlib
 import http.server
 import pathlib
 import secrets
+import socket
 import threading
 from typing import Any
 
@@ -88,7 +90,25 @@ class _Listener(http.server.ThreadingHTTPServer):
 
     def __init__(self, port: int, session: Session, token: str):
         self.session, self.token = session, token
+        self._open: set[socket.socket] = set()
         super().__init__(("127.0.0.1", port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Remembers connections: browsers keep them open."""
+        self._open.add(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Forgets a connection that ends."""
+        self._open.discard(request)
+        super().shutdown_request(request)
+
+    def server_close(self) -> None:
+        """Ends the connections that are open, too."""
+        super().server_close()
+        for each in list(self._open):
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing: a tab that was closed takes no answer."""

@@ -21,7 +21,7 @@ from jaxprt.view import messages, stages
 from jaxprt.view.messages import Look, Reply
 from jaxprt.view.stages import Stages
 
-_LARGEST = 2048  # pixels along an edge of a picture
+_LARGEST = 2048.0  # pixels along an edge of a picture
 _PIXELS = 400  # of a picture that the exact sum is compared at
 
 
@@ -107,7 +107,7 @@ class Session:
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
         look = messages.look(message, systems=list(self.stages.systems), lights=len(self.stages.lights))
-        return look, int(messages.number(message, "seq", 0, 2**53))
+        return look, int(messages.number(message, "seq", 0.0, 2.0**53))
 
     def _look(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         look, seq = self._parse(message)
@@ -126,7 +126,7 @@ class Session:
 
     def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         look, seq = self._parse(message)
-        width, height = (int(messages.number(message, each, 1, _LARGEST)) for each in ("width", "height"))
+        width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
         began = time.perf_counter()
         if self._is_late(seq):
             return Reply({"kind": "late", "seq": seq}, [])
@@ -139,7 +139,7 @@ class Session:
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """The exact picture in direct light, and the error of the picture at rest against some exact pixels."""
         look, seq = self._parse(message)
-        width, height = (int(messages.number(message, each, 1, _LARGEST)) for each in ("width", "height"))
+        width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
         look = look._replace(bounces=False)
         scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
         shadings = [of_part(part) for part in scene.parts]
@@ -195,7 +195,7 @@ def _named(lights: Sequence[Environment]) -> dict[str, Environment]:
 
 
 def _stops(message: Mapping[str, Any]) -> float | None:
-    return None if message.get("stops") is None else messages.number(message, "stops", -60, 60)
+    return None if message.get("stops") is None else messages.number(message, "stops", -60.0, 60.0)
 
 
 def _check_lights(lights: Mapping[str, Environment]) -> None:

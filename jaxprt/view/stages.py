@@ -209,4 +209,4 @@ def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
         flux = inside.reshape(6, size, _FINE, size, _FINE).sum((2, 4))
         flux *= 2 * np.pi * (1 - np.cos(each.angle)) / flux.sum()
         radiance += (flux / area)[..., None] * np.asarray(each.radiance)
-    return Environment(jnp.asarray(radiance, light.radiance.dtype))
+    return Environment(jnp.asarray(radiance, jnp.result_type(light.radiance)))

@@ -84,13 +84,13 @@ def test_a_light_that_turns_leaves_the_view_alone(session, look, monkeypatch):
     session.answer(look | {"bounces": True})
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3})
-    assert made == ["environment", "light", "shade"]
+    assert sorted(made) == ["environment", "light", "shade"]
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0]})
     assert made == ["view"]
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0], "materials": {"ball": {"f0": 0.3}}})
-    assert made == ["material", "shade", "view"]
+    assert sorted(made) == ["material", "shade", "view"]
 
 
 def test_pictures_at_rest_are_those_of_the_scene(session, systems, lights, look):

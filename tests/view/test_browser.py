@@ -1,0 +1,299 @@
+"""The viewer in a real browser: hands move the state, and the canvas shows what Python draws of it.
+
+Headless Chromium, found as `chromium`; skipped where there is none, unless JAXPRT_BROWSER_REQUIRED is set.
+"""
+
+import io
+import os
+import shutil
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxprt as prt
+from jaxprt import files, image
+from jaxprt.scene import Camera
+from jaxprt.scene.environment import rotate
+from jaxprt.view import Server
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
+TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
+
+if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
+    pytest.skip("no chromium on this machine", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield made
+        made.close()
+
+
+class Hand:
+    """A tab that shows a viewer."""
+
+    def __init__(self, browser, url):
+        self.page = browser.new_page(viewport={"width": 496, "height": 320})
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(url)
+        self.wait("shown >= 0 && stats.shown === stats.seq")
+
+    def stats(self):
+        return self.page.evaluate(f"() => ({CANVAS}).stats")
+
+    def state(self):
+        return self.page.evaluate(f"() => ({CANVAS}).state")
+
+    def camera(self):
+        return self.page.evaluate(f"() => {{ const c = ({CANVAS}).camera(); return {{ ...c, eye: c.eye }}; }}")
+
+    def wait(self, condition, seconds=60):
+        """Until something is true of the counters."""
+        self.page.wait_for_function(
+            f"() => {{ const stats = ({CANVAS})?.stats; return stats && stats.{condition}; }}", timeout=1000 * seconds
+        )
+
+    def settle(self):
+        self.wait("shown === stats.seq")
+
+    def still(self):
+        """Until the picture at rest has faded in."""
+        before = self.stats()["stills"]
+        self.settle()
+        self.wait(f"stills > {before}")
+        time.sleep(0.5)
+
+    def drag(self, start, end, steps=5, button="left"):
+        self.page.mouse.move(*start)
+        self.page.mouse.down(button=button)
+        self.page.mouse.move(*end, steps=steps)
+        self.page.mouse.up(button=button)
+        self.settle()
+
+    def pixels(self):
+        """What the canvas shows, in [0, 1], read from its drawing."""
+        text = self.page.evaluate(f"() => ({CANVAS}).toDataURL('image/png')")
+        import base64
+
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("RGB")) / 255
+
+
+@pytest.fixture
+def server(session):
+    made = Server(session)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def hand(browser, server):
+    made = Hand(browser, server.url)
+    yield made
+    made.page.close()
+    assert not made.errors
+
+
+def drawn(hand, systems, lights):
+    """The picture that Python draws of the state of a tab."""
+    state, camera = hand.state(), hand.camera()
+    scene = systems[state["system"]]
+    if not state["bounces"]:
+        scene = prt.RelitScene(scene.scene, scene.direct, scene.shading)
+    c, s = np.cos(state["turn"]), np.sin(state["turn"])
+    light = rotate(list(lights.values())[state["light"]], np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
+    height, width = hand.pixels().shape[:2]
+    view = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
+    return np.asarray(image.display(image.expose(scene.picture(light, view), stops=float(state["stops"]))))
+
+
+def test_the_canvas_shows_what_python_draws(hand, systems, lights):
+    hand.page.keyboard.press("g")
+    hand.page.locator("canvas.canvas").focus()
+    hand.still()
+    expected = drawn(hand, systems, lights)
+    np.testing.assert_allclose(hand.pixels(), expected, atol=2.5 / 255)
+
+
+def test_while_it_moves_the_canvas_shows_radiance_of_vertices_within_antialiasing(hand, systems, lights):
+    hand.page.locator("canvas.canvas").focus()
+    hand.page.keyboard.press("p")
+    hand.drag((100, 150), (150, 170))
+    hand.page.keyboard.press("]")
+    hand.settle()
+    time.sleep(0.3)
+    off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)
+    assert np.quantile(off, 0.9) < 0.03
+    assert np.mean(off) < 0.02
+
+
+def test_drags_and_keys_move_the_state(hand):
+    first = hand.camera()
+    hand.drag((100, 100), (140, 120))
+    assert hand.camera()["azimuth"] == pytest.approx(first["azimuth"] - 0.4)
+    assert hand.camera()["elevation"] == pytest.approx(first["elevation"] + 0.2)
+    hand.drag((100, 100), (132, 100), button="right")
+    moved = np.subtract(hand.camera()["target"], first["target"])
+    assert np.linalg.norm(moved) == pytest.approx(0.1 * 2 * first["distance"] * np.tan(0.35), rel=1e-3)
+    hand.page.keyboard.down("Shift")
+    hand.drag((100, 100), (150, 100))
+    hand.page.keyboard.up("Shift")
+    assert hand.state()["turn"] == pytest.approx(0.5)
+    hand.page.mouse.wheel(0, 100)
+    hand.settle()
+    assert hand.camera()["distance"] == pytest.approx(first["distance"] * np.exp(0.1))
+    for keys, name, value in (
+        ("l", "light", 1),
+        (".", "stops", 0.5),
+        ("b", "bounces", False),
+        ("s", "system", "harmonics"),
+    ):
+        hand.page.keyboard.press(keys)
+        hand.settle()
+        assert hand.state()[name] == value
+    hand.page.keyboard.press("r")
+    hand.settle()
+    assert hand.camera()["eye"] == pytest.approx(first["eye"])
+    assert hand.state()["turn"] == hand.state()["stops"] == 0
+
+
+def test_a_double_click_looks_at_a_point_of_the_surface(hand):
+    hand.page.mouse.dblclick(
+        *hand.page.evaluate(
+            f"() => {{ const b = ({CANVAS}).getBoundingClientRect(); return [b.width / 2, b.height / 2]; }}"
+        )
+    )
+    hand.settle()
+    assert np.linalg.norm(hand.camera()["target"]) == pytest.approx(1, abs=0.03)  # the ball's radius
+
+
+def test_a_point_in_the_plane_and_a_color_change_the_material(hand):
+    plane = hand.page.locator("canvas.plane")
+    plane.scroll_into_view_if_needed()
+    box = plane.bounding_box()
+    before = hand.pixels()
+    hand.drag((box["x"] + 10, box["y"] + 100), (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+    assert hand.state()["materials"]["ball"] == pytest.approx({"roughness": 0.6, "f0": 0.25}, abs=0.02)
+    hand.page.locator("input[type=color]").nth(1).fill("#0000ff")
+    hand.settle()
+    assert hand.state()["materials"]["ball"]["diffuse"] == pytest.approx([0, 0, 1])
+    assert np.abs(hand.pixels() - before).max() > 0.1
+
+
+def test_a_click_on_the_sky_puts_a_sun_and_a_drag_paints(hand):
+    box = hand.page.locator("canvas.sky").bounding_box()
+    before = hand.pixels().mean()
+    hand.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 8)
+    hand.settle()
+    (sun,) = hand.state()["lamps"]
+    assert sun["direction"][1] > 0.9
+    assert hand.pixels().mean() > before
+    hand.drag((box["x"] + 20, box["y"] + 40), (box["x"] + 120, box["y"] + 40), steps=10)
+    assert len(hand.state()["lamps"]) > 3
+    hand.page.locator("button").click()
+    hand.settle()
+    assert hand.state()["lamps"] == []
+
+
+def drop(hand, name, data):
+    """Drops a file on the viewer."""
+    hand.page.evaluate(
+        f"""([name, data]) => {{
+            const given = new DataTransfer();
+            given.items.add(new File([new Uint8Array(data)], name));
+            ({CANVAS}).dispatchEvent(new DragEvent("drop", {{ dataTransfer: given, bubbles: true, composed: true }}));
+        }}""",
+        [name, list(data)],
+    )
+
+
+def test_a_dropped_file_is_the_light_and_another_one_says_what_is_wrong(hand, tmp_path):
+    path = tmp_path / "red.exr"
+    files.write_exr(path, np.broadcast_to(np.float32([0.5, 0, 0]), (8, 16, 3)))
+    drop(hand, "red.exr", path.read_bytes())
+    hand.page.wait_for_function(f"() => ({CANVAS}).state.light === 2")
+    hand.settle()
+    time.sleep(0.3)
+    shown = hand.pixels()
+    assert shown[..., 0].mean() > 0.3
+    assert shown[..., 1:].max() < 0.02
+    drop(hand, "poem.txt", b"roses are red")
+    hand.page.wait_for_function(f"() => {TOLD}.includes('poem.txt')")
+    assert hand.state()["light"] == 2
+
+
+def test_many_fast_drags_leave_no_queue_and_end_at_the_newest_state(hand):
+    hand.page.mouse.move(50, 50)
+    hand.page.mouse.down()
+    before = hand.stats()
+    for k in range(200):
+        hand.page.mouse.move(50 + k % 60, 50 + k % 45)
+    hand.page.mouse.up()
+    hand.settle()
+    after = hand.stats()
+    assert after["seq"] - before["seq"] == 200
+    assert after["sent"] - before["sent"] <= 200
+    assert after["sent"] == after["got"]
+    time.sleep(0.2)
+    assert hand.stats()["sent"] == after["sent"]
+
+
+def test_two_viewers_at_once_and_a_tab_opened_again(browser, server, hand):
+    other = Hand(browser, server.url)
+    other.drag((50, 50), (90, 50))
+    hand.drag((50, 50), (50, 90))
+    assert hand.camera()["azimuth"] != other.camera()["azimuth"]
+    other.page.close()
+    again = Hand(browser, server.url)
+    assert (
+        again.camera()["azimuth"] != hand.camera()["azimuth"]
+        or again.camera()["elevation"] != hand.camera()["elevation"]
+    )
+    again.page.close()
+
+
+def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back(browser, session):
+    server = Server(session)
+    made = Hand(browser, server.url)
+    port, token = server._server.server_port, server._server.token
+    server.close()
+    made.page.keyboard.press("h")
+    made.page.mouse.move(60, 60)
+    made.page.mouse.down()
+    made.page.mouse.move(90, 60)
+    made.page.mouse.up()
+    made.page.wait_for_function(f"() => {TOLD}.includes('no answer from Python')")
+    back = Server(session, port=port)
+    back._server.token = token
+    made.settle()
+    assert not made.errors
+    made.page.close()
+    back.close()
+
+
+def test_a_lost_context_comes_back(hand):
+    hand.still()
+    before = hand.pixels()
+    hand.page.evaluate(
+        f"""() => {{
+            const lose = ({CANVAS}).getContext('webgl2').getExtension('WEBGL_lose_context');
+            lose.loseContext();
+            setTimeout(() => lose.restoreContext(), 200);
+        }}"""
+    )
+    hand.page.wait_for_function(f"() => {TOLD}.includes('context was lost')")
+    hand.page.wait_for_function(f"() => !({CANVAS}).getContext('webgl2').isContextLost()")
+    sent = hand.stats()["sent"]
+    hand.wait(f"got >= {sent}")
+    hand.settle()
+    time.sleep(1)
+    assert np.abs(hand.pixels() - before).mean() < 0.02
