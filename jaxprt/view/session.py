@@ -1,5 +1,6 @@
 """One viewer's questions and their answers."""
 
+import dataclasses
 import os
 import pathlib
 import tempfile
@@ -9,19 +10,23 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxprt import require
+from jaxprt.image import display, ray_direction, render
 from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, load_environment
+from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
 from jaxprt.view.messages import Look, Reply
 from jaxprt.view.stages import Stages
 
 _LARGEST = 2048.0  # pixels along an edge of a picture
+_PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
 _PIXELS = 400  # of a picture that the exact sum is compared at
 
 
@@ -80,6 +85,14 @@ class Session:
             return kinds[kind](message, buffers)
         except (ValueError, TypeError, OSError, MemoryError) as error:
             return Reply({"kind": "error", "of": message.get("kind"), "message": str(error)}, [])
+
+    def picture(self) -> Float[np.ndarray, "h w 3"]:
+        """What the viewer shows first, drawn from radiance at vertices, fit for a display."""
+        scene = self.stages.scene
+        camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
+        color = scene.radiance(self.stages.lights[0], eye=camera.eye)
+        sky = background(self.stages.lights[0], ray_direction(camera))
+        return np.asarray(display(render(scene.mesh, color, camera, background=sky)))
 
     def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         scene = self.stages.scene

@@ -1,5 +1,8 @@
 """The viewer in a notebook, by anywidget."""
 
+import base64
+import pathlib
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -7,6 +10,7 @@ from typing import Any
 import anywidget
 import traitlets
 
+from jaxprt import files
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
@@ -35,6 +39,18 @@ class Viewer(anywidget.AnyWidget):
         """Takes the viewer out of the notebook."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         super().close()
+
+    def _repr_mimebundle_(self, **options: Any) -> tuple[dict, dict] | None:
+        """The widget, and a picture for where there is no kernel: a saved notebook, or its page on the web."""
+        found = super()._repr_mimebundle_(**options)
+        if found is None:
+            return None
+        data, more = found
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / "picture.png"
+            files.write_png(path, self.session.picture())
+            picture = base64.b64encode(path.read_bytes()).decode()
+        return {**data, "image/png": picture}, more
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
