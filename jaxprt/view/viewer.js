@@ -630,7 +630,7 @@ const STYLE = `
 .sky { height: 80px; }
 .plane { height: 128px; width: 128px; }
 .line, .told { position: absolute; left: 8px; pointer-events: none; text-shadow: 0 0 3px #000, 0 0 3px #000; }
-.line { bottom: 6px; }
+.line { bottom: 6px; right: 184px; }
 .told { top: 6px; max-width: 60%; color: #fd5; }
 .help { position: absolute; left: 8px; top: 28px; margin: 0; padding: 8px; background: #000c; white-space: pre-wrap; max-width: 60%; }
 `;
