@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt32
 
 from jaxprt import require
 from jaxprt.image import display, ray_direction, render
@@ -18,7 +18,7 @@ from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, load_environment
+from jaxprt.scene import Environment, Mesh, load_environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
@@ -115,7 +115,7 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        arrays = np.asarray(mesh.position, "<f4"), np.asarray(mesh.face, "<u4")
+        arrays = np.asarray(mesh.position, "<f4"), _counterclockwise(mesh)
         return Reply(content, [each.tobytes() for each in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
@@ -201,6 +201,16 @@ class Session:
     def _is_late(self, seq: int) -> bool:
         with self._lock:
             return seq < self._newest
+
+
+def _counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
+    """Faces whose corners go around counterclockwise, seen from the side that their normals point to."""
+    face = np.asarray(mesh.face).astype("<u4")
+    position, normal = np.asarray(mesh.position, np.float64), np.asarray(mesh.normal, np.float64)
+    edge, other = (position[face[:, k]] - position[face[:, 0]] for k in (1, 2))
+    clockwise = np.sum(np.cross(edge, other) * normal[face].sum(1), -1) < 0
+    face[clockwise] = face[clockwise][:, ::-1]
+    return face
 
 
 def _named(lights: Sequence[Environment]) -> dict[str, Environment]:

@@ -15,7 +15,7 @@ vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1.);
   return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;
 const MESH = `#version 300 es
 precision highp float; in vec3 c; out vec4 o; ${DISPLAY}
-void main(){ o = vec4(display(c), 1); }`;
+void main(){ o = vec4(gl_FrontFacing ? display(c) : vec3(0), 1); } // backs are black, as in pictures`;
 const QUAD = `#version 300 es
 out vec2 at; void main(){ at = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(at * 2. - 1., .99999, 1); }`;
 const SKY = `#version 300 es
@@ -101,7 +101,7 @@ class Camera {
 class Drawing {
   constructor(canvas) {
     this.canvas = canvas;
-    const gl = (this.gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true }));
+    const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true }));
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
     this.build();
   }

@@ -34,6 +34,16 @@ def near(value, expected):
     np.testing.assert_allclose(value, expected, rtol=2e-3, atol=2e-3 * np.max(expected))
 
 
+def test_corners_go_around_counterclockwise_seen_from_the_front(lights):
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    normal = np.array([[0, 0, -1.0]] * 3)
+    mesh = prt.scene.mesh.make_mesh(corner, np.array([[0, 1, 2]]), normal=normal)
+    scene = prt.Scene([prt.Part("flap", mesh, prt.brdf.Lambert(0.5))])
+    made = prt.precompute(scene, system=prt.relit.Harmonics(1), size=8, progress=False)
+    face = np.frombuffer(Session(made, lights).answer({"kind": "scene"}).buffers[1], "<u4")
+    np.testing.assert_array_equal(face, [2, 1, 0])
+
+
 def test_a_scene_is_told_with_what_can_change(session, systems):
     reply = session.answer({"kind": "scene"})
     scene = systems["lobes"]
