@@ -71,7 +71,10 @@ class Hand:
         before = self.stats()["stills"]
         self.settle()
         self.wait(f"stills > {before}")
-        time.sleep(0.5)
+        drawn = -1
+        while drawn != (now := self.stats()["draws"]):
+            drawn = now
+            time.sleep(0.5)
 
     def drag(self, start, end, steps=5, button="left"):
         self.page.mouse.move(*start)
@@ -240,8 +243,8 @@ def test_many_fast_drags_leave_no_queue_and_end_at_the_newest_state(hand):
     hand.page.mouse.up()
     hand.settle()
     after = hand.stats()
-    assert after["seq"] - before["seq"] == 200
-    assert after["sent"] - before["sent"] <= 200
+    assert 20 <= after["seq"] - before["seq"] <= 200  # a busy browser takes several moves for one
+    assert after["sent"] - before["sent"] <= after["seq"] - before["seq"]
     assert after["sent"] == after["got"]
     time.sleep(0.2)
     assert hand.stats()["sent"] == after["sent"]
