@@ -61,7 +61,7 @@ class Page:
 
     def ask(self, content: dict[str, Any]) -> tuple[dict[str, Any], list[bytes]]:
         """One question and its answer."""
-        self._connection.request("POST", self._path, messages.pack(content))
+        self._connection.request("POST", self._path, messages.pack(content, []))
         return messages.unpack(self._connection.getresponse().read())
 
     def look(self, **change: Any) -> np.ndarray:
@@ -80,7 +80,7 @@ def hands(bounces: int, *, quick: bool) -> Iterator[dict[str, Any]]:
     free = (0.25, 0.35) if quick else (0.25, 0.8)
     made = prt.precompute(embedded(), system=recipe, roughness=free, bounces=bounces, size=size, progress=False)
     lights = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
-    server = view.serve(made, lights)
+    server = view.serve(made, environments=lights)
     page = Page(server.url)
     x, y, z = page.state["eye"]
     changes: dict[str, Callable[[int], dict[str, Any]]] = {

@@ -50,6 +50,8 @@ HOST = {
     "inverse": "takes functions, and fits on the host",
     "cli.report": "measures, and writes files",
     "cli.animation": "the same",
+    "cli.play": "serves pages",
+    "view": "the same, and answers messages",
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
     "scene.points.on_triangles": "checks values",

@@ -87,7 +87,7 @@ def shown(options: argparse.Namespace) -> Server:
         )
         for name in dict.fromkeys(options.system)
     }
-    return serve(made, lights, port=options.port)
+    return serve(made, environments=lights, port=options.port)
 
 
 def _scene(options: argparse.Namespace) -> Scene:

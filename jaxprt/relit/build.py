@@ -113,7 +113,7 @@ def precompute(
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:
     """The part as systems take it, refused before any rays are traced if its system cannot have it."""
-    shading = of_part(part, roughness)
+    shading = of_part(part, roughness=roughness)
     try:
         check(recipe, shading)
     except ValueError as error:

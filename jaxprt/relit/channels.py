@@ -90,7 +90,7 @@ class Appearance(eqx.Module):
     emitted: Float[Array, "v 3"] | None = None
 
 
-def of_part(part: Part, roughness: tuple[float, float] | None = None) -> Shading:
+def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shading:
     """A part of a scene, as systems take it.
 
     A texture of anisotropy is replaced by its mean, with a warning.

@@ -13,8 +13,8 @@ __all__ = ["Server", "Session", "serve", "view"]
 
 def view(
     scene: RelitScene | Mapping[str, RelitScene],
-    environments: Mapping[str, Environment] | None = None,
     *,
+    environments: Mapping[str, Environment] | None = None,
     height: int = 480,
 ) -> Any:
     """A viewer in a notebook. It needs the extra `jaxprt[view]`.
@@ -37,13 +37,13 @@ def view(
         from jaxprt.view.widget import Viewer
     except ImportError as error:
         raise ImportError("a viewer in a notebook needs anywidget: pip install 'jaxprt[view]'") from error
-    return Viewer(Session(scene, environments), height=height)
+    return Viewer(Session(scene, environments=environments), height=height)
 
 
 def serve(
     scene: RelitScene | Mapping[str, RelitScene],
-    environments: Mapping[str, Environment] | None = None,
     *,
+    environments: Mapping[str, Environment] | None = None,
     port: int = 0,
 ) -> Server:
     """A viewer for a browser on this machine: open its `url`, and `close` it in the end.
@@ -58,4 +58,4 @@ def serve(
     Returns:
         The server, which serves already.
     """
-    return Server(Session(scene, environments), port=port)
+    return Server(Session(scene, environments=environments), port=port)

@@ -108,7 +108,7 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
 
 
 def numbers(
-    message: Mapping[str, Any], name: str, count: int, low: float = -1e30, high: float = 1e30
+    message: Mapping[str, Any], name: str, count: int, *, low: float = -1e30, high: float = 1e30
 ) -> tuple[float, ...]:
     """Some finite numbers of a message.
 
@@ -121,7 +121,7 @@ def numbers(
     return tuple(number({name: each}, name, low, high) for each in value)
 
 
-def pack(content: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> bytes:
+def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
     """A message and its arrays as one string of bytes: the length of the JSON, the JSON, the arrays."""
     head = json.dumps({"content": content, "lengths": [len(each) for each in buffers]}, allow_nan=False).encode()
     head += b" " * (-(len(head) + 4) % 8)  # arrays begin at multiples of eight
@@ -184,7 +184,7 @@ def _lamp(message: Any) -> Lamp:
     direction = numbers(message, "direction", 3)
     if not 1e-6 < math.hypot(*direction) < 1e6:
         raise ValueError(f"the direction of a lamp must have a length, got {list(direction)}")
-    return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, 0.0, 1e9))
+    return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, low=0.0, high=1e9))
 
 
 def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
@@ -199,7 +199,6 @@ def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     result = []
     for name in sorted(message):
         count, most = MATERIAL[name]
-        result.append(
-            (name, number(message, name, 0.0, most) if count == 1 else numbers(message, name, count, 0.0, most))
-        )
+        found = numbers(message, name, count, low=0.0, high=most) if count > 1 else number(message, name, 0.0, most)
+        result.append((name, found))
     return tuple(result)

@@ -41,7 +41,7 @@ class Session:
     """
 
     def __init__(
-        self, systems: RelitScene | Mapping[str, RelitScene], environments: Mapping[str, Environment] | None = None
+        self, systems: RelitScene | Mapping[str, RelitScene], *, environments: Mapping[str, Environment] | None = None
     ):
         """Checks that all systems are of one scene, and all lights of one size.
 

@@ -60,7 +60,7 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
     def look(self):
         url = urllib.parse.urlsplit(self.url)
         connection = http.client.HTTPConnection(url.hostname, url.port)
-        connection.request("POST", url.path + "ask", messages.pack({"kind": "scene"}))
+        connection.request("POST", url.path + "ask", messages.pack({"kind": "scene"}, []))
         answers.append(messages.unpack(connection.getresponse().read())[0])
         connection.close()
         raise KeyboardInterrupt

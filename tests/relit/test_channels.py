@@ -168,7 +168,7 @@ def test_knots_cover_the_roughness_in_steps_of_less_than_one_and_a_half(low, hig
 
 def test_a_part_may_be_made_ready_for_more_roughness_than_it_has():
     part = patch(TexturedMaterial(roughness=0.3, metallic=0.5))
-    shading = of_part(part, (0.1, 0.6))
+    shading = of_part(part, roughness=(0.1, 0.6))
     (knot,) = shading.knot
     np.testing.assert_allclose(np.exp(knot[[0, -1]]), (0.1, 0.6), rtol=1e-6)
     np.testing.assert_allclose(shading.blend.parameter[0], np.log(0.3), rtol=1e-6)
@@ -183,7 +183,7 @@ def test_a_part_may_be_made_ready_for_more_roughness_than_it_has():
 
 def test_a_part_made_ready_from_no_roughness_on_takes_all_below_its_smoothest_table():
     part = patch(TexturedMaterial(roughness=0.3, metallic=1.0))
-    shading = of_part(part, (0.0, 0.3))
+    shading = of_part(part, roughness=(0.0, 0.3))
     appearance(part, shading, TexturedMaterial(roughness=0.0, metallic=1.0))
 
 

@@ -39,7 +39,7 @@ def lights():
 @pytest.fixture
 def session(systems, lights):
     """A session of its own for each test; what is compiled is shared."""
-    return Session(systems, lights)
+    return Session(systems, environments=lights)
 
 
 @pytest.fixture

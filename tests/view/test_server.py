@@ -38,7 +38,7 @@ def test_the_page_and_its_module_are_served_and_nothing_is_fetched_from_elsewher
 
 
 def test_a_question_is_answered(server, look):
-    status, headers, data = request(server, "ask", method="POST", body=messages.pack(look))
+    status, headers, data = request(server, "ask", method="POST", body=messages.pack(look, []))
     content, buffers = messages.unpack(data)
     assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
     assert content["kind"] == "color"
@@ -46,7 +46,7 @@ def test_a_question_is_answered(server, look):
 
 
 def content_vertices(server) -> int:
-    data = request(server, "ask", method="POST", body=messages.pack({"kind": "scene"}))[2]
+    data = request(server, "ask", method="POST", body=messages.pack({"kind": "scene"}, []))[2]
     return messages.unpack(data)[0]["vertices"]
 
 
@@ -58,7 +58,7 @@ def test_the_server_is_of_this_machine_alone(server):
 @pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/viewer.js", "/wrong/ask", "/../"])
 @pytest.mark.parametrize("method", ["GET", "POST"])
 def test_a_wrong_token_gets_403(server, path, method):
-    status, _, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}))
+    status, _, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}, []))
     assert status == 403
     assert len(data) < 100
 
@@ -69,7 +69,7 @@ def test_a_wrong_token_gets_403(server, path, method):
 )
 def test_pages_of_another_origin_get_nothing(server, headers):
     for path, method in (("", "GET"), ("ask", "POST")):
-        status, found, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}), **headers)
+        status, found, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}, []), **headers)
         assert status == 403
         assert "Access-Control-Allow-Origin" not in found
         assert len(data) < 100
@@ -80,7 +80,7 @@ def test_what_is_no_message_is_refused_and_the_server_goes_on(server, look):
     assert request(server, "ask", method="POST", body=b"", Content_Length=str(1 << 30))[0] == 413
     assert request(server, "other")[0] == 404
     assert request(server, "other", method="POST", body=b"")[0] == 404
-    assert request(server, "ask", method="POST", body=messages.pack(look))[0] == 200
+    assert request(server, "ask", method="POST", body=messages.pack(look, []))[0] == 200
 
 
 def test_tokens_differ_and_ports_come_back(session):

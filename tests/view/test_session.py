@@ -40,7 +40,7 @@ def test_corners_go_around_counterclockwise_seen_from_the_front(lights):
     mesh = prt.scene.mesh.make_mesh(corner, np.array([[0, 1, 2]]), normal=normal)
     scene = prt.Scene([prt.Part("flap", mesh, prt.brdf.Lambert(0.5))])
     made = prt.precompute(scene, system=prt.relit.Harmonics(1), size=8, progress=False)
-    face = np.frombuffer(Session(made, lights).answer({"kind": "scene"}).buffers[1], "<u4")
+    face = np.frombuffer(Session(made, environments=lights).answer({"kind": "scene"}).buffers[1], "<u4")
     np.testing.assert_array_equal(face, [2, 1, 0])
 
 
@@ -137,7 +137,7 @@ def test_bytes_are_exposed_and_encoded_for_a_display(session, look):
 def test_radiance_beyond_half_floats_keeps_its_ratios(systems, look):
     bright = {"bright": Environment(np.full((6, 8, 8, 3), 1e7))}
     plain = {"bright": Environment(np.ones((6, 8, 8, 3)))}
-    value, unit = (halves(Session(systems, light).answer(look)) for light in (bright, plain))
+    value, unit = (halves(Session(systems, environments=light).answer(look)) for light in (bright, plain))
     near(value, 1e7 * unit)
 
 
@@ -156,7 +156,7 @@ def test_a_small_lamp_has_its_flux_in_its_direction(session, lights, look):
 def test_the_picture_of_the_sky_has_up_on_top_and_z_in_the_middle(systems, look):
     side = np.zeros((6, 8, 8, 3))
     side[0], side[2], side[4] = [1, 0, 0], [0, 1, 0], [0, 0, 1]  # +x red, +y green, +z blue
-    reply = Session(systems, {"axes": Environment(side)}).answer(look | {"kind": "sky"})
+    reply = Session(systems, environments={"axes": Environment(side)}).answer(look | {"kind": "sky"})
     sky = halves(reply).reshape(reply.content["height"], reply.content["width"], 3)
     near(sky[0, 100], [0, 1, 0])
     near(sky[64, 128], [0, 0, 1])
@@ -235,15 +235,15 @@ def test_threads_get_the_answers_to_their_own_questions(session, look):
 @pytest.mark.usefixtures("unchecked")
 def test_scenes_and_lights_that_do_not_fit_are_refused(systems, lights):
     with pytest.raises(ValueError, match="must have a system, got none"):
-        Session({}, lights)
+        Session({}, environments=lights)
     with pytest.raises(TypeError, match=r"the system 'a' must be of class RelitScene, which jaxprt.precompute makes"):
-        Session({"a": systems["lobes"].scene}, lights)
+        Session({"a": systems["lobes"].scene}, environments=lights)
     with pytest.raises(ValueError, match="must have a light, got none"):
-        Session(systems, {})
+        Session(systems, environments={})
     with pytest.raises(ValueError, match="lights must be of one size, got faces of 4, 8 texels"):
-        Session(systems, lights | {"small": Environment(np.ones((6, 4, 4, 3)))})
+        Session(systems, environments=lights | {"small": Environment(np.ones((6, 4, 4, 3)))})
     with pytest.raises(ValueError, match=r"the light 'two' must be one light"):
-        Session(systems, {"two": Environment(np.ones((2, 6, 8, 8, 3)))})
+        Session(systems, environments={"two": Environment(np.ones((2, 6, 8, 8, 3)))})
 
 
 def test_messages_come_through_as_they_went():

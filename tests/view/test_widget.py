@@ -13,7 +13,7 @@ from jaxprt import view
 
 @pytest.fixture
 def viewer(systems, lights):
-    made = view.view(systems, lights, height=300)
+    made = view.view(systems, environments=lights, height=300)
     yield made
     made.close()
 
@@ -63,4 +63,4 @@ def test_a_saved_notebook_has_a_picture(viewer):
 def test_without_anywidget_the_error_says_what_to_install(systems, lights, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "jaxprt.view.widget", None)
     with pytest.raises(ImportError, match=r"pip install 'jaxprt\[view\]'"):
-        view.view(systems, lights)
+        view.view(systems, environments=lights)
