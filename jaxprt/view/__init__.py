@@ -5,10 +5,11 @@ from typing import Any
 
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
+from jaxprt.view.piece import Piece, export
 from jaxprt.view.server import Server
 from jaxprt.view.session import Session
 
-__all__ = ["Server", "Session", "serve", "view"]
+__all__ = ["Piece", "Server", "Session", "export", "serve", "view"]
 
 
 def view(

@@ -16,7 +16,7 @@ _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>jaxprt</title><link rel="icon" href="data:,">
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
 <script type="module">
-import { mount } from "./viewer.js";
+import { mount, unpack } from "./viewer.js";
 async function ask(content, buffers = []) {
   const lengths = buffers.map((each) => each.byteLength);
   let head = new TextEncoder().encode(JSON.stringify({ content, lengths }));
@@ -26,15 +26,7 @@ async function ask(content, buffers = []) {
   const pieces = buffers.flatMap((each) => [each, new Uint8Array((8 - (each.byteLength % 8)) % 8)]);
   const response = await fetch("./ask", { method: "POST", body: new Blob([length, padded, ...pieces]) });
   if (!response.ok) throw new Error(`the server says ${response.status}`);
-  const data = await response.arrayBuffer(), size = new DataView(data).getUint32(0, true);
-  const found = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
-  let place = 4 + size;
-  const arrays = found.lengths.map((each) => {
-    const view = new DataView(data, place, each);
-    place += each + ((8 - (each % 8)) % 8);
-    return view;
-  });
-  return { content: found.content, buffers: arrays };
+  return unpack(await response.arrayBuffer());
 }
 const close = mount(document.getElementById("viewer"), ask);
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });

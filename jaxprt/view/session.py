@@ -107,6 +107,7 @@ class Session:
             "parts": parts,
             "lights": self.stages.name,
             "systems": {name: {"bounces": each.bounces is not None} for name, each in self.stages.systems.items()},
+            "rests": ["still", "exact"],
             "vertices": len(mesh.position),
             "triangles": len(mesh.face),
             "center": ((low + high) / 2).tolist(),

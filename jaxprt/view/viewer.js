@@ -53,6 +53,18 @@ async function inflate(data, count) {
   return result;
 }
 
+// A message and its arrays from one string of bytes, as Python's `messages.pack` has made it.
+export function unpack(data) {
+  const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
+  let place = 4 + size;
+  const buffers = head.lengths.map((each) => {
+    const view = new DataView(data, place, each);
+    place += each + ((8 - (each % 8)) % 8);
+    return view;
+  });
+  return { content: head.content, buffers };
+}
+
 class Camera {
   constructor(scene) {
     const offset = add(scene.eye, scene.target, -1);
@@ -318,7 +330,7 @@ export function mount(root, ask) {
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
     line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
-      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices`;
+      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
   };
   const sky = async () => {
     const key = JSON.stringify([state.light, state.lamps]);
@@ -335,7 +347,7 @@ export function mount(root, ask) {
   };
   // At rest: the picture at pixels, then the exact one; the next move makes them late.
   const still = async () => {
-    if (!state.still || stillBusy || closed || flying) return;
+    if (!state.still || !scene.rests.length || stillBusy || closed || flying) return;
     stillBusy = true;
     const own = seq, size = { width: canvas.width, height: canvas.height };
     try {
@@ -444,7 +456,9 @@ function panelOf(panel, scene, state, { set, expose, moved }) {
     made.onchange = () => change({ [key]: made.checked });
     return [key, made];
   };
-  const boxes = [box("background", "background", set), box("picture at rest", "still", set), box("exact picture", "exact", set)];
+  const boxes = [box("background", "background", set)];
+  if (scene.rests.includes("still")) boxes.push(box("picture at rest", "still", set));
+  if (scene.rests.includes("exact")) boxes.push(box("exact picture", "exact", set));
   if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box("bounces", "bounces", set));
   element("div", panel, { className: "title", textContent: "put a sun by a click, paint light by a drag" });
   const sky = element("canvas", panel, { className: "sky", width: 256, height: 128 });

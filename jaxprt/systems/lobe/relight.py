@@ -37,7 +37,7 @@ _FIRST = 0.8  # width of the finest blur in texels of the environment
 _RATIO = 1.5  # from one width to the next
 _WIDEST = 1.3  # radians
 _COARSE = 0.75  # largest texel in widths
-_REACH = 3.0  # widths that a blur sums over
+REACH = 3.0  # widths that a blur sums over
 _TILE = 4  # edge of what is blurred at once, in texels
 _LEAST = 1e-3  # part of a lobe that counts as seen
 _FARTHEST = 2.5  # standard deviations by which the middle of what is seen may be off
@@ -280,6 +280,21 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLigh
     return LobeLight(jnp.concatenate(levels, 1), coefficient, size)
 
 
+def blur(edge: int, spread: float, *, size: int) -> tuple[int, float, float]:
+    """What faces of an edge are blurred from: the edge of the source's faces, and drop and concentration of the lobe.
+
+    Args:
+        edge: Of the blurred faces, in texels.
+        spread: The drop of the scale, as `scales` has it.
+        size: Edge of the light's faces.
+    """
+    source = _edge(np.sqrt(spread), size, least=8)
+    # The source's boxes and the tents of the lookup blur too.
+    texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
+    own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
+    return source, own, float(mixture.concentration_of(jnp.asarray(own)))
+
+
 def _edge(width: float, size: int, *, least: int) -> int:
     """Coarsest faces whose texels are fine enough for a width."""
     edge = size
@@ -313,17 +328,13 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
     scale = scales(size)
     result = []
     for edge, spread in zip(scale.edge.tolist()[1:], scale.spread.tolist()[1:], strict=True):
-        source = _edge(np.sqrt(spread), size, least=8)
-        # The source's boxes and the tents of the lookup blur too.
-        texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
-        own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
-        concentration = float(mixture.concentration_of(jnp.asarray(own)))
+        source, own, concentration = blur(edge, spread, size=size)
         center = np.asarray(cubemap.direction(size=source), np.float64).reshape(-1, 3)
         area = np.asarray(cubemap.solid_angle(size=source), np.float64).reshape(-1)
         tile = min(_TILE, edge)
         place = np.asarray(cubemap.direction(size=edge), np.float64)[0]
         place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
-        reach = 2 * np.sin(min(np.pi, _REACH * np.sqrt(own)) / 2)
+        reach = 2 * np.sin(min(np.pi, REACH * np.sqrt(own)) / 2)
         near = [np.unique(np.concatenate(each)) for each in scipy.spatial.KDTree(center).query_ball_point(place, reach)]
         index = np.zeros((len(place), max(map(len, near))), np.int32)
         known = np.zeros(index.shape)

@@ -1,0 +1,521 @@
+// A relit scene without Python: answers the questions of `viewer.js` from what `export` has written, on the GPU.
+// Diffuse light by transfer vectors, glossy light by lobes and means of visibility, as the lobe system does.
+
+const WIDTH = 2048; // columns of all textures
+const FINE = 4; // parts along the edge of a texel, by which the rim of a lamp is found
+
+const SHADE = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp isampler2D; precision highp usampler2D;
+uniform sampler2D place, weights, table, light; uniform isampler2D vectors; uniform usampler2D pyramid;
+uniform vec3 irradiance[TERMS], eye; uniform vec2 turn; // cosine and sine
+uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, diffuseTerms;
+uniform float knot[16], logRoughness;
+uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
+uniform float spreads[LEVELS], lightSpreads[WIDTHS];
+out uvec4 o;
+
+ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 11); }
+
+void project(vec3 d, out int face, out float s, out float t) {
+  vec3 a = abs(d);
+  bool x = a.x >= a.y && a.x >= a.z, y = !x && a.y >= a.z;
+  float forward = x ? d.x : y ? d.y : d.z;
+  bool back = forward < 0.;
+  face = (x ? 0 : y ? 2 : 4) + int(back);
+  s = (x ? (back ? d.z : -d.z) : y || !back ? d.x : -d.x) / abs(forward);
+  t = (y ? (back ? -d.z : d.z) : -d.y) / abs(forward);
+}
+vec3 unproject(int face, float s, float t) {
+  float side = (face & 1) == 1 ? -1. : 1.;
+  return face < 2 ? vec3(side, -t, -side * s) : face < 4 ? vec3(s, side, side * t) : vec3(side * s, -t, side);
+}
+float drop(float k) { return k < 1e-2 ? 1. - k / 3. : 1. / k - 2. / (exp(min(2. * k, 80.)) - 1.); }
+
+// Row and column of the first of four texels about a place, the rim counted, and how far the place is beyond.
+ivec2 corner(int edge, float s, float t, out vec2 part) {
+  vec2 place = (vec2(s, t) + 1.) * (float(edge) / 2.) + .5, low = clamp(floor(place), 0., float(edge));
+  part = place - low;
+  return ivec2(low);
+}
+float mean(int address) {
+  uint word = texelFetch(pyramid, at(address >> 2), 0).r;
+  return float((word >> uint(8 * (address & 3))) & 255u) / 255.;
+}
+// What a vertex sees of a lobe, and the slopes of that by s and t.
+vec3 visibility(int row, int face, float s, float t, float spread) {
+  int number = 0;
+  for (int i = 1; i < LEVELS - 1; i++) if (spread >= spreads[i]) number = i;
+  float upper = LEVELS == 1 ? 0. : clamp((spread - spreads[number]) / (spreads[number + 1] - spreads[number]), 0., 1.);
+  vec3 result = vec3(0);
+  for (int step = 0; step < min(2, LEVELS); step++) {
+    int edge = edges[number + step];
+    float half_ = float(edge) / 2., share = step == 0 ? 1. - upper : upper;
+    vec2 part;
+    ivec2 low = corner(edge, s, t, part);
+    int base = row + starts[number + step] + (face * (edge + 2) + low.y) * (edge + 2) + low.x;
+    float a = mean(base), b = mean(base + 1), c = mean(base + edge + 2), d = mean(base + edge + 3);
+    result += share * vec3(mix(mix(a, b, part.x), mix(c, d, part.x), part.y),
+      half_ * mix(b - a, d - c, part.y), half_ * mix(c - a, d - b, part.x));
+  }
+  return result;
+}
+vec3 radiance(vec3 d, float spread) {
+  d = vec3(turn.x * d.x - turn.y * d.z, d.y, turn.y * d.x + turn.x * d.z);
+  int face, number = 0;
+  float s, t;
+  project(d, face, s, t);
+  for (int i = 1; i < WIDTHS - 1; i++) if (spread >= lightSpreads[i]) number = i;
+  float upper = clamp((spread - lightSpreads[number]) / (lightSpreads[number + 1] - lightSpreads[number]), 0., 1.);
+  vec3 result = vec3(0);
+  for (int step = 0; step < 2; step++) {
+    int edge = lightEdges[number + step];
+    vec2 part;
+    ivec2 low = corner(edge, s, t, part);
+    int base = lightStarts[number + step] + (face * (edge + 2) + low.y) * (edge + 2) + low.x;
+    vec3 a = texelFetch(light, at(base), 0).rgb, b = texelFetch(light, at(base + 1), 0).rgb;
+    vec3 c = texelFetch(light, at(base + edge + 2), 0).rgb, d4 = texelFetch(light, at(base + edge + 3), 0).rgb;
+    result += (step == 0 ? 1. - upper : upper) * mix(mix(a, b, part.x), mix(c, d4, part.x), part.y);
+  }
+  return result;
+}
+// The light of a lobe, about the mean of what is seen of it: see jaxprt/systems/lobe/relight.py.
+vec3 seen(int row, vec3 d, float concentration) {
+  int face;
+  float s, t, spread = drop(concentration);
+  project(d, face, s, t);
+  vec3 v = visibility(row, face, s, t, max(spread, spreads[0]));
+  float variance = (1. + s * s + t * t) / (concentration * (1. - spread));
+  float alongS = variance * (v.y * (1. + s * s) + v.z * s * t), alongT = variance * (v.z * (1. + t * t) + v.y * s * t);
+  float part = max(v.x, 1e-3), off = sqrt((alongS * v.y + alongT * v.z) / (part * part) + 1e-12);
+  float reach = 1. / (part * max(off / 2.5, 1.));
+  off = min(off, 2.5);
+  float across = 1. / (1. + off * (2. + .42 * off));
+  return v.x * radiance(unproject(face, s + alongS * reach, t + alongT * reach), spread * (1. + across) / 2.);
+}
+vec4 entry(int knot_, int node, int which) { // a table's entries: for each lobe its mean and log concentration, and its weights
+  return texelFetch(table, at(tableStart + (knot_ * nodes + node) * (2 * lobes + 1) + which), 0);
+}
+void main() {
+  int id = int(gl_FragCoord.x) + ${WIDTH} * int(gl_FragCoord.y), row = id - first;
+  if (row < 0 || row >= count) discard;
+  vec3 position = texelFetch(place, at(2 * id), 0).xyz, normal = texelFetch(place, at(2 * id + 1), 0).xyz;
+  vec3 arriving = vec3(0);
+  for (int i = 0; i < TERMS; i += 4) {
+    if (i >= diffuseTerms) break;
+    vec4 each = vec4(texelFetch(vectors, at(id * (TERMS / 4) + i / 4), 0));
+    arriving += irradiance[i] * each.x + irradiance[i + 1] * each.y + irradiance[i + 2] * each.z + irradiance[i + 3] * each.w;
+  }
+  int weight = weightStart + row * weightStep;
+  vec3 w[4], color = texelFetch(weights, at(weight + channels), 0).rgb;
+  for (int k = 0; k < 4; k++) w[k] = k < channels ? texelFetch(weights, at(weight + k), 0).rgb : vec3(0);
+  vec4 diffuse = vec4(1);
+  if (lobes > 0) {
+    vec3 wo = normalize(eye - position), flat_ = wo - normal * dot(wo, normal);
+    float up = dot(wo, normal);
+    vec3 ahead = dot(flat_, flat_) > 1e-12 ? normalize(flat_) : normalize(cross(normal, abs(normal.x) < .6 ? vec3(1, 0, 0) : vec3(0, 1, 0)));
+    up = max(up, .01); // as views are raised above the horizon
+    vec3 aside = cross(normal, ahead);
+    float node = clamp(sqrt(max(1. - up * up, 0.)) / (1. + up) * float(nodes - 1), 0., float(nodes - 1));
+    int low = min(int(node), nodes - 2), knotLow = 0;
+    float upper = node - float(low), between = 0.;
+    if (knots > 1) {
+      float wanted = weightStep > 0 ? texelFetch(weights, at(weight), 0).a : logRoughness;
+      for (int i = 1; i < 15; i++) if (i < knots - 1 && wanted >= knot[i]) knotLow = i;
+      between = clamp((wanted - knot[knotLow]) / (knot[knotLow + 1] - knot[knotLow]), 0., 1.);
+    }
+    int knotHigh = knots > 1 ? knotLow + 1 : knotLow;
+    for (int l = 0; l <= lobes; l++) {
+      vec4 lobe = vec4(0), strength = vec4(0);
+      for (int n = 0; n < 2; n++) {
+        float share = n == 0 ? 1. - upper : upper;
+        if (l == lobes) {
+          strength += share * mix(entry(knotLow, low + n, 2 * lobes), entry(knotHigh, low + n, 2 * lobes), between);
+          continue;
+        }
+        vec4 a = entry(knotLow, low + n, 2 * l), b = entry(knotHigh, low + n, 2 * l);
+        vec4 p = entry(knotLow, low + n, 2 * l + 1), q = entry(knotHigh, low + n, 2 * l + 1);
+        float less = max((1. - between) * dot(p, vec4(1)), 0.) + 1e-12, more = max(between * dot(q, vec4(1)), 0.) + 1e-12;
+        lobe += share * mix(a, b, more / (less + more));
+        strength += share * mix(p, q, between);
+      }
+      if (l == lobes) { diffuse = strength; break; }
+      vec3 local = normalize(lobe.xyz);
+      vec3 tint = strength.x * w[0] + strength.y * w[1] + strength.z * w[2] + strength.w * w[3];
+      color += tint * seen(pyramidStart + row * STRIDE, ahead * local.x + aside * local.y + normal * local.z, exp(lobe.w));
+    }
+  }
+  color += arriving * (diffuse.x * w[0] + diffuse.y * w[1] + diffuse.z * w[2] + diffuse.w * w[3]);
+  color = clamp(color, -65504., 65504.);
+  o = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0)), 0, 0);
+}`;
+const WHOLE = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 1., 0, 1); }`;
+
+const toHalf = (() => {
+  const float = new Float32Array(1), bits = new Uint32Array(float.buffer);
+  return (value) => {
+    float[0] = Math.min(Math.max(value, -65504), 65504);
+    const x = bits[0], sign = (x >>> 16) & 0x8000, exponent = ((x >>> 23) & 255) - 112;
+    if (exponent <= 0) return sign | (exponent < -10 ? 0 : (((x & 0x7fffff) | 0x800000) + (1 << (13 - exponent))) >> (14 - exponent));
+    return sign | ((exponent << 10) + ((x & 0x7fffff) >> 13) + ((x >> 12) & 1));
+  };
+})();
+
+// Real spherical harmonics of a unit direction, orthonormal, z the polar axis, in the order l (l + 1) + m.
+function harmonics(x, y, z, degree, result) {
+  let real = 1, imaginary = 0, diagonal = Math.sqrt(1 / (4 * Math.PI));
+  const factor = (l, m) => Math.sqrt((4 * l * l - 1) / (l * l - m * m));
+  for (let m = 0; m <= degree; m++) {
+    if (m > 0) {
+      [real, imaginary] = [real * x - imaginary * y, real * y + imaginary * x];
+      diagonal *= Math.sqrt(((2 * m + 1) / (2 * m)) * (m === 1 ? 2 : 1));
+    }
+    for (let l = m, before = 0, value = diagonal; l <= degree; l++) {
+      result[l * (l + 1) + m] = value * real;
+      if (m > 0) result[l * (l + 1) - m] = value * imaginary;
+      [before, value] = [value, factor(l + 1, m) * (z * value - (l > m ? before / factor(l, m) : 0))];
+    }
+  }
+}
+
+// Directions and solid angles of the texels of cubemaps.
+const SIDES = [[[0, 0, -1], [0, -1, 0], [1, 0, 0]], [[0, 0, 1], [0, -1, 0], [-1, 0, 0]], [[1, 0, 0], [0, 0, 1], [0, 1, 0]],
+  [[1, 0, 0], [0, 0, -1], [0, -1, 0]], [[1, 0, 0], [0, -1, 0], [0, 0, 1]], [[-1, 0, 0], [0, -1, 0], [0, 0, -1]]];
+const grids = new Map();
+function grid(edge) {
+  if (grids.has(edge)) return grids.get(edge);
+  const way = new Float32Array(18 * edge * edge), area = new Float32Array(6 * edge * edge);
+  const corner = (s, t) => Math.atan2(s * t, Math.sqrt(1 + s * s + t * t)), step = 2 / edge;
+  for (let face = 0, i = 0; face < 6; face++) for (let row = 0; row < edge; row++) for (let column = 0; column < edge; column++, i++) {
+    const s = (column + 0.5) * step - 1, t = (row + 0.5) * step - 1, length = Math.sqrt(1 + s * s + t * t);
+    for (let c = 0; c < 3; c++) way[3 * i + c] = (s * SIDES[face][0][c] + t * SIDES[face][1][c] + SIDES[face][2][c]) / length;
+    const [u, v, s1, t1] = [s - step / 2, t - step / 2, s + step / 2, t + step / 2];
+    area[i] = corner(s1, t1) - corner(u, t1) - corner(s1, v) + corner(u, v);
+  }
+  grids.set(edge, { way, area });
+  return { way, area };
+}
+function texelOf(x, y, z, edge) {
+  const a = [Math.abs(x), Math.abs(y), Math.abs(z)], axis = a[0] >= a[1] && a[0] >= a[2] ? 0 : a[1] >= a[2] ? 1 : 2;
+  const d = [x, y, z], face = 2 * axis + (d[axis] < 0 ? 1 : 0), [S, T] = SIDES[face];
+  const spot = (A) => Math.min(edge - 1, Math.max(0, Math.floor(((A[0] * x + A[1] * y + A[2] * z) / a[axis] + 1) / 2 * edge)));
+  return (face * edge + spot(T)) * edge + spot(S);
+}
+
+// A light at half the resolution: means over the sphere.
+function halved(light, edge) {
+  const { area } = grid(edge), half = edge / 2, result = new Float32Array(18 * half * half), whole = grid(half).area;
+  for (let face = 0; face < 6; face++) for (let row = 0; row < edge; row++) for (let column = 0; column < edge; column++) {
+    const from = (face * edge + row) * edge + column, to = (face * half + (row >> 1)) * half + (column >> 1);
+    for (let c = 0; c < 3; c++) result[3 * to + c] += (light[3 * from + c] * area[from]) / whole[to];
+  }
+  return result;
+}
+
+// Faces with a rim of their neighbours' texels; the corners are means of the three that meet.
+function rimmed(light, edge, index, result, start) {
+  const m = edge + 2, outer = [0, m - 1], inner = [1, m - 2];
+  for (let i = 0; i < 6 * m * m; i++) for (let c = 0; c < 3; c++) result[4 * (start + i) + c] = light[3 * index[i] + c];
+  for (let face = 0; face < 6; face++) for (let p = 0; p < 2; p++) for (let q = 0; q < 2; q++) for (let c = 0; c < 3; c++) {
+    const from = (row, column) => result[4 * (start + (face * m + row) * m + column) + c];
+    result[4 * (start + (face * m + outer[p]) * m + outer[q]) + c] = (from(inner[p], inner[q]) + from(inner[p], outer[q]) + from(outer[p], inner[q])) / 3;
+  }
+}
+
+// Blurs a light to all widths, as `jaxprt.lobe.prefilter` does; which texels each takes, and how much, is made once.
+class Blur {
+  constructor(scale, index) {
+    Object.assign(this, { scale, index });
+    this.levels = scale.edges.map((edge, i) => (i ? this.taps(edge, scale.sources[i], scale.concentrations[i], scale.reaches[i]) : null));
+  }
+  taps(edge, source, concentration, reach) {
+    const to = grid(edge).way, { way, area } = grid(source), least = Math.cos(reach), from = [0], index = [], weight = [];
+    for (let i = 0; i < 6 * edge * edge; i++) {
+      let total = 0;
+      for (let j = 0; j < 6 * source * source; j++) {
+        const cosine = to[3 * i] * way[3 * j] + to[3 * i + 1] * way[3 * j + 1] + to[3 * i + 2] * way[3 * j + 2];
+        if (cosine < least) continue;
+        const each = area[j] * Math.exp(concentration * (cosine - 1));
+        index.push(j);
+        weight.push(each);
+        total += each;
+      }
+      for (let k = from[i]; k < index.length; k++) weight[k] /= total;
+      from.push(index.length);
+    }
+    return { from: Uint32Array.from(from), index: Uint16Array.from(index), weight: Float32Array.from(weight) };
+  }
+  apply(mips) {
+    const { edges, starts, sources, total } = this.scale, result = new Float32Array(4 * WIDTH * Math.ceil(total / WIDTH));
+    edges.forEach((edge, n) => {
+      let value = mips.get(edge);
+      if (n) {
+        const { from, index, weight } = this.levels[n], source = mips.get(sources[n]);
+        value = new Float32Array(18 * edge * edge);
+        for (let i = 0; i < 6 * edge * edge; i++) for (let k = from[i]; k < from[i + 1]; k++) for (let c = 0; c < 3; c++) value[3 * i + c] += weight[k] * source[3 * index[k] + c];
+      }
+      rimmed(value, edge, this.index.get(edge), result, starts[n]);
+    });
+    return result;
+  }
+}
+
+// Radiance HDR: lines of RGBE, plain or by runs, from the top left.
+function readHdr(data) {
+  const text = new TextDecoder("latin1").decode(data.subarray(0, 4096)), size = /\n\s*\n?-Y (\d+) \+X (\d+)\n/.exec(text);
+  if (!text.startsWith("#?") || !size || !text.includes("32-bit_rle_rgbe")) throw new Error("must be a Radiance HDR environment with its first line on top (EXR files need Python)");
+  const height = Number(size[1]), width = Number(size[2]), pixel = new Float32Array(3 * width * height), line = new Uint8Array(4 * width);
+  let place = size.index + size[0].length;
+  for (let y = 0; y < height; y++) {
+    if (width >= 8 && width < 32768 && data[place] === 2 && data[place + 1] === 2 && data[place + 2] < 128) {
+      place += 4;
+      for (let c = 0; c < 4; c++) for (let x = 0; x < width; ) {
+        const count = data[place++], run = count > 128, length = run ? count - 128 : count;
+        if (!length || x + length > width || place >= data.length) throw new Error("must be a whole Radiance HDR file, got a damaged one");
+        for (let k = 0; k < length; k++, x++) line[4 * x + c] = run ? data[place] : data[place + k];
+        place += run ? 1 : length;
+      }
+    } else {
+      if (place + 4 * width > data.length) throw new Error("must be a whole Radiance HDR file, got a part of one");
+      line.set(data.subarray(place, place + 4 * width));
+      place += 4 * width;
+    }
+    for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) pixel[3 * (y * width + x) + c] = line[4 * x + 3] ? (line[4 * x + c] + 0.5) * 2 ** (line[4 * x + 3] - 136) : 0;
+  }
+  return { pixel, width, height };
+}
+
+// A latitude-longitude image as a cubemap: each texel the mean of some points in it.
+function toCubemap({ pixel, width, height }, edge) {
+  const parts = Math.max(1, Math.ceil(width / (4 * edge))), fine = grid(edge * parts), result = new Float32Array(18 * edge * edge), whole = grid(edge).area;
+  for (let i = 0; i < 6 * (edge * parts) ** 2; i++) {
+    const [x, y, z] = fine.way.subarray(3 * i, 3 * i + 3), column = Math.floor(i % (edge * parts) / parts), row = Math.floor(i / (edge * parts)) % (edge * parts);
+    const u = (((0.5 - Math.atan2(x, z) / (2 * Math.PI)) * width) % width + width) % width, v = (Math.acos(Math.min(Math.max(y, -1), 1)) / Math.PI) * height;
+    const from = Math.min(Math.floor(v), height - 1) * width + Math.min(Math.floor(u), width - 1);
+    const to = (Math.floor(i / (edge * parts) ** 2) * edge + Math.floor(row / parts)) * edge + column;
+    for (let c = 0; c < 3; c++) result[3 * to + c] += (pixel[3 * from + c] * fine.area[i]) / whole[to];
+  }
+  grids.delete(edge * parts);
+  return result;
+}
+
+class Piece {
+  constructor(content, buffers) {
+    this.content = content;
+    const next = (() => { let i = 0; return (kind) => { const each = buffers[i++]; return new kind(each.buffer, each.byteOffset, each.byteLength / kind.BYTES_PER_ELEMENT); }; })();
+    this.position = next(Float32Array);
+    this.face = next(Uint32Array);
+    this.normal = next(Int16Array);
+    this.vectors = next(Int8Array);
+    this.pyramid = next(Uint8Array);
+    this.table = next(Float32Array);
+    this.weights = next(Float32Array);
+    this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
+    this.lights = content.scene.lights.map(() => next(Float32Array));
+    this.names = [...content.scene.lights];
+    this.canvas = document.createElement("canvas");
+    this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    this.build();
+  }
+  build() {
+    const gl = (this.gl = this.canvas.getContext("webgl2")), { content } = this;
+    if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
+    const text = SHADE.replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride);
+    this.program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, WHOLE], [gl.FRAGMENT_SHADER, text]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      gl.attachShader(this.program, shader);
+    }
+    gl.linkProgram(this.program);
+    gl.useProgram(this.program);
+    gl.bindVertexArray(gl.createVertexArray());
+    const count = content.scene.vertices, place = new Float32Array(8 * count);
+    for (let i = 0; i < count; i++) for (let c = 0; c < 3; c++) {
+      place[8 * i + c] = this.position[3 * i + c];
+      place[8 * i + 4 + c] = this.normal[3 * i + c] / 32767;
+    }
+    this.unit = 0;
+    this.textures = {};
+    this.texture("place", gl.RGBA32F, gl.RGBA, gl.FLOAT, place, 4);
+    this.texture("vectors", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.vectors, 4);
+    this.texture("pyramid", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, new Uint32Array(this.pyramid.buffer, this.pyramid.byteOffset, this.pyramid.length / 4), 1);
+    this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
+    this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
+    const set = { ints: gl.uniform1iv, floats: gl.uniform1fv };
+    for (const [kind, name, value] of [["ints", "edges", content.edges], ["ints", "starts", content.starts], ["floats", "spreads", content.spreads],
+      ["ints", "lightEdges", content.light.edges], ["ints", "lightStarts", content.light.starts], ["floats", "lightSpreads", content.light.spreads]]) set[kind].call(gl, this.at(name), value);
+    this.rows = Math.ceil(count / WIDTH);
+    const target = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0 + 8);
+    gl.bindTexture(gl.TEXTURE_2D, target);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, this.rows);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
+    gl.viewport(0, 0, WIDTH, this.rows);
+    [this.lit, this.turned, this.kept] = ["", "", null];
+  }
+  at(name) { return gl_(this.gl, this.program, name); }
+  texture(name, internal, format, type, data, channels) {
+    const gl = this.gl, entries = data.length / channels, rows = Math.max(1, Math.ceil(entries / WIDTH));
+    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`this browser has textures of ${gl.getParameter(gl.MAX_TEXTURE_SIZE)} rows, and the scene needs ${rows}`);
+    const unit = (this.textures[name] ??= { unit: this.unit++ }).unit;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.deleteTexture(this.textures[name].made ?? null);
+    gl.bindTexture(gl.TEXTURE_2D, (this.textures[name].made = gl.createTexture()));
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    const padded = new data.constructor(WIDTH * rows * channels);
+    padded.set(data);
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, WIDTH, rows, 0, format, type, padded);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    gl.uniform1i(this.at(name), unit);
+  }
+  // A light with its lamps: disks; one that is smaller than a texel keeps its flux.
+  radiance(message) {
+    const edge = this.content.environment, light = Float32Array.from(this.lights[message.light]), { area } = grid(edge), fine = grid(edge * FINE), m = edge * FINE;
+    for (const lamp of message.lamps) {
+      const l = Math.hypot(...lamp.direction), d = lamp.direction.map((x) => x / l), flux = new Float64Array(6 * edge * edge);
+      let least = Math.cos(lamp.angle), most = -1, total = 0;
+      const toward = (i) => fine.way[3 * i] * d[0] + fine.way[3 * i + 1] * d[1] + fine.way[3 * i + 2] * d[2];
+      for (let i = 0; i < 6 * m * m; i++) most = Math.max(most, toward(i));
+      for (let i = 0; i < 6 * m * m; i++) if (toward(i) >= Math.min(least, most)) {
+        const to = (Math.floor(i / (m * m)) * edge + Math.floor(Math.floor(i / m) % m / FINE)) * edge + Math.floor((i % m) / FINE);
+        flux[to] += fine.area[i];
+        total += fine.area[i];
+      }
+      const scale = (2 * Math.PI * (1 - Math.cos(lamp.angle))) / total;
+      for (let i = 0; i < 6 * edge * edge; i++) for (let c = 0; c < 3; c++) light[3 * i + c] += ((flux[i] * scale) / area[i]) * lamp.radiance[c];
+    }
+    return light;
+  }
+  // The light side: the light blurred, and its harmonics as it is turned.
+  shine(message) {
+    const { gl, content } = this, key = JSON.stringify([message.light, message.lamps]);
+    if (this.lit !== key) {
+      this.mips = new Map();
+      for (let edge = content.environment, light = this.radiance(message); edge >= 4; edge /= 2) {
+        this.mips.set(edge, light);
+        if (edge > 4) light = halved(light, edge);
+      }
+      this.blur ??= new Blur(content.light, this.index);
+      this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.blur.apply(this.mips), 4);
+      [this.lit, this.turned] = [key, ""];
+    }
+    if (this.turned === `${key} ${message.turn}`) return;
+    const edge = Math.min(content.light.edges[0], 32), light = this.mips.get(edge), { way, area } = grid(edge);
+    const degree = Math.round(Math.sqrt(content.vectorScale.length)) - 1, basis = new Float64Array((degree + 1) ** 2), value = new Float32Array(3 * content.terms);
+    const c = Math.cos(message.turn), s = Math.sin(message.turn);
+    for (let i = 0; i < 6 * edge * edge; i++) {
+      const [x, y, z] = [way[3 * i], way[3 * i + 1], way[3 * i + 2]];
+      harmonics(c * x + s * z, y, c * z - s * x, degree, basis);
+      for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] += basis[k] * area[i] * light[3 * i + j];
+    }
+    for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] *= content.vectorScale[k];
+    gl.uniform3fv(this.at("irradiance"), value);
+    gl.uniform2f(this.at("turn"), c, s);
+    this.turned = `${key} ${message.turn}`;
+  }
+  look(message) {
+    const { gl, content } = this;
+    if (gl.isContextLost()) { this.canvas = document.createElement("canvas"); this.build(); return this.look(message); }
+    const began = performance.now();
+    this.shine(message);
+    const lit = performance.now();
+    gl.uniform3fv(this.at("eye"), message.eye);
+    for (const part of content.parts) {
+      const { weightStep, log } = this.material(part, message.materials[part.name]);
+      for (const name of ["first", "count", "lobes", "channels", "nodes", "knots", "tableStart", "weightStart", "pyramidStart", "diffuseTerms"]) gl.uniform1i(this.at(name), part[name]);
+      gl.uniform1i(this.at("weightStep"), weightStep);
+      gl.uniform1f(this.at("logRoughness"), log);
+      if (part.knot.length) gl.uniform1fv(this.at("knot"), part.knot);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    const count = content.scene.vertices, found = new Uint32Array(4 * WIDTH * this.rows), result = new Uint16Array(3 * count);
+    gl.readPixels(0, 0, WIDTH, this.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
+    for (let i = 0; i < count; i++) {
+      result[3 * i] = found[4 * i] & 65535;
+      result[3 * i + 1] = found[4 * i] >>> 16;
+      result[3 * i + 2] = found[4 * i + 1] & 65535;
+    }
+    const ms = { light: lit - began, view: 0, combine: performance.now() - lit };
+    return { content: { kind: "color", seq: message.seq, scale: 1, ms }, buffers: [new DataView(result.buffer)] };
+  }
+  // Weights of a part whose material is one for all vertices, as `MetallicRoughness.coefficient` has them.
+  material(part, change) {
+    const own = part.material;
+    if (!own) return { weightStep: part.weightStep, log: 0 };
+    const value = { ...own, ...change }, white = ((1 - own.ior) / (1 + own.ior)) ** 2, f0White = Math.max(white, 1e-6);
+    let tint = own.specular_color;
+    if (change?.f0 !== undefined || change?.specular) {
+      const most = Math.max(...tint), strength = change.f0 !== undefined ? change.f0 / (own.ior === 0 ? 1 : f0White) : most;
+      tint = (change.specular ?? tint.map((x) => x / Math.max(most, 1e-6))).map((x) => x * strength);
+    }
+    const base = change?.diffuse ?? own.base_color, f0 = tint.map((x) => Math.min(white * x, 1)), dielectric = 1 - own.metallic, layer = dielectric * own.specular;
+    const under = 1 - Math.max(...f0), every = [
+      base.map((x) => layer * x * under),
+      f0.map((x, c) => layer * x + own.metallic * base[c]),
+      f0.map((x, c) => layer * (1 - x) + own.metallic * (1 - base[c])),
+      base.map((x) => dielectric * (1 - own.specular) * x),
+    ];
+    const key = JSON.stringify(every);
+    if (key !== part.written) {
+      const gl = this.gl;
+      part.term.forEach((term, k) => {
+        const at = part.weightStart + k;
+        gl.activeTexture(gl.TEXTURE0 + this.textures.weights.unit);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, at % WIDTH, Math.floor(at / WIDTH), 1, 1, gl.RGBA, gl.FLOAT, Float32Array.of(...every[term].map((x) => x / part.scale[k]), 0));
+      });
+      part.written = key;
+    }
+    return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)) };
+  }
+  sky(message) {
+    const edge = this.content.environment, light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
+    const rim = new Float32Array(24 * (edge + 2) ** 2), index = this.index.get(edge), m = edge + 2;
+    rimmed(light, edge, index, rim, 0);
+    for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
+      const latitude = Math.PI * (0.5 - (y + 0.5) / height), longitude = Math.PI * (1 - (2 * (x + 0.5)) / width), ring = Math.cos(latitude);
+      const d = [ring * Math.sin(longitude), Math.sin(latitude), ring * Math.cos(longitude)], face = Math.floor(texelOf(...d, 1));
+      const [S, T, N] = SIDES[face], dot = (A) => A[0] * d[0] + A[1] * d[1] + A[2] * d[2];
+      const u = ((dot(S) / dot(N) + 1) / 2) * edge + 0.5, v = ((dot(T) / dot(N) + 1) / 2) * edge + 0.5, i = Math.min(Math.floor(u), edge), j = Math.min(Math.floor(v), edge);
+      for (let c = 0; c < 3; c++) {
+        const from = (row, column) => rim[4 * ((face * m + row) * m + column) + c];
+        const top = from(j, i) + (u - i) * (from(j, i + 1) - from(j, i)), low = from(j + 1, i) + (u - i) * (from(j + 1, i + 1) - from(j + 1, i));
+        result[3 * (y * width + x) + c] = toHalf(top + (v - j) * (low - top));
+      }
+    }
+    return { content: { kind: "sky", seq: message.seq, scale: 1, width, height }, buffers: [new DataView(result.buffer)] };
+  }
+  drop(message, data) {
+    this.lights.push(toCubemap(readHdr(new Uint8Array(data)), this.content.environment));
+    this.names.push(message.name.replace(/\.[^.]*$/, ""));
+    return { content: { kind: "lights", lights: [...this.names], light: this.names.length - 1 }, buffers: [] };
+  }
+  answer(message, buffers) {
+    switch (message.kind) {
+      case "scene": return { content: { ...this.content.scene, lights: this.names }, buffers: [this.position, this.face] };
+      case "look": return this.look(message);
+      case "sky": return this.sky(message);
+      default: return this.drop(message, buffers[0]);
+    }
+  }
+}
+function gl_(gl, program, name) {
+  const known = (program.places ??= new Map());
+  if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));
+  return known.get(name);
+}
+
+// What `mount` of `viewer.js` asks: the answers of a scene that `export` has written.
+export function answers(content, buffers) {
+  const piece = new Piece(content, buffers);
+  return async (message, given = []) => {
+    try {
+      return piece.answer(message, given);
+    } catch (error) {
+      return { content: { kind: "error", of: message.kind, message: `${message.name ?? "the viewer"} ${error.message}` }, buffers: [] };
+    }
+  };
+}
