@@ -2,13 +2,13 @@
 // Diffuse light by transfer vectors, glossy light by lobes and means of visibility, as the lobe system does.
 
 const WIDTH = 2048; // columns of all textures
-const FINE = 4; // parts along the edge of a texel, by which the rim of a lamp is found
+const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
 const SHADE = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp isampler2D; precision highp usampler2D;
 uniform sampler2D place, weights, table, light; uniform isampler2D vectors; uniform usampler2D pyramid;
 uniform vec3 irradiance[TERMS], eye; uniform vec2 turn; // cosine and sine
-uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, diffuseTerms;
+uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, terms;
 uniform float knot[16], logRoughness;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
@@ -49,13 +49,13 @@ vec3 visibility(int row, int face, float s, float t, float spread) {
   vec3 result = vec3(0);
   for (int step = 0; step < min(2, LEVELS); step++) {
     int edge = edges[number + step];
-    float half_ = float(edge) / 2., share = step == 0 ? 1. - upper : upper;
+    float middle = float(edge) / 2., share = step == 0 ? 1. - upper : upper;
     vec2 part;
     ivec2 low = corner(edge, s, t, part);
     int base = row + starts[number + step] + (face * (edge + 2) + low.y) * (edge + 2) + low.x;
     float a = mean(base), b = mean(base + 1), c = mean(base + edge + 2), d = mean(base + edge + 3);
     result += share * vec3(mix(mix(a, b, part.x), mix(c, d, part.x), part.y),
-      half_ * mix(b - a, d - c, part.y), half_ * mix(c - a, d - b, part.x));
+      middle * mix(b - a, d - c, part.y), middle * mix(c - a, d - b, part.x));
   }
   return result;
 }
@@ -101,7 +101,7 @@ void main() {
   vec3 position = texelFetch(place, at(2 * id), 0).xyz, normal = texelFetch(place, at(2 * id + 1), 0).xyz;
   vec3 arriving = vec3(0);
   for (int i = 0; i < TERMS; i += 4) {
-    if (i >= diffuseTerms) break;
+    if (i >= terms) break;
     vec4 each = vec4(texelFetch(vectors, at(id * (TERMS / 4) + i / 4), 0));
     arriving += irradiance[i] * each.x + irradiance[i + 1] * each.y + irradiance[i + 2] * each.z + irradiance[i + 3] * each.w;
   }
@@ -195,19 +195,18 @@ function grid(edge) {
   grids.set(edge, { way, area });
   return { way, area };
 }
-function texelOf(x, y, z, edge) {
-  const a = [Math.abs(x), Math.abs(y), Math.abs(z)], axis = a[0] >= a[1] && a[0] >= a[2] ? 0 : a[1] >= a[2] ? 1 : 2;
-  const d = [x, y, z], face = 2 * axis + (d[axis] < 0 ? 1 : 0), [S, T] = SIDES[face];
-  const spot = (A) => Math.min(edge - 1, Math.max(0, Math.floor(((A[0] * x + A[1] * y + A[2] * z) / a[axis] + 1) / 2 * edge)));
-  return (face * edge + spot(T)) * edge + spot(S);
-}
+// The texel that a part of one lies in, where each has `parts` x `parts`.
+const whole = (i, edge, parts) => {
+  const m = edge * parts, row = Math.floor(i / m);
+  return Math.floor(row / parts) * edge + Math.floor((i % m) / parts);
+};
 
 // A light at half the resolution: means over the sphere.
 function halved(light, edge) {
-  const { area } = grid(edge), half = edge / 2, result = new Float32Array(18 * half * half), whole = grid(half).area;
+  const { area } = grid(edge), half = edge / 2, result = new Float32Array(18 * half * half), total = grid(half).area;
   for (let face = 0; face < 6; face++) for (let row = 0; row < edge; row++) for (let column = 0; column < edge; column++) {
     const from = (face * edge + row) * edge + column, to = (face * half + (row >> 1)) * half + (column >> 1);
-    for (let c = 0; c < 3; c++) result[3 * to + c] += (light[3 * from + c] * area[from]) / whole[to];
+    for (let c = 0; c < 3; c++) result[3 * to + c] += (light[3 * from + c] * area[from]) / total[to];
   }
   return result;
 }
@@ -264,7 +263,9 @@ class Blur {
 function readHdr(data) {
   const text = new TextDecoder("latin1").decode(data.subarray(0, 4096)), size = /\n\s*\n?-Y (\d+) \+X (\d+)\n/.exec(text);
   if (!text.startsWith("#?") || !size || !text.includes("32-bit_rle_rgbe")) throw new Error("must be a Radiance HDR environment with its first line on top (EXR files need Python)");
-  const height = Number(size[1]), width = Number(size[2]), pixel = new Float32Array(3 * width * height), line = new Uint8Array(4 * width);
+  const height = Number(size[1]), width = Number(size[2]);
+  if (width !== 2 * height) throw new Error(`must be twice as wide as high, got ${width} x ${height} pixels`);
+  const pixel = new Float32Array(3 * width * height), line = new Uint8Array(4 * width);
   let place = size.index + size[0].length;
   for (let y = 0; y < height; y++) {
     if (width >= 8 && width < 32768 && data[place] === 2 && data[place + 1] === 2 && data[place + 2] < 128) {
@@ -280,20 +281,19 @@ function readHdr(data) {
       line.set(data.subarray(place, place + 4 * width));
       place += 4 * width;
     }
-    for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) pixel[3 * (y * width + x) + c] = line[4 * x + 3] ? (line[4 * x + c] + 0.5) * 2 ** (line[4 * x + 3] - 136) : 0;
+    for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) pixel[3 * (y * width + x) + c] = line[4 * x + 3] ? line[4 * x + c] * 2 ** (line[4 * x + 3] - 136) : 0;
   }
   return { pixel, width, height };
 }
 
 // A latitude-longitude image as a cubemap: each texel the mean of some points in it.
 function toCubemap({ pixel, width, height }, edge) {
-  const parts = Math.max(1, Math.ceil(width / (4 * edge))), fine = grid(edge * parts), result = new Float32Array(18 * edge * edge), whole = grid(edge).area;
-  for (let i = 0; i < 6 * (edge * parts) ** 2; i++) {
-    const [x, y, z] = fine.way.subarray(3 * i, 3 * i + 3), column = Math.floor(i % (edge * parts) / parts), row = Math.floor(i / (edge * parts)) % (edge * parts);
+  const parts = Math.max(1, Math.ceil(width / (4 * edge))), fine = grid(edge * parts), result = new Float32Array(18 * edge * edge), { area } = grid(edge);
+  for (let i = 0; i < fine.area.length; i++) {
+    const [x, y, z] = fine.way.subarray(3 * i, 3 * i + 3), to = whole(i, edge, parts);
     const u = (((0.5 - Math.atan2(x, z) / (2 * Math.PI)) * width) % width + width) % width, v = (Math.acos(Math.min(Math.max(y, -1), 1)) / Math.PI) * height;
     const from = Math.min(Math.floor(v), height - 1) * width + Math.min(Math.floor(u), width - 1);
-    const to = (Math.floor(i / (edge * parts) ** 2) * edge + Math.floor(row / parts)) * edge + column;
-    for (let c = 0; c < 3; c++) result[3 * to + c] += (pixel[3 * from + c] * fine.area[i]) / whole[to];
+    for (let c = 0; c < 3; c++) result[3 * to + c] += (pixel[3 * from + c] * fine.area[i]) / area[to];
   }
   grids.delete(edge * parts);
   return result;
@@ -357,7 +357,7 @@ class Piece {
     gl.viewport(0, 0, WIDTH, this.rows);
     [this.lit, this.turned, this.kept] = ["", "", null];
   }
-  at(name) { return gl_(this.gl, this.program, name); }
+  at(name) { return placeOf(this.gl, this.program, name); }
   texture(name, internal, format, type, data, channels) {
     const gl = this.gl, entries = data.length / channels, rows = Math.max(1, Math.ceil(entries / WIDTH));
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`this browser has textures of ${gl.getParameter(gl.MAX_TEXTURE_SIZE)} rows, and the scene needs ${rows}`);
@@ -374,17 +374,17 @@ class Piece {
   }
   // A light with its lamps: disks; one that is smaller than a texel keeps its flux.
   radiance(message) {
-    const edge = this.content.environment, light = Float32Array.from(this.lights[message.light]), { area } = grid(edge), fine = grid(edge * FINE), m = edge * FINE;
+    const edge = this.content.mips[0], light = Float32Array.from(this.lights[message.light]), { area } = grid(edge), fine = grid(edge * FINE);
     for (const lamp of message.lamps) {
       const l = Math.hypot(...lamp.direction), d = lamp.direction.map((x) => x / l), flux = new Float64Array(6 * edge * edge);
-      let least = Math.cos(lamp.angle), most = -1, total = 0;
-      const toward = (i) => fine.way[3 * i] * d[0] + fine.way[3 * i + 1] * d[1] + fine.way[3 * i + 2] * d[2];
-      for (let i = 0; i < 6 * m * m; i++) most = Math.max(most, toward(i));
-      for (let i = 0; i < 6 * m * m; i++) if (toward(i) >= Math.min(least, most)) {
-        const to = (Math.floor(i / (m * m)) * edge + Math.floor(Math.floor(i / m) % m / FINE)) * edge + Math.floor((i % m) / FINE);
-        flux[to] += fine.area[i];
+      const toward = fine.area.map((_, i) => fine.way[3 * i] * d[0] + fine.way[3 * i + 1] * d[1] + fine.way[3 * i + 2] * d[2]);
+      const least = Math.min(Math.cos(lamp.angle), toward.reduce((a, b) => Math.max(a, b)));
+      let total = 0;
+      toward.forEach((each, i) => {
+        if (each < least) return;
+        flux[whole(i, edge, FINE)] += fine.area[i];
         total += fine.area[i];
-      }
+      });
       const scale = (2 * Math.PI * (1 - Math.cos(lamp.angle))) / total;
       for (let i = 0; i < 6 * edge * edge; i++) for (let c = 0; c < 3; c++) light[3 * i + c] += ((flux[i] * scale) / area[i]) * lamp.radiance[c];
     }
@@ -395,24 +395,28 @@ class Piece {
     const { gl, content } = this, key = JSON.stringify([message.light, message.lamps]);
     if (this.lit !== key) {
       this.mips = new Map();
-      for (let edge = content.environment, light = this.radiance(message); edge >= 4; edge /= 2) {
+      let light = this.radiance(message);
+      for (const edge of content.mips) {
         this.mips.set(edge, light);
-        if (edge > 4) light = halved(light, edge);
+        if (edge > content.mips.at(-1)) light = halved(light, edge);
       }
-      this.blur ??= new Blur(content.light, this.index);
-      this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.blur.apply(this.mips), 4);
+      if (content.glossy) {
+        this.blur ??= new Blur(content.light, this.index);
+        this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.blur.apply(this.mips), 4);
+      }
       [this.lit, this.turned] = [key, ""];
     }
     if (this.turned === `${key} ${message.turn}`) return;
-    const edge = Math.min(content.light.edges[0], 32), light = this.mips.get(edge), { way, area } = grid(edge);
-    const degree = Math.round(Math.sqrt(content.vectorScale.length)) - 1, basis = new Float64Array((degree + 1) ** 2), value = new Float32Array(3 * content.terms);
+    const edge = content.mips.find((each) => each <= 32) ?? content.mips.at(-1), light = this.mips.get(edge);
+    const parts = Math.max(1, Math.floor(32 / edge)), { way, area } = grid(edge * parts);
+    const degree = Math.round(Math.sqrt(content.vectorUnit.length)) - 1, basis = new Float64Array((degree + 1) ** 2), value = new Float32Array(3 * content.terms);
     const c = Math.cos(message.turn), s = Math.sin(message.turn);
-    for (let i = 0; i < 6 * edge * edge; i++) {
-      const [x, y, z] = [way[3 * i], way[3 * i + 1], way[3 * i + 2]];
+    for (let i = 0; i < area.length; i++) {
+      const [x, y, z] = [way[3 * i], way[3 * i + 1], way[3 * i + 2]], from = whole(i, edge, parts);
       harmonics(c * x + s * z, y, c * z - s * x, degree, basis);
-      for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] += basis[k] * area[i] * light[3 * i + j];
+      for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] += basis[k] * area[i] * light[3 * from + j];
     }
-    for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] *= content.vectorScale[k];
+    for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] *= content.vectorUnit[k];
     gl.uniform3fv(this.at("irradiance"), value);
     gl.uniform2f(this.at("turn"), c, s);
     this.turned = `${key} ${message.turn}`;
@@ -426,9 +430,10 @@ class Piece {
     gl.uniform3fv(this.at("eye"), message.eye);
     for (const part of content.parts) {
       const { weightStep, log } = this.material(part, message.materials[part.name]);
-      for (const name of ["first", "count", "lobes", "channels", "nodes", "knots", "tableStart", "weightStart", "pyramidStart", "diffuseTerms"]) gl.uniform1i(this.at(name), part[name]);
+      for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "terms"]) gl.uniform1i(this.at(name), part[name]);
       gl.uniform1i(this.at("weightStep"), weightStep);
       gl.uniform1f(this.at("logRoughness"), log);
+      gl.uniform1i(this.at("knots"), Math.max(part.knot.length, 1));
       if (part.knot.length) gl.uniform1fv(this.at("knot"), part.knot);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
@@ -472,12 +477,13 @@ class Piece {
     return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)) };
   }
   sky(message) {
-    const edge = this.content.environment, light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
+    const edge = this.content.mips[0], light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
     const rim = new Float32Array(24 * (edge + 2) ** 2), index = this.index.get(edge), m = edge + 2;
     rimmed(light, edge, index, rim, 0);
     for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
       const latitude = Math.PI * (0.5 - (y + 0.5) / height), longitude = Math.PI * (1 - (2 * (x + 0.5)) / width), ring = Math.cos(latitude);
-      const d = [ring * Math.sin(longitude), Math.sin(latitude), ring * Math.cos(longitude)], face = Math.floor(texelOf(...d, 1));
+      const d = [ring * Math.sin(longitude), Math.sin(latitude), ring * Math.cos(longitude)];
+      const size = d.map(Math.abs), axis = size.indexOf(Math.max(...size)), face = 2 * axis + (d[axis] < 0 ? 1 : 0);
       const [S, T, N] = SIDES[face], dot = (A) => A[0] * d[0] + A[1] * d[1] + A[2] * d[2];
       const u = ((dot(S) / dot(N) + 1) / 2) * edge + 0.5, v = ((dot(T) / dot(N) + 1) / 2) * edge + 0.5, i = Math.min(Math.floor(u), edge), j = Math.min(Math.floor(v), edge);
       for (let c = 0; c < 3; c++) {
@@ -489,7 +495,7 @@ class Piece {
     return { content: { kind: "sky", seq: message.seq, scale: 1, width, height }, buffers: [new DataView(result.buffer)] };
   }
   drop(message, data) {
-    this.lights.push(toCubemap(readHdr(new Uint8Array(data)), this.content.environment));
+    this.lights.push(toCubemap(readHdr(new Uint8Array(data)), this.content.mips[0]));
     this.names.push(message.name.replace(/\.[^.]*$/, ""));
     return { content: { kind: "lights", lights: [...this.names], light: this.names.length - 1 }, buffers: [] };
   }
@@ -502,7 +508,7 @@ class Piece {
     }
   }
 }
-function gl_(gl, program, name) {
+function placeOf(gl, program, name) {
   const known = (program.places ??= new Map());
   if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));
   return known.get(name);

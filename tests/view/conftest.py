@@ -1,5 +1,8 @@
 """A small scene, made ready by two systems, and a session of it."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 
@@ -8,6 +11,22 @@ from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, bui
 from jaxprt.view import Session
 
 SIZE = 8
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Headless Chromium; tests of it are skipped where there is none, unless JAXPRT_BROWSER_REQUIRED is set."""
+    if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
+        pytest.skip("no chromium on this machine")
+    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield made
+        made.close()
 
 
 @pytest.fixture(scope="session")

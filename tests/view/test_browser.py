@@ -4,8 +4,6 @@ Headless Chromium, found as `chromium`; skipped where there is none, unless JAXP
 """
 
 import io
-import os
-import shutil
 import time
 
 import numpy as np
@@ -18,24 +16,8 @@ from jaxprt.scene import Camera
 from jaxprt.scene.environment import rotate
 from jaxprt.view import Server
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
 TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
-
-if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
-    pytest.skip("no chromium on this machine", allow_module_level=True)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        yield made
-        made.close()
 
 
 class Hand:

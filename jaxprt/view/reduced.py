@@ -1,0 +1,118 @@
+"""Relit scenes with less in them: what a page that relights without Python has of them."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt.relit.scene import RelitScene
+from jaxprt.systems import bright_texels, harmonic, lobe
+from jaxprt.systems.lobe import pyramid
+from jaxprt.systems.protocol import Joined, System
+
+_LIGHT = 32  # texels along the edge of the light's faces that lobes are read from
+
+Exported = lobe.LobeSystem | harmonic.DiffuseSystem
+
+
+class CoarseTransport(lobe.LobeTransport):
+    """Visibility without its finest scales, read under a light of another size.
+
+    Attributes:
+        edge: Texels along the edge of visibility's faces.
+        spread: That of the finest scale which is left.
+    """
+
+    edge: int = eqx.field(static=True)
+    spread: float = eqx.field(static=True)
+
+    def lobe_visibility(self, face, s, t, spread, points=None):
+        """What each vertex sees of its lobes, by the scales that are left."""
+        whole = lobe.LobeTransport(self.pyramid, self.vector, self.position, self.frame, self.edge)
+        return whole.lobe_visibility(face, s, t, jnp.maximum(spread, self.spread), points)
+
+
+def coarse(scene: RelitScene, level: int) -> RelitScene:
+    """A scene as a page has it: without bounces, single texels and fine visibility, its vectors rounded to bytes.
+
+    Args:
+        scene: The scene.
+        level: Finest scale of visibility, as `jaxprt.systems.lobe.pyramid.scales` numbers them.
+    """
+    systems = systems_of(scene)
+    vectors = [vectors_of(each) for each in systems]
+    unit = vector_unit(vectors)
+    made: list[System] = []
+    for system, vector in zip(systems, vectors, strict=True):
+        own = unit[: len(vector), None]
+        rounded = jnp.asarray(np.round(vector / own) * own, jnp.result_type(float))
+        if isinstance(system, harmonic.DiffuseSystem):
+            made.append(eqx.tree_at(lambda each: each.transport.vector, system, rounded[:, None]))
+            continue
+        old = system.transport
+        size, least = min(_LIGHT, old.size), float(pyramid.scales(old.size).spread[level])
+        seen = CoarseTransport(old.pyramid, rounded, old.position, old.frame, size, old.size, least)
+        made.append(lobe.LobeSystem(seen, system.brdf))
+    return RelitScene(scene.scene, Joined(tuple(made)), scene.shading)
+
+
+def systems_of(scene: RelitScene) -> list[Exported]:
+    """The systems of the parts without single texels; refuses those that a page does not have."""
+    result: list[Exported] = []
+    for part, system in zip(scene.scene.parts, scene.direct.part, strict=True):
+        own = system.system if isinstance(system, bright_texels.BrightTexels) else system
+        if not isinstance(own, lobe.LobeSystem | harmonic.DiffuseSystem):
+            raise ValueError(
+                f"part {part.name!r} must be ideally diffuse or made by the system 'lobe' to be exported, "
+                f"got {type(own).__name__}"
+            )
+        if isinstance(own, lobe.LobeSystem):
+            _check(part.name, own.brdf)
+        result.append(own)
+    return result
+
+
+def _check(name: str, brdf: lobe.LobeBrdf) -> None:
+    if not brdf.isotropic:
+        raise ValueError(f"part {name!r} must have an isotropic BRDF to be exported, got an anisotropic one")
+    if len(brdf.knot) > 1 or len(brdf.weight) > 4 or any(len(each) > 16 for each in brdf.knot):
+        raise ValueError(
+            f"part {name!r} must have a table of at most four channels and one parameter of 16 knots to be exported, "
+            f"got {len(brdf.weight)} and {[len(each) for each in brdf.knot]}"
+        )
+
+
+def scale_of(scene: RelitScene) -> pyramid.Scales | None:
+    """Scales of the visibility of the scene's glossy parts; None where there are none."""
+    found = [each.transport for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)]
+    if not found:
+        return None
+    return pyramid.scales(edge_of(found[0]))
+
+
+def edge_of(transport: lobe.LobeTransport) -> int:
+    """Texels along the edge of the faces of visibility."""
+    return transport.edge if isinstance(transport, CoarseTransport) else transport.size
+
+
+def light_size(scene: RelitScene) -> int:
+    """Edge of the light that the lobes of a reduced scene are read from; 0 without lobes."""
+    return max((each.transport.size for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)), default=0)
+
+
+def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
+    """Transfer vectors of a part's vertices."""
+    found = system.transport.vector
+    if isinstance(system, harmonic.DiffuseSystem):
+        if found.shape[1] != 1:
+            raise ValueError(f"transfer vectors must be gray to be exported, got {found.shape[1]} colors")
+        found = found[:, 0]
+    return np.asarray(found, np.float64)
+
+
+def vector_unit(vectors: list[np.ndarray]) -> Float[np.ndarray, " lm"]:
+    """What 1 of the signed bytes stands for, for each harmonic."""
+    largest = np.zeros(max(map(len, vectors)))
+    for each in vectors:
+        largest[: len(each)] = np.maximum(largest[: len(each)], np.abs(each).max(1, initial=0))
+    return np.maximum(largest, 1e-12) / 127
