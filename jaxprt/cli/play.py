@@ -13,11 +13,11 @@ import equinox as eqx
 import jax
 
 import jaxprt as prt
-from jaxprt.relit import Harmonics, Lobes
+from jaxprt.relit import Harmonics, Lobes, RelitScene
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import ground_plane, split
 from jaxprt.scene.scene import numbered
-from jaxprt.view import Server, serve
+from jaxprt.view import export, serve
 
 _LIGHTS = {".exr", ".hdr", ".pic"}
 _PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
@@ -32,7 +32,14 @@ def main(arguments: Sequence[str]) -> None:
         OSError: It cannot be read, or the port cannot be taken.
     """
     options = _parser().parse_args(arguments)
-    server = shown(options)
+    if options.export is not None and (options.export.suffix.lower() != ".html" or options.system != ["lobe"]):
+        raise ValueError(f"--export takes a file *.html and the system lobe, got {options.export} and {options.system}")
+    made, lights = ready(options)
+    if options.export is not None:
+        piece = export(next(iter(made.values())), options.export, environments=lights)
+        print(f"jaxprt: {piece.path}, {piece.nbytes:,} bytes, {100 * piece.error:.1f} % off the whole scene")
+        return
+    server = serve(made, environments=lights, port=options.port)
     print(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it", flush=True)
     if options.browser:
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
@@ -63,13 +70,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--bounces", type=int, choices=[0, 1, 2], default=0, help="of light between parts (default 0)")
     parser.add_argument("--ground", action="store_true", help="stand the scene on a diffuse ground plane")
     parser.add_argument("--output", type=Path, help="folder that keeps what was precomputed, for later runs")
+    parser.add_argument("--export", type=Path, metavar="HTML", help="write a page that needs no Python, and end")
     parser.add_argument("--port", type=int, default=0, help="of this machine (default: a free one)")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     return parser
 
 
-def shown(options: argparse.Namespace) -> Server:
-    """The scene of the options, made ready, and served."""
+def ready(options: argparse.Namespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
+    """The scene of the options, made ready by each system, and its lights."""
     if not 1 <= options.lobes <= 64:
         raise ValueError(f"--lobes must be from 1 to 64, got {options.lobes}")
     if not 0 <= options.port < 2**16:
@@ -87,7 +95,7 @@ def shown(options: argparse.Namespace) -> Server:
         )
         for name in dict.fromkeys(options.system)
     }
-    return serve(made, environments=lights, port=options.port)
+    return made, lights
 
 
 def _scene(options: argparse.Namespace) -> Scene:

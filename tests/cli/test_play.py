@@ -51,6 +51,15 @@ def test_without_files_there_are_the_chess_pieces_in_two_lights():
     assert list(play._lights([])) == ["daylight", "studio"]
 
 
+def test_a_page_without_python_is_written(place, monkeypatch, capsys):
+    monkeypatch.setattr(prt, "precompute", lambda scene, **more: precompute(scene, **more | {"size": 8}))
+    page = place / "piece.html"
+    assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--lobes", "1", "--export", str(page)]) == 0
+    assert f"{page}, {page.stat().st_size:,} bytes" in capsys.readouterr().out
+    assert main(["view", str(place / "first.obj"), "--export", "piece.txt"]) == 2
+    assert "--export takes a file *.html and the system lobe, got piece.txt" in capsys.readouterr().err
+
+
 def test_the_page_of_files_is_served(place, monkeypatch, capsys):
     monkeypatch.setattr(prt.scene.builtin, "daylight", None)
     opened = []
@@ -65,7 +74,7 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
         connection.close()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(play.Server, "wait", look)
+    monkeypatch.setattr(prt.view.Server, "wait", look)
     store = str(place / "store")
     monkeypatch.setattr(prt, "precompute", lambda scene, **more: precompute(scene, **more | {"size": 8}))
     assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--lobes", "1", "--output", store]) == 0
