@@ -1,18 +1,30 @@
 """What a page that relights without Python holds of the parts of a scene, as arrays."""
 
+import math
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxprt.brdf import GGX
+from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import TexturedMaterial
 from jaxprt.scene.material import Texture
 from jaxprt.systems import harmonic, lobe
 from jaxprt.systems.lobe import pyramid, relight
-from jaxprt.view.reduced import Exported, edge_of, scale_of, systems_of, vector_unit, vectors_of
+from jaxprt.view.reduced import (
+    Exported,
+    bits_of,
+    edge_of,
+    scale_of,
+    systems_of,
+    texels_of,
+    vector_unit,
+    vectors_of,
+)
 
 NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # of scenes without glossy parts
 _SKY = 64  # texels along the edge of a light's faces, at most
@@ -39,6 +51,7 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
                 "nodes": table.shape[1],
                 "knot": [] if isinstance(system, harmonic.DiffuseSystem) else _knot(system.brdf),
                 "terms": -(-len(vector) // 4) * 4,
+                "family": _family(shading),
                 "weightStep": 0 if described else weight.shape[1],
                 **(described or {}),
                 **place,
@@ -59,8 +72,12 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
         starts = scale.start[level:] - scale.start[level]
         visible = {"edges": scale.edge[level:].tolist(), "spreads": scale.spread[level:].tolist()}
         visible["starts"] = starts.tolist()
-    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **visible}
+    bits = bits_of(reduced)
     joined = [np.concatenate(each) for each in arrays]
+    joined.append(np.zeros(0, np.uint8) if bits is None else np.concatenate([each.reshape(-1) for each in bits]))
+    texel_edge = 0 if bits is None else math.isqrt(8 * bits[0].shape[1] // 6)
+    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **visible}
+    content |= {"texelEdge": texel_edge, "texels": texels_of(texel_edge) if texel_edge else 0}
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     return content, [each.tobytes() for each in joined]
 
@@ -89,6 +106,13 @@ def blurring(size: int) -> dict[str, Any]:
         "concentrations": concentration,
         "reaches": [min(np.pi, relight.REACH * np.sqrt(each)) for each in own],
     }
+
+
+def _family(shading: Shading) -> dict[str, list]:
+    """Terms of `MetallicRoughness` that the channels are, and their factors; empty for other BRDFs."""
+    if shading.blend is None or shading.scale is None:
+        return {"terms": [], "scale": []}
+    return {"terms": list(shading.term), "scale": np.asarray(shading.scale, float).tolist()}
 
 
 def _knot(brdf: lobe.LobeBrdf) -> list[float]:
@@ -133,6 +157,8 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     result[:, :-1, :3] = weight
     if shading.blend is not None and shading.blend.parameter:
         result[:, 0, 3] = np.asarray(shading.blend.parameter[0])
+    elif isinstance(shading.brdf, Channels):  # GGX of one roughness, whose axes are alike
+        result[:, 0, 3] = np.log(next(float(each.roughness[0]) for each in shading.brdf.model if isinstance(each, GGX)))
     if shading.emitted is not None:
         result[:, -1, :3] = np.asarray(shading.emitted)
     return result
@@ -146,4 +172,4 @@ def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
         return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
     values = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
-    return {"material": values, "term": list(shading.term), "scale": np.asarray(shading.scale, float).tolist()}
+    return {"material": values}

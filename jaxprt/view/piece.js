@@ -1,20 +1,20 @@
 // A relit scene without Python: answers the questions of `viewer.js` from what `export` has written, on the GPU.
 // Diffuse light by transfer vectors, glossy light by lobes and means of visibility, as the lobe system does.
 
-const WIDTH = 2048; // columns of all textures
+const WIDTH = 4096; // columns of all textures
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
 const SHADE = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp isampler2D; precision highp usampler2D;
-uniform sampler2D place, weights, table, light; uniform isampler2D vectors; uniform usampler2D pyramid;
+uniform sampler2D place, weights, table, light, bright; uniform isampler2D vectors; uniform usampler2D pyramid, bits;
 uniform vec3 irradiance[TERMS], eye; uniform vec2 turn; // cosine and sine
-uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, terms;
-uniform float knot[16], logRoughness;
+uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, terms, term[4], families, texels;
+uniform float knot[16], scale[4], logRoughness;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
 out uvec4 o;
 
-ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 11); }
+ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }
 
 void project(vec3 d, out int face, out float s, out float t) {
   vec3 a = abs(d);
@@ -92,8 +92,41 @@ vec3 seen(int row, vec3 d, float concentration) {
   float across = 1. / (1. + off * (2. + .42 * off));
   return v.x * radiance(unproject(face, s + alongS * reach, t + alongT * reach), spread * (1. + across) / 2.);
 }
-vec4 entry(int knot_, int node, int which) { // a table's entries: for each lobe its mean and log concentration, and its weights
-  return texelFetch(table, at(tableStart + (knot_ * nodes + node) * (2 * lobes + 1) + which), 0);
+// Whether a vertex sees a direction: bits of texels, bilinear between their middles.
+float bit(int id, int face, int row, int column) {
+  row = clamp(row, 0, TEXELS - 1);
+  column = clamp(column, 0, TEXELS - 1);
+  int address = id * (6 * TEXELS * TEXELS / 8) + (face * (TEXELS / 2) + row / 2) * (TEXELS / 4) + column / 4;
+  uint word = texelFetch(bits, at(address >> 2), 0).r;
+  return float((word >> uint(8 * (address & 3) + (column / 2 & 1) * 4 + (row & 1) * 2 + (column & 1))) & 1u);
+}
+float clear(int id, vec3 d) {
+  int face;
+  float s, t;
+  project(d, face, s, t);
+  vec2 place = (vec2(s, t) + 1.) * (float(TEXELS) / 2.) - .5, low = floor(place + 1e-3), part = max(place - low, 0.);
+  ivec2 near = ivec2(low);
+  float a = bit(id, face, near.y, near.x), b = bit(id, face, near.y, near.x + 1);
+  float c = bit(id, face, near.y + 1, near.x), d4 = bit(id, face, near.y + 1, near.x + 1);
+  return mix(mix(a, b, part.x), mix(c, d4, part.x), part.y);
+}
+// Terms of MetallicRoughness, in 1/sr: see jaxprt/brdf/microfacet.py.
+vec4 family(vec3 wi, vec3 wo, vec3 normal, float alpha) {
+  vec3 h = normalize(wi + wo);
+  float ci = dot(wi, normal), co = dot(wo, normal), z = dot(h, normal), schlick = pow(1. - min(dot(wo, h), 1.), 5.), a = alpha * alpha;
+  vec3 flat_ = h - normal * z;
+  float tilt = dot(flat_, flat_) / a + z * z, mask = .5 / (co * sqrt(a * (1. - ci * ci) + ci * ci) + ci * sqrt(a * (1. - co * co) + co * co));
+  float lobe = mask / (3.14159265 * a * tilt * tilt);
+  vec4 result = vec4(0);
+  for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 1 ? lobe : term[k] == 2 ? lobe * schlick : 1. / 3.14159265);
+  return result;
+}
+vec3 texelWay(int i) {
+  vec3 d = texelFetch(bright, at(2 * i), 0).xyz;
+  return vec3(turn.x * d.x + turn.y * d.z, d.y, turn.x * d.z - turn.y * d.x);
+}
+vec4 entry(int number, int node, int which) { // a table's entries: for each lobe its mean and log concentration, and its weights
+  return texelFetch(table, at(tableStart + (number * nodes + node) * (2 * lobes + 1) + which), 0);
 }
 void main() {
   int id = int(gl_FragCoord.x) + ${WIDTH} * int(gl_FragCoord.y), row = id - first;
@@ -109,19 +142,22 @@ void main() {
   vec3 w[4], color = texelFetch(weights, at(weight + channels), 0).rgb;
   for (int k = 0; k < 4; k++) w[k] = k < channels ? texelFetch(weights, at(weight + k), 0).rgb : vec3(0);
   vec4 diffuse = vec4(1);
+  vec3 wo = normal;
+  float rough = weightStep > 0 ? texelFetch(weights, at(weight), 0).a : logRoughness;
   if (lobes > 0) {
-    vec3 wo = normalize(eye - position), flat_ = wo - normal * dot(wo, normal);
+    wo = normalize(eye - position);
+    vec3 flat_ = wo - normal * dot(wo, normal);
     float up = dot(wo, normal);
     vec3 ahead = dot(flat_, flat_) > 1e-12 ? normalize(flat_) : normalize(cross(normal, abs(normal.x) < .6 ? vec3(1, 0, 0) : vec3(0, 1, 0)));
     up = max(up, .01); // as views are raised above the horizon
+    wo = ahead * sqrt(1. - up * up) + normal * up;
     vec3 aside = cross(normal, ahead);
     float node = clamp(sqrt(max(1. - up * up, 0.)) / (1. + up) * float(nodes - 1), 0., float(nodes - 1));
     int low = min(int(node), nodes - 2), knotLow = 0;
     float upper = node - float(low), between = 0.;
     if (knots > 1) {
-      float wanted = weightStep > 0 ? texelFetch(weights, at(weight), 0).a : logRoughness;
-      for (int i = 1; i < 15; i++) if (i < knots - 1 && wanted >= knot[i]) knotLow = i;
-      between = clamp((wanted - knot[knotLow]) / (knot[knotLow + 1] - knot[knotLow]), 0., 1.);
+      for (int i = 1; i < 15; i++) if (i < knots - 1 && rough >= knot[i]) knotLow = i;
+      between = clamp((rough - knot[knotLow]) / (knot[knotLow + 1] - knot[knotLow]), 0., 1.);
     }
     int knotHigh = knots > 1 ? knotLow + 1 : knotLow;
     for (int l = 0; l <= lobes; l++) {
@@ -141,8 +177,23 @@ void main() {
       if (l == lobes) { diffuse = strength; break; }
       vec3 local = normalize(lobe.xyz);
       vec3 tint = strength.x * w[0] + strength.y * w[1] + strength.z * w[2] + strength.w * w[3];
-      color += tint * seen(pyramidStart + row * STRIDE, ahead * local.x + aside * local.y + normal * local.z, exp(lobe.w));
+      vec3 middle = ahead * local.x + aside * local.y + normal * local.z;
+      float k = exp(lobe.w);
+      color += tint * seen(pyramidStart + row * STRIDE, middle, k);
+      if (families > 0) continue;
+      for (int i = 0; i < texels; i++) {
+        vec3 d = texelWay(i), away = d - middle;
+        float value = dot(d, normal) > 0. ? k / (6.28318531 * (1. - exp(-2. * k))) * exp(-k * dot(away, away) / 2.) : 0.;
+        if (value > 1e-6) color += tint * value * clear(id, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
+      }
     }
+  }
+  for (int i = 0; i < texels; i++) {
+    vec3 d = texelWay(i);
+    float cosine = dot(d, normal);
+    if (cosine <= 0.) continue;
+    vec4 value = families > 0 ? family(d, wo, normal, max(exp(2. * rough), 1e-3)) : diffuse / 3.14159265;
+    color += (value.x * w[0] + value.y * w[1] + value.z * w[2] + value.w * w[3]) * cosine * clear(id, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
   }
   color += arriving * (diffuse.x * w[0] + diffuse.y * w[1] + diffuse.z * w[2] + diffuse.w * w[3]);
   color = clamp(color, -65504., 65504.);
@@ -310,6 +361,7 @@ class Piece {
     this.pyramid = next(Uint8Array);
     this.table = next(Float32Array);
     this.weights = next(Float32Array);
+    this.bits = next(Uint8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = content.scene.lights.map(() => next(Float32Array));
     this.names = [...content.scene.lights];
@@ -320,7 +372,7 @@ class Piece {
   build() {
     const gl = (this.gl = this.canvas.getContext("webgl2")), { content } = this;
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
-    const text = SHADE.replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride);
+    const text = SHADE.replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride).replaceAll("TEXELS", Math.max(content.texelEdge, 4));
     this.program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, WHOLE], [gl.FRAGMENT_SHADER, text]]) {
       const shader = gl.createShader(kind);
@@ -342,6 +394,7 @@ class Piece {
     this.texture("place", gl.RGBA32F, gl.RGBA, gl.FLOAT, place, 4);
     this.texture("vectors", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.vectors, 4);
     this.texture("pyramid", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, new Uint32Array(this.pyramid.buffer, this.pyramid.byteOffset, this.pyramid.length / 4), 1);
+    this.texture("bits", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, new Uint32Array(this.bits.buffer, this.bits.byteOffset, this.bits.length / 4), 1);
     this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
     this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
     const set = { ints: gl.uniform1iv, floats: gl.uniform1fv };
@@ -349,7 +402,7 @@ class Piece {
       ["ints", "lightEdges", content.light.edges], ["ints", "lightStarts", content.light.starts], ["floats", "lightSpreads", content.light.spreads]]) set[kind].call(gl, this.at(name), value);
     this.rows = Math.ceil(count / WIDTH);
     const target = gl.createTexture();
-    gl.activeTexture(gl.TEXTURE0 + 8);
+    gl.activeTexture(gl.TEXTURE0 + 10);
     gl.bindTexture(gl.TEXTURE_2D, target);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, this.rows);
     gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
@@ -396,6 +449,7 @@ class Piece {
     if (this.lit !== key) {
       this.mips = new Map();
       let light = this.radiance(message);
+      light = this.split(light);
       for (const edge of content.mips) {
         this.mips.set(edge, light);
         if (edge > content.mips.at(-1)) light = halved(light, edge);
@@ -421,6 +475,24 @@ class Piece {
     gl.uniform2f(this.at("turn"), c, s);
     this.turned = `${key} ${message.turn}`;
   }
+  // Takes the brightest texels out of a light, as far as they stand out: `jaxprt.bright_texels.split`.
+  split(light) {
+    const { gl, content } = this, edge = content.mips[0], { way, area } = grid(edge), count = content.texels;
+    gl.uniform1i(this.at("texels"), count);
+    if (!count) return light;
+    const flux = area.map((each, i) => each * (light[3 * i] + light[3 * i + 1] + light[3 * i + 2]));
+    const order = Array.from(flux.keys()).sort((a, b) => flux[b] - flux[a]), rest = light.slice(), data = new Float32Array(8 * count);
+    for (let n = 0; n < count; n++) {
+      const i = order[n], share = flux[i] > 0 ? Math.max(1 - flux[order[count]] / flux[i], 0) : 0;
+      for (let c = 0; c < 3; c++) {
+        data[8 * n + c] = way[3 * i + c];
+        data[8 * n + 4 + c] = share * light[3 * i + c] * area[i] * (1 - area[i] / (4 * Math.PI)); // as a disk of its solid angle has
+        rest[3 * i + c] -= share * light[3 * i + c];
+      }
+    }
+    this.texture("bright", gl.RGBA32F, gl.RGBA, gl.FLOAT, data, 4);
+    return rest;
+  }
   look(message) {
     const { gl, content } = this;
     if (gl.isContextLost()) { this.canvas = document.createElement("canvas"); this.build(); return this.look(message); }
@@ -433,6 +505,11 @@ class Piece {
       for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "terms"]) gl.uniform1i(this.at(name), part[name]);
       gl.uniform1i(this.at("weightStep"), weightStep);
       gl.uniform1f(this.at("logRoughness"), log);
+      gl.uniform1i(this.at("families"), part.family.terms.length);
+      if (part.family.terms.length) {
+        gl.uniform1iv(this.at("term"), part.family.terms);
+        gl.uniform1fv(this.at("scale"), part.family.scale);
+      }
       gl.uniform1i(this.at("knots"), Math.max(part.knot.length, 1));
       if (part.knot.length) gl.uniform1fv(this.at("knot"), part.knot);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -467,10 +544,10 @@ class Piece {
     const key = JSON.stringify(every);
     if (key !== part.written) {
       const gl = this.gl;
-      part.term.forEach((term, k) => {
+      part.family.terms.forEach((term, k) => {
         const at = part.weightStart + k;
         gl.activeTexture(gl.TEXTURE0 + this.textures.weights.unit);
-        gl.texSubImage2D(gl.TEXTURE_2D, 0, at % WIDTH, Math.floor(at / WIDTH), 1, 1, gl.RGBA, gl.FLOAT, Float32Array.of(...every[term].map((x) => x / part.scale[k]), 0));
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, at % WIDTH, Math.floor(at / WIDTH), 1, 1, gl.RGBA, gl.FLOAT, Float32Array.of(...every[term].map((x) => x / part.family.scale[k]), 0));
       });
       part.written = key;
     }

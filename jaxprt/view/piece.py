@@ -2,6 +2,7 @@
 
 import base64
 import html
+import itertools
 import os
 import pathlib
 import zlib
@@ -17,10 +18,11 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
 from jaxprt.view import messages, parts, stages
-from jaxprt.view.reduced import coarse, light_size, scale_of
+from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
+_MOST_BITS = 2**27  # bytes of visibility of single texels, which graphics cards take
 _FIRST = 2  # scale of visibility that is the finest one in bytes
 _VIEWS = 4  # from which the error is measured
 _PAGE = """<!doctype html>
@@ -47,6 +49,7 @@ class Piece(NamedTuple):
         path: The file.
         nbytes: Its size.
         edge: Texels along the edge of the faces of the finest visibility in it; 0 without glossy parts.
+        texels: Whether the brightest texels of the light are summed one by one, for shadows of a small sun.
         error: Relative L2 error of its radiance at the vertices against that of the scene, over four views, in the
             light where it is largest.
     """
@@ -54,6 +57,7 @@ class Piece(NamedTuple):
     path: pathlib.Path
     nbytes: int
     edge: int
+    texels: bool
     error: float
 
 
@@ -67,8 +71,9 @@ def export(
     """Writes a page that relights a scene without Python, by the browser's GPU: the viewer, and what it needs.
 
     Direct light alone: ideally diffuse parts by transfer vectors in bytes, others by lobes and by means of visibility,
-    as fine as fit in the size that is asked for. What the viewer changes can be changed in it: light, turned or
-    another, lamps, and materials that are one for all of a part. A Radiance HDR file that is dropped on it is a light.
+    as fine as fit in the size that is asked for; and the brightest texels of the light one by one, where they fit. What
+    the viewer changes can be changed in it: light, turned or another, lamps, and materials that are one for all of a
+    part. A Radiance HDR file that is dropped on it is a light.
 
     Args:
         scene: From `jaxprt.precompute`, with the systems "lobe", or with any for parts that are ideally diffuse.
@@ -89,29 +94,30 @@ def export(
         raise ValueError(f"path must end in .html, got {path.name!r}")
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
-    scale = scale_of(scene)
+    scale, bits = scale_of(scene), bits_of(scene)
+    levels = [0] if scale is None else range(_FIRST, len(scale.edge))
+    # Shadows of a small sun are worth more than fine means of visibility.
+    fits = bits is not None and sum(each.size for each in bits) <= _MOST_BITS
     least = 0
-    for level in [0] if scale is None else range(_FIRST, len(scale.edge)):
-        reduced = coarse(scene, level)
+    for texels, level in itertools.product([True, False] if fits else [False], levels):
+        reduced = coarse(scene, level, texels=texels)
         error = max(_error(scene, reduced, each) for each in lights.values())
         page = _page(session, reduced, lights, level, error=error, title=path.stem)
         if len(page) <= most:
             path.write_bytes(page)
-            return Piece(path, len(page), 0 if scale is None else int(scale.edge[level]), error)
+            return Piece(path, len(page), 0 if scale is None else int(scale.edge[level]), texels, error)
         least = len(page)
     raise ValueError(f"most must be at least the {least} bytes of the scene with its coarsest visibility, got {most}")
 
 
 def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
     """Relative error over some views around the scene."""
-    size = light_size(reduced)
-    smaller = _resized(light, size=size) if size else light
     off = whole = 0.0
     for number in range(_VIEWS):
         turn = stages.about(2 * np.pi * number / _VIEWS)
         target = jnp.asarray(scene.camera.target)
         eye = target + turn @ (jnp.asarray(scene.camera.eye) - target)
-        full, found = (np.asarray(each.radiance(lit, eye=eye)) for each, lit in ((scene, light), (reduced, smaller)))
+        full, found = (np.asarray(each.radiance(light, eye=eye)) for each in (scene, reduced))
         full, found = np.broadcast_arrays(full, found)
         off, whole = off + float(np.sum((found - full) ** 2)), whole + float(np.sum(full**2))
     return float(np.sqrt(off / whole)) if whole else 0.0
@@ -152,15 +158,6 @@ def _page(
     return _PAGE.format(title=html.escape(title), data=data, **modules).encode()
 
 
-def _resized(light: Environment, *, size: int) -> Environment:
-    """A light with fewer texels: means over the sphere."""
-    large = light.radiance.shape[-2]
-    area = np.asarray(cubemap.solid_angle(size=large), np.float64)[..., None]
-    folded = (6, size, large // size, size, large // size, -1)
-    value, whole = (each.reshape(folded).sum((2, 4)) for each in (np.asarray(light.radiance) * area, area))
-    return Environment(jnp.asarray(value / whole, jnp.result_type(float)))
-
-
 def _colored(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:
-    radiance = np.asarray(_resized(light, size=size).radiance)
+    radiance = np.asarray(resized(light, size=size).radiance)
     return np.broadcast_to(radiance, (*radiance.shape[:-1], 3))

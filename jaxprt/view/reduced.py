@@ -3,14 +3,19 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, UInt8
 
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Environment
+from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels, harmonic, lobe
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.protocol import Joined, System
 
 _LIGHT = 32  # texels along the edge of the light's faces that lobes are read from
+_TEXELS = 64  # brightest texels that are summed one by one
+_GRAZING = 1e-3
 
 Exported = lobe.LobeSystem | harmonic.DiffuseSystem
 
@@ -32,12 +37,35 @@ class CoarseTransport(lobe.LobeTransport):
         return whole.lobe_visibility(face, s, t, jnp.maximum(spread, self.spread), points)
 
 
-def coarse(scene: RelitScene, level: int) -> RelitScene:
-    """A scene as a page has it: without bounces, single texels and fine visibility, its vectors rounded to bytes.
+class CoarseSystem(lobe.LobeSystem):
+    """Lobes under a light with fewer texels than it has."""
+
+    def light(self, environment: Environment) -> lobe.LobeLight:
+        """The light with fewer texels, blurred."""
+        return super().light(resized(environment, size=self.transport.size))
+
+
+class LobesAlone(eqx.Module):
+    """What lobes carry of a BRDF, in 1/sr.
+
+    Attributes:
+        table: The lobes.
+    """
+
+    table: lobe.LobeBrdf
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value: the lobes over the cosine, which counts as at least 0.001."""
+        return self.table(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
+
+
+def coarse(scene: RelitScene, level: int, *, texels: bool) -> RelitScene:
+    """A scene as a page has it: without bounces and fine visibility of lobes, its vectors rounded to bytes.
 
     Args:
         scene: The scene.
         level: Finest scale of visibility, as `jaxprt.systems.lobe.pyramid.scales` numbers them.
+        texels: Whether the brightest texels of the light are summed one by one.
     """
     systems = systems_of(scene)
     vectors = [vectors_of(each) for each in systems]
@@ -52,8 +80,53 @@ def coarse(scene: RelitScene, level: int) -> RelitScene:
         old = system.transport
         size, least = min(_LIGHT, old.size), float(pyramid.scales(old.size).spread[level])
         seen = CoarseTransport(old.pyramid, rounded, old.position, old.frame, size, old.size, least)
-        made.append(lobe.LobeSystem(seen, system.brdf))
+        made.append(CoarseSystem(seen, system.brdf))
+    if texels:
+        full = zip(made, scene.direct.part, scene.shading, strict=True)
+        made = [_with_texels(each, system, shading) for each, system, shading in full]
     return RelitScene(scene.scene, Joined(tuple(made)), scene.shading)
+
+
+def _with_texels(system: System, full: System, shading: Shading) -> System:
+    """A system with the brightest texels of the light, each taken in its middle."""
+    assert isinstance(full, bright_texels.BrightTexels)
+    brdf = shading.brdf
+    if isinstance(system, lobe.LobeSystem) and shading.blend is None:
+        brdf = LobesAlone(system.brdf)
+    return bright_texels.BrightTexels(system, full.visibility, brdf, count=texels_of(full.visibility.size))
+
+
+def texels_of(size: int) -> int:
+    """How many texels of a light are summed one by one."""
+    return min(_TEXELS, 6 * size**2 - 1)
+
+
+def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"]] | None:
+    """Visibility of single texels for each part; None where a part has none."""
+    result = []
+    for system in scene.direct.part:
+        seen = system.visibility if isinstance(system, bright_texels.BrightTexels) else None
+        if isinstance(seen, lobe.TexelBits):
+            result.append(np.asarray(seen.bit).T)
+        elif isinstance(seen, lobe.LobeTransport):
+            result.append(np.asarray(seen.pyramid)[:, : 6 * seen.size**2 // 8])
+        else:
+            return None
+    return result
+
+
+def resized(light: Environment, *, size: int) -> Environment:
+    """A light with fewer texels: means over the sphere.
+
+    Args:
+        light: The light.
+        size: A divisor of the edge of its faces.
+    """
+    large = light.radiance.shape[-2]
+    area = jnp.asarray(cubemap.solid_angle(size=large))[..., None]
+    folded = (6, size, large // size, size, large // size, -1)
+    value, whole = (each.reshape(folded).sum((2, 4)) for each in (light.radiance * area, area))
+    return Environment(value / whole)
 
 
 def systems_of(scene: RelitScene) -> list[Exported]:

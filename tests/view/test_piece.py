@@ -78,16 +78,18 @@ LAMPS = [{"direction": [0.2, 1.0, 0.5], "angle": 0.4, "radiance": [5.0, 4.0, 3.0
 def test_page_makes_the_radiance_of_the_reduced_scene(change, page, systems, lights, look):
     message = look | change
     known = messages.look(message, systems=["lobes"], lights=2)
-    made = stages.Stages({"lobes": coarse(systems["lobes"], 2)}, lights)
+    made = stages.Stages({"lobes": coarse(systems["lobes"], 2, texels=True)}, lights)
     light = made.unturned(known.light, known.lamps)
     if known.turn:
         light = rotate(light, stages.about(known.turn))
     true = made.scene.radiance(light, eye=jnp.asarray(known.eye), materials=made.materials(known))
-    assert off(page.color(message), np.asarray(true)) < 2e-3
+    assert (
+        off(page.color(message), np.asarray(true)) < 5e-3
+    )  # at 6 x 8 x 8 a texel is .4 % off the disk that the page takes it for
 
 
 def test_error_is_told_against_the_whole_scene(made, systems, lights):
-    scene, reduced = systems["lobes"], coarse(systems["lobes"], 2)
+    scene, reduced = systems["lobes"], coarse(systems["lobes"], 2, texels=True)
     apart = norm = 0.0
     for quarter in range(4):
         turn = stages.about(quarter * np.pi / 2)
@@ -126,7 +128,7 @@ def test_dropped_hdr_lights_the_page_as_it_lights_python(by_runs, page, systems,
     assert content["lights"][-1] == "soft"
     found = page.color(look | {"light": content["light"]})
     light = prt.load_environment(path, size=8)
-    true = coarse(systems["lobes"], 2).radiance(light, eye=jnp.asarray(look["eye"]))
+    true = coarse(systems["lobes"], 2, texels=True).radiance(light, eye=jnp.asarray(look["eye"]))
     assert off(found, np.asarray(true)) < 0.02
 
 
