@@ -69,6 +69,7 @@ HOST = {
     "systems.axes": "reads annotations",
     "systems.ranges": "cuts objects",
     "visibility.stored.precompute": "traces rays",
+    "systems.lobe.relight.blur": "makes numbers",
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",
     "systems.lobe.pyramid.bits": "cuts bytes",

@@ -15,6 +15,7 @@ import numpy as np
 from jaxprt import visibility
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
+from jaxprt.relit.kept import kept
 from jaxprt.scene import Mesh
 from jaxprt.systems import bright_texels, harmonic, lobe, separable
 from jaxprt.systems.lobe import LobeTransport
@@ -116,7 +117,11 @@ class Lobes(eqx.Module):
             vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
             matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
-        table = lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot)
+        table = kept(
+            None if target.path is None else pathlib.Path(f"{target.path}_table_{self.lobes}.prt"),
+            (shading.brdf, shading.knot, self.lobes),
+            lambda: lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot),
+        )
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
