@@ -5,6 +5,7 @@ from jaxprt.scene import (
     camera,
     environment,
     interiors,
+    light_probes,
     light_samples,
     material,
     mesh,
@@ -15,6 +16,7 @@ from jaxprt.scene import (
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
 from jaxprt.scene.formats.scene_file import load_scene
+from jaxprt.scene.light_probes import light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
 from jaxprt.scene.scene import Part, Scene
@@ -31,6 +33,8 @@ __all__ = [
     "camera",
     "environment",
     "interiors",
+    "light_probe",
+    "light_probes",
     "light_samples",
     "load_environment",
     "load_mesh",

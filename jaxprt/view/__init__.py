@@ -5,11 +5,12 @@ from typing import Any
 
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
+from jaxprt.view.baked import export_baked
 from jaxprt.view.piece import Piece, export
 from jaxprt.view.server import Server
 from jaxprt.view.session import Session
 
-__all__ = ["Piece", "Server", "Session", "export", "serve", "view"]
+__all__ = ["Piece", "Server", "Session", "export", "export_baked", "serve", "view"]
 
 
 def view(

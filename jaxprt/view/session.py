@@ -116,7 +116,7 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        arrays = np.asarray(mesh.position, "<f4"), _counterclockwise(mesh)
+        arrays = np.asarray(mesh.position, "<f4"), counterclockwise(mesh)
         return Reply(content, [each.tobytes() for each in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
@@ -204,7 +204,7 @@ class Session:
             return seq < self._newest
 
 
-def _counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
+def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
     """Faces whose corners go around counterclockwise, seen from the side that their normals point to."""
     face = np.asarray(mesh.face).astype("<u4")
     position, normal = np.asarray(mesh.position, np.float64), np.asarray(mesh.normal, np.float64)

@@ -1,0 +1,122 @@
+"""Scenes as binary glTF with the radiance of one light and one view in the colors of the vertices."""
+
+import json
+import os
+import pathlib
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Environment, Mesh
+from jaxprt.view.session import counterclockwise
+
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_FLOAT, _UINT = 5126, 5125
+_ARRAY, _ELEMENT = 34962, 34963
+
+
+def export_baked(
+    scene: RelitScene,
+    path: str | os.PathLike,
+    environment: Environment,
+    *,
+    eye: Float[Array, "3"] | None = None,
+    materials: Mapping[str, Any] | None = None,
+) -> float:
+    """Writes a scene as binary glTF, baked: it shows the radiance of one light towards one eye from everywhere.
+
+    Each part is a mesh with radiance in COLOR_0, and a material of KHR_materials_unlit. glTF's colors are linear and
+    end at 1, so all are divided by the largest radiance; the file has that number in its `extras` as `exposure`. What
+    is negative counts as 0. The names in the file say that it is baked.
+
+    Args:
+        scene: From `jaxprt.precompute`.
+        path: The file, `*.glb`.
+        environment: The light.
+        eye: Position of the viewer; that of the scene's camera if None.
+        materials: Other materials of some parts.
+
+    Returns:
+        What the colors of the file must be multiplied by to be radiance.
+
+    Raises:
+        TypeError: No relit scene, or no environment.
+        ValueError: A file of another kind, or what `RelitScene.radiance` refuses.
+
+    Reference: Khronos, glTF 2.0 specification, sections 3.7.2 and 4.4; KHR_materials_unlit.
+    """
+    require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
+    require.kind("the light", environment, Environment, source="jaxprt.load_environment")
+    path = pathlib.Path(path)
+    if path.suffix.lower() != ".glb":
+        raise ValueError(f"path must end in .glb, got {path.name!r}")
+    eye = scene.camera.eye if eye is None else eye
+    color = np.asarray(scene.radiance(environment, eye=eye, materials=materials), np.float32)
+    if color.ndim != 2:
+        raise ValueError(f"the light must be one environment, got a batch of {len(color)}")
+    color = np.maximum(np.broadcast_to(color, (len(color), 3)), 0)
+    exposure = max(float(color.max(initial=0)), 1e-30)
+    path.write_bytes(_file(scene, color / np.float32(exposure), np.asarray(eye, float).tolist(), exposure))
+    return exposure
+
+
+def _file(scene: RelitScene, color: Float[np.ndarray, "v 3"], eye: list[float], exposure: float) -> bytes:
+    views, accessors, meshes, nodes, data = [], [], [], [], b""
+
+    def add(array: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
+        nonlocal data
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind, **more}
+        )
+        data += array.tobytes()
+        return len(accessors) - 1
+
+    first = 0
+    for part in scene.scene.parts:
+        mesh: Mesh = part.mesh
+        own = color[first : first + len(mesh.position)]
+        first += len(own)
+        position = np.asarray(mesh.position, "<f4")
+        span = {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
+        primitive = {
+            "attributes": {
+                "POSITION": add(position, "VEC3", _FLOAT, _ARRAY, **span),
+                "COLOR_0": add(np.clip(own, 0, 1).astype("<f4"), "VEC3", _FLOAT, _ARRAY),
+            },
+            "indices": add(counterclockwise(mesh).reshape(-1), "SCALAR", _UINT, _ELEMENT),
+            "material": 0,
+        }
+        name = f"{part.name}, baked for one light and one view"
+        meshes.append({"name": name, "primitives": [primitive]})
+        nodes.append({"name": name, "mesh": len(meshes) - 1})
+    unlit = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    head = {
+        "asset": {"version": "2.0", "generator": "jaxprt", "extras": {"baked": True, "eye": eye, "exposure": exposure}},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"name": "baked for one light and one view", "nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": [{"name": "baked", "pbrMetallicRoughness": unlit, "extensions": {"KHR_materials_unlit": {}}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(head, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(data)
+    return b"".join(
+        [
+            struct.pack("<III", _MAGIC, 2, size),
+            struct.pack("<II", len(text), _JSON),
+            text,
+            struct.pack("<II", len(data), _BIN),
+            data,
+        ]
+    )
