@@ -1,7 +1,7 @@
 """Executes notebooks in place: `python notebooks/execute.py NOTEBOOK...`.
 
-Of a viewer the file keeps the picture alone. Without a kernel there is no widget to show, and JupyterLab would print an error
-in its place.
+A saved viewer keeps its picture alone: without a kernel there is no widget to show, and JupyterLab would print an error
+instead.
 """
 
 import pathlib

@@ -1,6 +1,7 @@
 """The viewer in JupyterLab: the same module as on the page of its own, its questions sent as messages of a widget.
 
 A real JupyterLab, of the extra `notebook`, and headless Chromium; skipped where one of them is missing.
+JAXPRT_BROWSER_REQUIRED asks for Chromium alone: JupyterLab is no part of the extra `test`.
 """
 
 import importlib.util
@@ -31,7 +32,7 @@ gradient = np.linspace(0.1, 1, 8)[:, None, None] * np.ones((6, 8, 8, 3))
 prt.view.view(relit, environments={"gradient": Environment(gradient)}, height=300)
 """
 
-if CHROMIUM is None:
+if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
     pytest.skip("no chromium on this machine", allow_module_level=True)
 if importlib.util.find_spec("jupyterlab") is None:
     pytest.skip("no jupyterlab: pip install 'jaxprt[notebook]'", allow_module_level=True)
@@ -45,12 +46,9 @@ def lab(tmp_path):
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
     (tmp_path / "files" / "play.ipynb").write_text(json.dumps(notebook))
-    own = {
-        name: str(tmp_path / name)
-        for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_DIR")
-    }
-    del own["JUPYTERLAB_DIR"]
-    own |= {name: str(tmp_path / name) for name in ("JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR")}
+    names = ["JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR"]
+    names += ["JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR"]
+    own = {name: str(tmp_path / name) for name in names}
     root = str(pathlib.Path(__file__).parents[2])
     found = os.environ.get("PYTHONPATH")
     own["PYTHONPATH"] = root if not found else os.pathsep.join([root, found])
@@ -95,6 +93,7 @@ def ask(url, path, *, method="GET"):
 @pytest.fixture
 def page(lab):
     """The notebook, opened and run, in a browser whose clock can be put forward."""
+    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
