@@ -41,7 +41,7 @@ tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half
 
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
-	$(BIN)/jupyter nbconvert --to notebook --execute --inplace $(sort $(wildcard notebooks/*.ipynb))
+	$(BIN)/python notebooks/execute.py $(sort $(wildcard notebooks/*.ipynb))
 
 clean: ## remove what was computed and cached; .venv stays
 	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache

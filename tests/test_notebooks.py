@@ -109,6 +109,13 @@ def test_outputs_hold_neither_errors_nor_warnings(path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_outputs_need_no_kernel(path):
+    assert "widgets" not in json.loads(path.read_text())["metadata"]
+    shown = [kind for cell in _code(path) for output in cell["outputs"] for kind in output.get("data", {})]
+    assert not [kind for kind in shown if "widget" in kind]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_names_no_folder_of_a_machine(path):
     found = [match.group() for text in _texts(json.loads(path.read_text())) for match in MACHINE.finditer(text)]
     assert not found

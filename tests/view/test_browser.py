@@ -151,6 +151,45 @@ def test_drags_and_keys_move_the_state(hand):
     assert hand.state()["turn"] == hand.state()["stops"] == 0
 
 
+@pytest.fixture
+def touch(hand):
+    """Puts fingers on the page, at places by their numbers, moves them and takes them away."""
+    tab = hand.page.context.new_cdp_session(hand.page)
+
+    def send(kind, places):
+        points = [{"id": number, "x": x, "y": y} for number, (x, y) in enumerate(places)]
+        tab.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    def move(start, end, steps=5):
+        start, end = np.array(start, float), np.array(end, float)
+        send("touchStart", start)
+        for share in np.linspace(0, 1, steps + 1)[1:]:
+            send("touchMove", start + share * (end - start))
+        send("touchEnd", [])
+        hand.settle()
+
+    return move
+
+
+def test_one_finger_orbits_and_two_zoom_and_pan(hand, touch):
+    first = hand.camera()
+    touch([(100, 100)], [(140, 120)])
+    turned = hand.camera()
+    assert turned["azimuth"] == pytest.approx(first["azimuth"] - 0.4)
+    assert turned["elevation"] == pytest.approx(first["elevation"] + 0.2)
+    assert turned["distance"] == first["distance"]
+    touch([(100, 100), (160, 100)], [(70, 100), (190, 100)])  # twice as far apart around the same middle
+    pinched = hand.camera()
+    assert pinched["distance"] == pytest.approx(first["distance"] / 2)
+    assert pinched["azimuth"] == turned["azimuth"]
+    np.testing.assert_allclose(pinched["target"], first["target"], atol=0.02 * first["distance"])
+    touch([(100, 100), (160, 100)], [(100, 132), (160, 132)])
+    panned = hand.camera()
+    moved = np.subtract(panned["target"], pinched["target"])
+    assert np.linalg.norm(moved) == pytest.approx(0.1 * 2 * pinched["distance"] * np.tan(0.35), rel=0.02)
+    assert panned["distance"] == pytest.approx(pinched["distance"], rel=0.02)
+
+
 def test_a_double_click_looks_at_a_point_of_the_surface(hand):
     hand.page.mouse.dblclick(
         *hand.page.evaluate(

@@ -1,0 +1,153 @@
+"""The viewer in JupyterLab: the same module as on the page of its own, its questions sent as messages of a widget.
+
+A real JupyterLab, of the extra `notebook`, and headless Chromium; skipped where one of them is missing.
+JAXPRT_BROWSER_REQUIRED asks for Chromium alone: JupyterLab is no part of the extra `test`.
+"""
+
+import importlib.util
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+TOKEN = "of-this-test"
+PATIENCE = 120  # seconds: a busy machine compiles the kernel's programs anew
+SOURCE = """
+import jaxprt as prt
+from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
+import numpy as np
+
+material = TexturedMaterial(base_color=(0.6, 0.2, 0.1), metallic=0.0, specular=0.0)
+scene = Scene([Part("ball", builtin.sphere(rings=8, sectors=16), material)])
+relit = prt.precompute(scene, system=prt.relit.Harmonics(2), size=8, progress=False)
+gradient = np.linspace(0.1, 1, 8)[:, None, None] * np.ones((6, 8, 8, 3))
+prt.view.view(relit, environments={"gradient": Environment(gradient)}, height=300)
+"""
+
+if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
+    pytest.skip("no chromium on this machine", allow_module_level=True)
+if importlib.util.find_spec("jupyterlab") is None:
+    pytest.skip("no jupyterlab: pip install 'jaxprt[notebook]'", allow_module_level=True)
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """JupyterLab's address, with settings and files of its own."""
+    (tmp_path / "files").mkdir()
+    cell = {"cell_type": "code", "id": "only", "metadata": {}, "source": SOURCE, "outputs": [], "execution_count": None}
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
+    (tmp_path / "files" / "play.ipynb").write_text(json.dumps(notebook))
+    names = ["JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR"]
+    names += ["JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR"]
+    own = {name: str(tmp_path / name) for name in names}
+    root = str(pathlib.Path(__file__).parents[2])
+    found = os.environ.get("PYTHONPATH")
+    own["PYTHONPATH"] = root if not found else os.pathsep.join([root, found])
+    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--port=0"]
+    command += [f"--IdentityProvider.token={TOKEN}", f"--ServerApp.root_dir={tmp_path / 'files'}"]
+    with (tmp_path / "log").open("w") as log:
+        server = subprocess.Popen(command, env=os.environ | own, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        yield _url(server, pathlib.Path(own["JUPYTER_RUNTIME_DIR"]), tmp_path / "log")
+    finally:
+        server.terminate()  # which ends its kernels
+        try:
+            server.wait(20)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+def _url(server, folder, log):
+    """Where the server listens, once it does."""
+    until = time.monotonic() + PATIENCE
+    while time.monotonic() < until:
+        assert server.poll() is None, log.read_text()
+        for path in folder.glob("jpserver-*.json"):
+            try:
+                url = json.loads(path.read_text())["url"]
+                ask(url, "api/status")
+                return url
+            except (OSError, ValueError):
+                continue  # half written, or not yet listening
+        time.sleep(0.1)
+    raise AssertionError(f"JupyterLab did not start: {log.read_text()}")
+
+
+def ask(url, path, *, method="GET"):
+    """What JupyterLab's interface answers."""
+    request = urllib.request.Request(url + path, method=method, headers={"Authorization": f"token {TOKEN}"})
+    with urllib.request.urlopen(request, timeout=30) as response:
+        return json.loads(response.read() or "null")
+
+
+@pytest.fixture
+def page(lab):
+    """The notebook, opened and run, in a browser whose clock can be put forward."""
+    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        page = browser.new_page(viewport={"width": 1100, "height": 800})
+        page.set_default_timeout(1000 * PATIENCE)
+        page.clock.install()
+        page.goto(f"{lab}doc/tree/play.ipynb?token={TOKEN}")
+        page.locator(".jp-Notebook .cm-content").first.click()
+        page.keyboard.press("Shift+Enter")
+        page.locator("canvas.canvas").wait_for()
+        yield page
+        browser.close()
+
+
+def stats(page):
+    return page.locator("canvas.canvas").evaluate("canvas => canvas.stats")
+
+
+def until(condition):
+    """Waits for something to become true."""
+    last = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < last, "waited in vain"
+        time.sleep(0.1)
+
+
+def drag(page):
+    """Drags over the canvas from its middle."""
+    box = page.locator("canvas.canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y + 20, steps=5)
+    page.mouse.up()
+
+
+def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told(page, lab):
+    until(lambda: stats(page)["shown"] == stats(page)["seq"] > 0)
+    before = stats(page)
+    drag(page)
+    until(lambda: stats(page)["shown"] == stats(page)["seq"] > before["seq"])
+    after = stats(page)
+    assert after["got"] == after["sent"] > before["got"]
+    assert after["errors"] == 0
+    until(lambda: stats(page)["stills"] > before["stills"])
+
+    (kernel,) = ask(lab, "api/kernels")
+    ask(lab, f"api/kernels/{kernel['id']}/restart", method="POST")
+    until(lambda: ask(lab, "api/kernels")[0]["execution_state"] == "idle")
+    drag(page)
+    page.clock.fast_forward("02:05")  # longer than the viewer waits for an answer
+    told = page.locator(".told", has_text="no answer from Python")
+    told.wait_for()
+    drag(page)  # the page goes on
+    assert stats(page)["seq"] > after["seq"]
+    assert stats(page)["got"] == after["got"]
