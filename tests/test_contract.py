@@ -508,6 +508,7 @@ EXAMPLES = {
     ),
     "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
+    "scene.light_probes.light_probe": example(lambda draw: call(draw.light()), tool="Unity"),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),

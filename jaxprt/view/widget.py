@@ -40,6 +40,10 @@ class Viewer(anywidget.AnyWidget):
         self._threads.shutdown(wait=False, cancel_futures=True)
         super().close()
 
+    def __repr__(self) -> str:
+        """The names of what it shows, the same in every run."""
+        return f"Viewer of {', '.join(part.name for part in self.session.stages.scene.scene.parts)}"
+
     def _repr_mimebundle_(self, **options: Any) -> tuple[dict, dict] | None:
         """The widget, and a picture for where there is no kernel: a saved notebook, or its page on the web."""
         found = super()._repr_mimebundle_(**options)

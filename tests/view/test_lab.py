@@ -8,7 +8,6 @@ import importlib.util
 import json
 import os
 import pathlib
-import shutil
 import subprocess
 import sys
 import time
@@ -16,8 +15,6 @@ import urllib.request
 
 import pytest
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 TOKEN = "of-this-test"
 PATIENCE = 120  # seconds: a busy machine compiles the kernel's programs anew
 SOURCE = """
@@ -32,8 +29,6 @@ gradient = np.linspace(0.1, 1, 8)[:, None, None] * np.ones((6, 8, 8, 3))
 prt.view.view(relit, environments={"gradient": Environment(gradient)}, height=300)
 """
 
-if CHROMIUM is None and not os.environ.get("JAXPRT_BROWSER_REQUIRED"):
-    pytest.skip("no chromium on this machine", allow_module_level=True)
 if importlib.util.find_spec("jupyterlab") is None:
     pytest.skip("no jupyterlab: pip install 'jaxprt[notebook]'", allow_module_level=True)
 
@@ -91,22 +86,17 @@ def ask(url, path, *, method="GET"):
 
 
 @pytest.fixture
-def page(lab):
+def page(browser, lab):
     """The notebook, opened and run, in a browser whose clock can be put forward."""
-    assert CHROMIUM, "JAXPRT_BROWSER_REQUIRED is set, and there is no chromium"
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        page = browser.new_page(viewport={"width": 1100, "height": 800})
-        page.set_default_timeout(1000 * PATIENCE)
-        page.clock.install()
-        page.goto(f"{lab}doc/tree/play.ipynb?token={TOKEN}")
-        page.locator(".jp-Notebook .cm-content").first.click()
-        page.keyboard.press("Shift+Enter")
-        page.locator("canvas.canvas").wait_for()
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": 1100, "height": 800})
+    page.set_default_timeout(1000 * PATIENCE)
+    page.clock.install()
+    page.goto(f"{lab}doc/tree/play.ipynb?token={TOKEN}")
+    page.locator(".jp-Notebook .cm-content").first.click()
+    page.keyboard.press("Shift+Enter")
+    page.locator("canvas.canvas").wait_for()
+    yield page
+    page.close()
 
 
 def stats(page):
