@@ -35,8 +35,8 @@ _FIRST = """
 import sys, time
 from jaxprt.cli import play
 play.keep_programs()
-options = play._parser().parse_args(["--no-browser", "--output", sys.argv[1]])
-server = play.shown(options)
+made, lights = play.ready(play._parser().parse_args(["--output", sys.argv[1]]))
+server = play.serve(made, environments=lights)
 print(server.url, flush=True)
 server.wait()
 """
