@@ -212,7 +212,16 @@ class Drawing {
       gl.uniformMatrix4fv(this.mesh.at("matrix"), false, camera.matrix(width / height, center));
       gl.uniform1f(this.mesh.at("gain"), gain * this.scale);
       gl.uniform1i(this.mesh.at("encoded"), this.encoded ? 1 : 0);
+      // Backs lie a little deeper: at silhouettes they are as deep as the fronts beside them, and would show as dots.
+      gl.enable(gl.CULL_FACE);
+      gl.enable(gl.POLYGON_OFFSET_FILL);
+      gl.polygonOffset(2, 4);
+      gl.cullFace(gl.FRONT);
       gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
+      gl.disable(gl.POLYGON_OFFSET_FILL);
+      gl.cullFace(gl.BACK);
+      gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
+      gl.disable(gl.CULL_FACE);
       gl.disable(gl.DEPTH_TEST);
     }
     if (this.stillImage && alpha > 0) {
@@ -255,7 +264,7 @@ export function mount(root, ask) {
   const help = element("pre", frame, { className: "help", textContent: HELP, hidden: true });
   const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, background: true, bounces: false, still: true, exact: false, materials: {} };
   const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, draws: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
-  let scene = null, camera = null, drawing = null, closed = false, far = false;
+  let scene = null, camera = null, first = null, drawing = null, closed = false, far = false;
   let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillAt = 0, stillBusy = false, skyKey = "", framed = 0;
 
   const tell = (text) => { told.textContent = text; told.hidden = !text; };
@@ -305,6 +314,11 @@ export function mount(root, ask) {
         const compressed = own.stops !== null, bytes = buffers[0].byteLength;
         const data = compressed ? await inflate(buffers[0], scene.vertices) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, bytes / 2);
         drawing.setColor(data, compressed, content.scale);
+        if (first === null) {
+          first = compressed ? 0 : exposureFor(data, content.scale);
+          state.stops = first;
+          controls?.show();
+        }
         stats.trip = performance.now() - began;
         const spent = content.ms.light + content.ms.view + content.ms.combine;
         far = far ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
@@ -389,7 +403,7 @@ export function mount(root, ask) {
       set({ light: content.light, lamps: [] });
     } catch (error) { stats.errors++; tell(`no answer from Python: ${error.message}`); }
   };
-  const reset = () => { camera = new Camera(scene); set({ turn: 0, lamps: [], materials: {}, stops: 0 }); };
+  const reset = () => { camera = new Camera(scene); set({ turn: 0, lamps: [], materials: {}, stops: first ?? 0 }); };
   const lookAt = (x, y) => {
     const ray = camera.ray(canvas.clientWidth / canvas.clientHeight);
     const way = unit([0, 1, 2].map((i) => ray[i] * x + ray[3 + i] * y + ray[6 + i])), origin = camera.eye;
@@ -478,6 +492,14 @@ function panelOf(panel, scene, state, { set, expose, moved }) {
     },
     paint(data, { width, height, scale }) { paintSky(sky, data, width, height, scale, state.stops); },
   };
+}
+
+// Stops for what is seen first: none, unless most of it would be white or black.
+function exposureFor(data, scale) {
+  const value = [], step = 3 * Math.max(1, Math.floor(data.length / 30000));
+  for (let i = 0; i + 2 < data.length; i += step) value.push(scale * Math.max(half(data[i]), half(data[i + 1]), half(data[i + 2])));
+  const lit = value.filter((x) => x > 0).sort((a, b) => a - b), middle = lit[lit.length >> 1] ?? 0.5;
+  return middle > 1 || middle < 0.02 ? clamp(Math.round(10 * Math.log2(0.5 / middle)) / 10, -20, 20) : 0;
 }
 
 function half(bits) {

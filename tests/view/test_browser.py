@@ -12,9 +12,9 @@ from PIL import Image
 
 import jaxprt as prt
 from jaxprt import files, image
-from jaxprt.scene import Camera
+from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
-from jaxprt.view import Server
+from jaxprt.view import Server, Session
 
 CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
 TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
@@ -302,6 +302,21 @@ def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back
     assert not made.errors
     made.page.close()
     back.close()
+
+
+@pytest.mark.parametrize(("factor", "stops"), [(1.0, 0.0), (2.0**8, -8.0), (2.0**-8, 8.0)])
+def test_what_is_seen_first_is_neither_white_nor_black(browser, systems, lights, factor, stops):
+    light = Environment(factor * np.asarray(lights["gray"].radiance))
+    server = Server(Session(systems, environments={"gray": light}))
+    hand = Hand(browser, server.url)
+    assert hand.state()["stops"] == pytest.approx(stops, abs=3.0)
+    assert 0.1 < np.median(hand.pixels()) < 0.95
+    hand.page.keyboard.press(".")
+    hand.page.keyboard.press("r")
+    hand.settle()
+    assert hand.state()["stops"] == pytest.approx(stops, abs=3.0)
+    hand.page.close()
+    server.close()
 
 
 def test_a_lost_context_comes_back(hand):
