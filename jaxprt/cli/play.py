@@ -14,6 +14,7 @@ import jax
 
 import jaxprt as prt
 from jaxprt.relit import Harmonics, Lobes, RelitScene
+from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import ground_plane, split
 from jaxprt.scene.scene import numbered
@@ -32,8 +33,10 @@ def main(arguments: Sequence[str]) -> None:
         OSError: It cannot be read, or the port cannot be taken.
     """
     options = _parser().parse_args(arguments)
-    if options.export is not None and (options.export.suffix.lower() != ".html" or options.system != ["lobe"]):
-        raise ValueError(f"--export takes a file *.html and the system lobe, got {options.export} and {options.system}")
+    if options.export is not None and options.export.suffix.lower() != ".html":
+        raise ValueError(f"--export takes a file *.html, got {options.export}")
+    if options.export is not None and (options.system != ["lobe"] or len(options.lobes) > 1):
+        raise ValueError("--export takes the system lobe with one number of lobes, got several or another")
     made, lights = ready(options)
     if options.export is not None:
         piece = export(next(iter(made.values())), options.export, environments=lights)
@@ -66,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         "files", type=Path, nargs="*", metavar="FILE", help="meshes and scenes, HDR and EXR environments; embedded ones"
     )
     parser.add_argument("--system", choices=["lobe", "harmonic"], nargs="+", default=["lobe"], help="one, or both")
-    parser.add_argument("--lobes", type=int, default=6, help="lobes of each BRDF (default 6)")
+    parser.add_argument("--lobes", type=_counts, default=[6], help="of each BRDF: 6, or several as 3,6,12 (default 6)")
     parser.add_argument("--bounces", type=int, choices=[0, 1, 2], default=0, help="of light between parts (default 0)")
     parser.add_argument("--ground", action="store_true", help="stand the scene on a diffuse ground plane")
     parser.add_argument("--output", type=Path, help="folder that keeps what was precomputed, for later runs")
@@ -76,24 +79,34 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _counts(text: str) -> list[int]:
+    """Numbers with commas between them."""
+    try:
+        return list(dict.fromkeys(int(each) for each in text.split(",")))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, or several as 3,6,12, got {text!r}") from None
+
+
 def ready(options: argparse.Namespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
     """The scene of the options, made ready by each system, and its lights."""
-    if not 1 <= options.lobes <= 64:
-        raise ValueError(f"--lobes must be from 1 to 64, got {options.lobes}")
+    if not all(1 <= each <= 64 for each in options.lobes):
+        raise ValueError(f"--lobes must be from 1 to 64, got {', '.join(map(str, options.lobes))}")
     if not 0 <= options.port < 2**16:
         raise ValueError(f"--port must be from 0 to 65535, got {options.port}")
     scene, lights = _scene(options), _lights(options.files)
-    recipes = {"lobe": Lobes(options.lobes), "harmonic": Harmonics(laplacian=0.4)}
+    recipes: list[tuple[str, str, Recipe]] = [("lobe", f"{count} lobes", Lobes(count)) for count in options.lobes]
+    recipes.append(("harmonic", "harmonics", Harmonics(laplacian=0.4)))
     made = {
         name: prt.precompute(
             scene,
-            system=recipes[name],
+            system=recipe,
             bounces=options.bounces,
             roughness=_ROUGHNESS,
-            path=None if options.output is None else options.output / name,
+            path=None if options.output is None else options.output / system,  # what lobes of any number share
             progress=sys.stderr.isatty(),
         )
-        for name in dict.fromkeys(options.system)
+        for system, name, recipe in recipes
+        if system in options.system
     }
     return made, lights
 

@@ -56,8 +56,11 @@ def test_a_page_without_python_is_written(place, monkeypatch, capsys):
     page = place / "piece.html"
     assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--lobes", "1", "--export", str(page)]) == 0
     assert f"{page}, {page.stat().st_size:,} bytes" in capsys.readouterr().out
+    several = ["view", str(place / "first.obj"), "--lobes", "1,2", "--export", str(page)]
+    assert main(several) == 2
+    assert "one number of lobes" in capsys.readouterr().err
     assert main(["view", str(place / "first.obj"), "--export", "piece.txt"]) == 2
-    assert "--export takes a file *.html and the system lobe, got piece.txt" in capsys.readouterr().err
+    assert "--export takes a file *.html, got piece.txt" in capsys.readouterr().err
 
 
 def test_the_page_of_files_is_served(place, monkeypatch, capsys):
@@ -77,8 +80,9 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
     monkeypatch.setattr(prt.view.Server, "wait", look)
     store = str(place / "store")
     monkeypatch.setattr(prt, "precompute", lambda scene, **more: precompute(scene, **more | {"size": 8}))
-    assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--lobes", "1", "--output", store]) == 0
+    assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--output", store, "--lobes", "1,2"]) == 0
     assert answers[0]["lights"] == ["sky"]
+    assert list(answers[0]["systems"]) == ["1 lobes", "2 lobes"]
     assert answers[0]["vertices"] == 4
     assert "http://127.0.0.1:" in capsys.readouterr().out
 
