@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Mesh
-from jaxprt.view.session import counterclockwise
+from jaxprt.view.stages import counterclockwise
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT = 5126, 5125

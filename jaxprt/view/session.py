@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Bool, Float
 
 from jaxprt import require
 from jaxprt.image import display, ray_direction, render
@@ -18,7 +18,7 @@ from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Mesh, load_environment
+from jaxprt.scene import Environment, load_environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
@@ -116,7 +116,7 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        arrays = np.asarray(mesh.position, "<f4"), counterclockwise(mesh)
+        arrays = np.asarray(mesh.position, "<f4"), stages.counterclockwise(mesh)
         return Reply(content, [each.tobytes() for each in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
@@ -132,11 +132,23 @@ class Session:
         lit = time.perf_counter()
         self.stages.view_side(look)
         viewed = time.perf_counter()
-        data, scale = messages.encode(self.stages.color(look), stops=_stops(message))
+        color, which = self.stages.color(look), self._which(message, look)
+        data, scale = messages.encode(color if which is None else color[which], stops=_stops(message))
         done = time.perf_counter()
         spent = {"light": lit - began, "view": viewed - lit, "combine": done - viewed}
         times = {name: 1000 * each for name, each in spent.items()}
-        return Reply({"kind": "color", "seq": seq, "scale": scale, "ms": times}, [data])
+        content = {"kind": "color", "seq": seq, "scale": scale, "ms": times}
+        return Reply(content, [data] if which is None else [data, np.packbits(which).tobytes()])
+
+    def _which(self, message: Mapping[str, Any], look: Look) -> Bool[np.ndarray, " v"] | None:
+        """The vertices that a message asks for: those that the eye can see first, the others later; None for all."""
+        asked = message.get("vertices", "all")
+        if asked not in ("all", "seen", "unseen"):
+            raise ValueError(f"vertices must be all, seen or unseen, got {asked!r}")
+        if asked == "all":
+            return None
+        seen = self.stages.facing(look)
+        return seen if asked == "seen" else ~seen
 
     def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         look, seq = self._parse(message)
@@ -202,16 +214,6 @@ class Session:
     def _is_late(self, seq: int) -> bool:
         with self._lock:
             return seq < self._newest
-
-
-def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
-    """Faces whose corners go around counterclockwise, seen from the side that their normals point to."""
-    face = np.asarray(mesh.face).astype("<u4")
-    position, normal = np.asarray(mesh.position, np.float64), np.asarray(mesh.normal, np.float64)
-    edge, other = (position[face[:, k]] - position[face[:, 0]] for k in (1, 2))
-    clockwise = np.sum(np.cross(edge, other) * normal[face].sum(1), -1) < 0
-    face[clockwise] = face[clockwise][:, ::-1]
-    return face
 
 
 def _named(lights: Sequence[Environment]) -> dict[str, Environment]:

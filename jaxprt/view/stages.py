@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Appearance, Shading, roughness_range
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Camera, Environment, Scene, TexturedMaterial
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import background, rotate
 from jaxprt.sphere import cubemap
 from jaxprt.view.messages import Lamp, Look
@@ -108,8 +108,30 @@ class Stages:
 
     def color(self, look: Look) -> Float[np.ndarray, "v 3"]:
         """Radiance of the vertices."""
-        color = np.asarray(self.system(look).combine(self.light_side(look), self.view_side(look)))
-        return np.broadcast_to(color, (len(color), 3))  # gray ones have one channel
+
+        def combined() -> Float[np.ndarray, "v 3"]:
+            color = np.asarray(self.system(look).combine(self.light_side(look), self.view_side(look)))
+            return np.broadcast_to(color, (len(color), 3))  # gray ones have one channel
+
+        return self._once("color", look, combined)
+
+    def facing(self, look: Look) -> Bool[np.ndarray, " v"]:
+        """Whether each vertex is a corner of a triangle that is seen from its front."""
+        mesh = self.scene.mesh
+
+        def faces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            face, position = counterclockwise(mesh), np.asarray(mesh.position)
+            corner, left, right = (position[face[:, k]] for k in range(3))
+            normal = np.cross(left - corner, right - corner)
+            return face, normal, np.sum(normal * corner, -1)
+
+        def seen() -> Bool[np.ndarray, " v"]:
+            face, normal, distance = self._once("faces", None, faces)
+            result = np.zeros(len(mesh.position), bool)
+            result[face[normal @ np.asarray(look.eye, normal.dtype) > distance]] = True
+            return result
+
+        return self._once("facing", look.eye, seen)
 
     def picture(self, look: Look, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
         """The picture at pixels."""
@@ -136,6 +158,16 @@ class Stages:
             while len(kept) > _KEPT:
                 kept.popitem(last=False)
         return made
+
+
+def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
+    """Faces whose corners go around counterclockwise, seen from the side that their normals point to."""
+    face = np.asarray(mesh.face).astype("<u4")
+    position, normal = np.asarray(mesh.position, np.float64), np.asarray(mesh.normal, np.float64)
+    edge, other = (position[face[:, k]] - position[face[:, 0]] for k in (1, 2))
+    clockwise = np.sum(np.cross(edge, other) * normal[face].sum(1), -1) < 0
+    face[clockwise] = face[clockwise][:, ::-1]
+    return face
 
 
 def about(angle: float) -> Float[Array, "3 3"]:

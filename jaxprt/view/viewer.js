@@ -44,12 +44,13 @@ function element(tag, parent, fields = {}) {
   return made;
 }
 
-// Colors that Python has exposed, made bytes, and compressed: differences, channel by channel.
-async function inflate(data, count) {
+// Colors that Python has exposed, made bytes, and compressed: differences, channel by channel. Where a mask comes with
+// them, one bit for each entry, they are those of its entries alone; the others stay as they were.
+async function inflate(data, count, before, mask) {
   const stream = new Blob([data]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const plane = new Uint8Array(await new Response(stream).arrayBuffer());
-  const result = new Uint8Array(3 * count);
-  for (let c = 0; c < 3; c++) for (let i = 0, value = 0; i < count; i++) result[3 * i + c] = value = (value + plane[c * count + i]) & 255;
+  const plane = new Uint8Array(await new Response(stream).arrayBuffer()), entries = plane.length / 3;
+  const result = mask ? before : new Uint8Array(3 * count), bit = (i) => !mask || (mask.getUint8(i >> 3) >> (7 - (i & 7))) & 1;
+  for (let c = 0; c < 3; c++) for (let i = 0, from = c * entries, value = 0; i < count; i++) if (bit(i)) result[3 * i + c] = value = (value + plane[from++]) & 255;
   return result;
 }
 
@@ -265,6 +266,7 @@ export function mount(root, ask) {
   const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, background: true, bounces: false, still: true, exact: false, materials: {} };
   const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, draws: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
   let scene = null, camera = null, first = null, drawing = null, closed = false, far = false;
+  let bytes = null, partial = false; // colors as bytes for a far kernel: what the eye can see comes first
   let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillAt = 0, stillBusy = false, skyKey = "", framed = 0;
 
   const tell = (text) => { told.textContent = text; told.hidden = !text; };
@@ -300,19 +302,21 @@ export function mount(root, ask) {
     redraw();
     look();
   };
-  const look = async () => {
+  const look = async (vertices = "seen") => {
     if (flying) { dirty = true; return; }
     if (closed) return;
     [flying, dirty] = [true, false];
-    const began = performance.now(), own = message("look");
+    const began = performance.now(), own = { ...message("look"), vertices: far && bytes ? vertices : "all" };
     stats.sent++;
     try {
       const { content, buffers } = await ask(own);
       if (closed) return;
       if (content.kind === "error") { stats.errors++; tell(content.message); }
       else {
-        const compressed = own.stops !== null, bytes = buffers[0].byteLength;
-        const data = compressed ? await inflate(buffers[0], scene.vertices) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, bytes / 2);
+        const compressed = own.stops !== null, sent = buffers.reduce((total, each) => total + each.byteLength, 0);
+        if (compressed) bytes = await inflate(buffers[0], scene.vertices, bytes, buffers[1]);
+        const data = compressed ? bytes : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
+        partial = own.vertices === "seen";
         drawing.setColor(data, compressed, content.scale);
         if (first === null) {
           first = compressed ? 0 : exposureFor(data, content.scale);
@@ -323,12 +327,12 @@ export function mount(root, ask) {
         const spent = content.ms.light + content.ms.view + content.ms.combine;
         far = far ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
         stats.got++;
-        stats.bytes += bytes;
+        stats.bytes += sent;
         stats.shown = content.seq;
         if (content.seq === seq) tell("");
         const rate = framed ? 1000 / (performance.now() - framed) : 0;
         framed = performance.now();
-        status(content.ms, rate, bytes);
+        status(content.ms, rate, sent);
         redraw();
       }
     } catch (error) {
@@ -339,6 +343,7 @@ export function mount(root, ask) {
       flying = false;
     }
     if (dirty) look();
+    else if (stats.shown === seq && partial) look("unseen");
     else if (stats.shown === seq) { sky(); stillTimer = setTimeout(still, 250); }
   };
   const status = (ms, rate, bytes) => {

@@ -263,10 +263,10 @@ def test_many_fast_drags_leave_no_queue_and_end_at_the_newest_state(hand):
         hand.page.mouse.move(50 + k % 60, 50 + k % 45)
     hand.page.mouse.up()
     hand.settle()
+    hand.wait("got === stats.sent")  # a busy browser may take what the eye cannot see later
     after = hand.stats()
     assert 20 <= after["seq"] - before["seq"] <= 200  # a busy browser takes several moves for one
-    assert after["sent"] - before["sent"] <= after["seq"] - before["seq"]
-    assert after["sent"] == after["got"]
+    assert after["sent"] - before["sent"] <= after["seq"] - before["seq"] + 1
     time.sleep(0.2)
     assert hand.stats()["sent"] == after["sent"]
 
@@ -335,3 +335,28 @@ def test_a_lost_context_comes_back(hand):
     hand.wait(f"stills > {stats['stills']}")
     time.sleep(0.5)
     assert np.abs(hand.pixels() - before).mean() < 0.02
+
+
+def test_a_far_kernel_sends_bytes_of_what_is_seen_first(hand, session, monkeypatch):
+    hand.page.evaluate(f"() => ({CANVAS}).focus()")
+    for key in "pg":  # colors of the vertices alone
+        hand.page.keyboard.press(key)
+    hand.settle()
+    near, answer, asked = hand.pixels(), session.answer, []
+
+    def slow(message, buffers=()):
+        time.sleep(0.2)
+        asked.append(message.get("vertices"))
+        return answer(message, buffers)
+
+    monkeypatch.setattr(session, "answer", slow)
+    for key in "]]]][[[[":
+        hand.page.keyboard.press(key)
+        hand.settle()
+    hand.page.wait_for_timeout(1500)
+    assert "seen" in asked
+    assert [each for each in asked if each][-1] == "unseen"
+    assert hand.state()["turn"] == pytest.approx(0, abs=1e-9)
+    off = np.abs(hand.pixels() - near)  # bytes are interpolated as displays have them, and half floats as radiance
+    assert off.mean() < 1 / 255
+    assert off.max() < 0.1

@@ -94,13 +94,13 @@ def test_a_light_that_turns_leaves_the_view_alone(session, look, monkeypatch):
     session.answer(look | {"bounces": True})
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3})
-    assert sorted(made) == ["environment", "light", "shade"]
+    assert sorted(made) == ["color", "environment", "light", "shade"]
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0]})
-    assert made == ["view"]
+    assert sorted(made) == ["color", "view"]
     made.clear()
     session.answer(look | {"bounces": True, "turn": 0.3, "eye": [0.0, 1.0, 5.0], "materials": {"ball": {"f0": 0.3}}})
-    assert sorted(made) == ["material", "shade", "view"]
+    assert sorted(made) == ["color", "material", "shade", "view"]
 
 
 def test_pictures_at_rest_are_those_of_the_scene(session, systems, lights, look):
@@ -255,3 +255,24 @@ def test_messages_come_through_as_they_went():
 def test_bytes_that_are_no_message_are_refused(data):
     with pytest.raises(ValueError, match=f"what the viewer sends, got {len(data)} other bytes"):
         messages.unpack(data)
+
+
+def test_vertices_that_the_eye_can_see_come_first_and_the_others_later(session, look):
+    whole = halves(session.answer(look))
+    first, later = (session.answer(look | {"vertices": which}) for which in ("seen", "unseen"))
+    seen, unseen = (
+        np.unpackbits(np.frombuffer(each.buffers[1], np.uint8))[: len(whole)] > 0 for each in (first, later)
+    )
+    np.testing.assert_array_equal(seen, ~unseen)
+    assert 0.2 < seen.mean() < 0.8
+    np.testing.assert_array_equal(halves(first), whole[seen])
+    np.testing.assert_array_equal(halves(later), whole[unseen])
+    mesh = session.stages.scene.mesh
+    position, face = np.asarray(mesh.position, float), np.asarray(mesh.face)
+    corner = position[face]
+    front = (
+        np.einsum("fi,fi->f", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), EYE - corner[:, 0])
+        > 1e-9
+    )
+    assert seen[face[front]].all()  # all corners of what is drawn
+    assert session.answer(look | {"vertices": "some"}).content["kind"] == "error"
