@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import Lambert, MetallicRoughness, grid
+from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.compile import jit
 from jaxprt.scene import Mesh, Part
@@ -53,16 +53,31 @@ class RoughnessFamily(eqx.Module):
         return Channels(tuple(each[k] for k in self.term), self.scale)
 
 
+class ShininessFamily(eqx.Module):
+    """Diffuse base and lobe of `BlinnPhong` as channels, for any exponent: a function that makes a BRDF.
+
+    Attributes:
+        scale: Factor of each.
+    """
+
+    scale: Float[Array, " k"]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF of a roughness, the square root of 2 / (exponent + 2), given its natural logarithm."""
+        return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)
+
+
 class Shading(eqx.Module):
     """A part of a scene, as systems take it.
 
     Attributes:
         mesh: The part's mesh, with normals of the normal map and tangents along the anisotropy.
         brdf: The BRDF, with as many channels as `blend` has weights. With `knot` it is a function that makes one: a
-            `RoughnessFamily`.
+            `RoughnessFamily`, or a `ShininessFamily`.
         exact: The BRDF of every vertex, for the exact sum.
         knot: Logarithms of roughness at which to tabulate; empty where roughness does not vary.
-        blend: Weights of each vertex, and logarithms of its roughness; None for a part whose material is a BRDF.
+        blend: Weights of each vertex, and logarithms of its roughness; None for a part whose material is a BRDF that
+            stays.
         emitted: Radiance that the surface emits; None for none.
         term: Which of the terms of `MetallicRoughness` the channels are.
         scale: Factor of each channel, by which the weights are divided.
@@ -97,7 +112,8 @@ def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shad
 
     Args:
         part: The part.
-        roughness: Least and largest roughness of materials that it may have later, beside those of its own.
+        roughness: Least and largest roughness of materials that it may have later, beside those of its own; of
+            `BlinnPhong` the square root of 2 / (exponent + 2).
 
     Raises:
         TypeError: The material is a BRDF of another form: a table that holds the cosine, or one BRDF for each vertex.
@@ -109,6 +125,8 @@ def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shad
                 "got a BRDF for each vertex"
             )
         brdf = grid.as_argument(part.material)
+        if isinstance(brdf, BlinnPhong) and roughness is not None:
+            return _shiny(part.mesh, brdf, roughness)
         return Shading(part.mesh, brdf, brdf)
     surface = part.surface()
     _warn_of_varying_anisotropy(part.name, surface)
@@ -128,7 +146,40 @@ def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shad
     return Shading(mesh, brdf, PerVertex(material), knot, blend, _emitted(surface), term, scale)
 
 
-def appearance(part: Part, shading: Shading, material: TexturedMaterial) -> Appearance:
+def _shiny(mesh: Mesh, brdf: BlinnPhong, roughness: tuple[float, float]) -> Shading:
+    """A part of Blinn-Phong whose colors and exponent may change; one that stays where no roughness is given."""
+    own = jnp.exp(_log_roughness(brdf.exponent))
+    knot = _knots(jnp.append(own, jnp.array(roughness)), least=min(_SMOOTHEST, float(own)))
+    if not knot:
+        return Shading(mesh, brdf, brdf)
+    scale = jnp.stack([jnp.mean(brdf.diffuse), jnp.mean(brdf.specular)])
+    scale = jnp.maximum(scale, _RARE * jnp.max(scale)) + (jnp.max(scale) <= 0)
+    blend = _shiny_blend(brdf, scale, len(mesh.position))
+    return Shading(mesh, ShininessFamily(scale), brdf, knot, blend, scale=scale)
+
+
+def _log_roughness(exponent: Array) -> Array:
+    return jnp.log(2 / (exponent + 2)) / 2
+
+
+def _shiny_blend(brdf: BlinnPhong, scale: Array, count: int) -> Blend:
+    """The same weights for so many vertices or points."""
+    weight = jnp.stack([jnp.broadcast_to(each, (3,)) for each in (brdf.diffuse, brdf.specular)]) / scale[:, None]
+    roughness = jnp.broadcast_to(_log_roughness(brdf.exponent), (count,))
+    return Blend(jnp.broadcast_to(weight, (count, *weight.shape)), (roughness,))
+
+
+def _shiny_appearance(part: Part, shading: Shading, brdf: BlinnPhong) -> Appearance:
+    assert shading.scale is not None
+    least, most = exponent_range(shading)
+    if _known(brdf.exponent) and not least * (1 - _EQUAL) <= float(brdf.exponent) <= most * (1 + _EQUAL):
+        raise ValueError(
+            f"part {part.name!r} was precomputed for exponents from {least:.3g} to {most:.3g}, got {brdf.exponent:.3g}"
+        )
+    return Appearance(_shiny_blend(brdf, shading.scale, len(part.mesh.position)))
+
+
+def appearance(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Appearance:
     """Another material on a part that was precomputed.
 
     Textures of color, metallic, specular and emission, and within the range that was precomputed of roughness, may be
@@ -143,7 +194,14 @@ def appearance(part: Part, shading: Shading, material: TexturedMaterial) -> Appe
     Raises:
         ValueError: The material takes texture coordinates that the mesh does not have, or has a term, a roughness, an
             anisotropy or a normal map that were not precomputed.
+        TypeError: A metallic-roughness material for a part of Blinn-Phong, or the other way around.
     """
+    shiny = isinstance(shading.brdf, ShininessFamily)
+    if isinstance(material, BlinnPhong) != shiny:
+        kind = "BlinnPhong" if shiny else "TexturedMaterial"
+        raise TypeError(f"the material of part {part.name!r} must be a {kind}, got {type(material).__name__}")
+    if isinstance(material, BlinnPhong):
+        return _shiny_appearance(part, shading, material)
     surface = dataclasses.replace(part, material=material).surface()
     new = _material(surface)
     _check_shape(part, shading, surface, new)
@@ -160,12 +218,16 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
     Args:
         part: The part.
         shading: From `of_part`.
-        material: A `TexturedMaterial` that `appearance` takes, an `Appearance` at the vertices, or None for the part's.
+        material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's.
         points: On the part's triangles.
     """
     if isinstance(material, Appearance):
         return jax.tree.map(points.carry, material)
-    if material is None and not isinstance(part.material, TexturedMaterial):
+    own = part.material if material is None else material
+    if isinstance(own, BlinnPhong) and isinstance(shading.brdf, ShininessFamily):
+        assert shading.scale is not None
+        return Appearance(_shiny_blend(own, shading.scale, len(points)))
+    if not isinstance(own, TexturedMaterial):
         return Appearance(None)
     surface = (part if material is None else dataclasses.replace(part, material=material)).surface(points)
     assert shading.scale is not None
@@ -209,13 +271,20 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
 
 def roughness_range(shading: Shading) -> tuple[Array, Array]:
     """Least and largest roughness that a part was precomputed for."""
-    old = _old(shading).roughness
     if not shading.knot:
+        old = _old(shading).roughness
         return jnp.min(old), jnp.max(old)
     (knot,) = shading.knot
     # What is smoother than the first knot has the BRDF of that.
     least, most = jnp.exp(knot[0]), jnp.exp(knot[-1])
     return jnp.where(least <= _SMOOTHEST + _EQUAL, 0, least), most
+
+
+def exponent_range(shading: Shading) -> tuple[float, float]:
+    """Least and largest exponent that a part of Blinn-Phong was precomputed for."""
+    (knot,) = shading.knot
+    least, most = (2 * np.exp(-2 * knot[each]) - 2 for each in (-1, 0))
+    return max(float(least), 0.0), float(most)
 
 
 def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRoughness) -> None:
@@ -284,9 +353,9 @@ def _warn_of_varying_anisotropy(name: str, surface: Surface) -> None:
         )
 
 
-def _knots(roughness: Float[Array, " v"]) -> tuple[np.ndarray, ...]:
+def _knots(roughness: Float[Array, " v"], *, least: float = _SMOOTHEST) -> tuple[np.ndarray, ...]:
     """Logarithms of roughness between the least and the largest; none where these are equal."""
-    low, high = (max(float(each), _SMOOTHEST) for each in (jnp.min(roughness), jnp.max(roughness)))
+    low, high = (max(float(each), least) for each in (jnp.min(roughness), jnp.max(roughness)))
     if high - low <= _EQUAL:
         return ()
     count = 1 + int(np.ceil(np.log(high / low) / np.log(_STEP)))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
-from jaxprt.brdf import grid
+from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.relit import interpolation, measuring, pictures
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
 from jaxprt.relit.pictures import PictureView, Surface
@@ -238,11 +238,11 @@ class RelitScene(System):
             if shading.blend is None:
                 raise TypeError(
                     f"the material of part {name!r} is a BRDF, which cannot be replaced: precompute the scene with "
-                    "another one, or with a TexturedMaterial"
+                    "another one, with a TexturedMaterial, or a BlinnPhong with roughness=(low, high)"
                 )
-            kinds, source = (TexturedMaterial, Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
+            kinds, source = (TexturedMaterial, BlinnPhong, Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", given, *kinds, source=source)
-            if isinstance(given, TexturedMaterial):
+            if isinstance(given, TexturedMaterial | BlinnPhong):
                 given = appearance(part, shading, given)
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
         return result

@@ -62,7 +62,7 @@ class Look(NamedTuple):
 
 
 # What of a material can change: how many numbers it has, and the largest of them.
-MATERIAL = {"roughness": (1, 1.0), "f0": (1, 1.0), "diffuse": (3, 1.0), "specular": (3, 1.0)}
+MATERIAL = {"roughness": (1, 1.0), "exponent": (1, 1e6), "f0": (1, 1.0), "diffuse": (3, 1.0), "specular": (3, 1.0)}
 
 
 def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> Look:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxprt.relit.channels import Shading
+from jaxprt.relit.channels import Shading, ShininessFamily
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
@@ -132,7 +132,9 @@ def resized(light: Environment, *, size: int) -> Environment:
 def systems_of(scene: RelitScene) -> list[Exported]:
     """The systems of the parts without single texels; refuses those that a page does not have."""
     result: list[Exported] = []
-    for part, system in zip(scene.scene.parts, scene.direct.part, strict=True):
+    for part, shading, system in zip(scene.scene.parts, scene.shading, scene.direct.part, strict=True):
+        if isinstance(shading.brdf, ShininessFamily):
+            raise ValueError(f"part {part.name!r} must have one exponent to be exported: precompute without roughness")
         own = system.system if isinstance(system, bright_texels.BrightTexels) else system
         if not isinstance(own, lobe.LobeSystem | harmonic.DiffuseSystem):
             raise ValueError(

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxprt.brdf import Lambert
-from jaxprt.relit.channels import Appearance, Shading, roughness_range
+from jaxprt.brdf import BlinnPhong, Lambert
+from jaxprt.relit.channels import Appearance, Shading, exponent_range, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import background, rotate
@@ -77,7 +77,7 @@ class Stages:
         way = [ring * np.sin(longitude), np.sin(latitude) + 0 * longitude, ring * np.cos(longitude)]
         return background(self.unturned(number, lamps), jnp.asarray(np.stack(way, -1), jnp.result_type(float)))
 
-    def materials(self, look: Look) -> dict[str, TexturedMaterial]:
+    def materials(self, look: Look) -> dict[str, TexturedMaterial | BlinnPhong]:
         """The changed materials of a look."""
         parts = {part.name: part for part in self.scene.scene.parts}
         unknown = [name for name, _ in look.material if name not in parts]
@@ -183,6 +183,16 @@ def camera(look: Look, width: int, height: int) -> Camera:
 
 def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     """What of a part's material can change, with its values now; None for a BRDF, which stays."""
+    if isinstance(material, BlinnPhong) and shading.blend is not None:
+        least, most = exponent_range(shading)
+        specular = np.broadcast_to(np.asarray(material.specular, float), (3,))
+        return {
+            "diffuse": np.broadcast_to(np.asarray(material.diffuse, float), (3,)).tolist(),
+            "exponent": float(material.exponent),
+            "exponent_range": [max(least, 1.0), max(most, 2.0)],  # of which the viewer takes logarithms
+            "f0": float(specular.max()),
+            "specular": (specular / max(specular.max(), 1e-6)).tolist(),
+        }
     if not isinstance(material, TexturedMaterial):
         return None
     free: dict[str, Any] = {"diffuse": np.asarray(material.base_color).tolist()}
@@ -197,12 +207,17 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     return free
 
 
-def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial:
+def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial | BlinnPhong:
     """A material of other roughness, reflectance and colors.
 
     Raises:
         ValueError: It is a BRDF, which cannot change.
     """
+    if isinstance(material, BlinnPhong):
+        new = {each: jnp.asarray(values[each]) for each in ("diffuse", "exponent") if each in values}
+        if "f0" in values or "specular" in values:
+            new["specular"] = _tinted(material.specular, 1.0, values)
+        return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
         raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change while it is looked at")
     new: dict[str, Any] = {}
@@ -211,11 +226,16 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
     if "diffuse" in values:
         new["base_color"] = jnp.asarray(values["diffuse"])
     if "f0" in values or "specular" in values:
-        old = np.asarray(material.specular_color)
-        strength = values["f0"] / _f0(material) if "f0" in values else float(old.max())
-        tint = np.asarray(values["specular"]) if "specular" in values else old / max(old.max(), 1e-6)
-        new["specular_color"] = jnp.asarray(strength * tint)
+        new["specular_color"] = _tinted(material.specular_color, _f0(material), values)
     return dataclasses.replace(material, **new)
+
+
+def _tinted(color: Any, white: float, values: Mapping[str, Any]) -> Float[Array, "3"]:
+    """A color of another strength, of which 1 reflects so much at normal incidence, or of another tint."""
+    old = np.broadcast_to(np.asarray(color), (3,))
+    strength = values["f0"] / white if "f0" in values else float(old.max())
+    tint = np.asarray(values["specular"]) if "specular" in values else old / max(old.max(), 1e-6)
+    return jnp.asarray(strength * tint)
 
 
 def _f0(material: TexturedMaterial) -> float:

@@ -549,12 +549,16 @@ function materialOf(panel, part, state, moved) {
   const free = part.free, value = (name) => state.materials[part.name]?.[name] ?? free[name];
   const change = (fields) => { state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } }; show(); moved(); };
   element("div", panel, { className: "title", textContent: part.name });
-  const range = free.roughness_range, hasPlane = range || free.f0 !== undefined;
-  const plane = hasPlane ? element("canvas", panel, { className: "plane", width: 128, height: 128, title: "roughness to the right, reflectance at normal incidence up" }) : null;
+  // Of Blinn-Phong the exponent falls to the right, as roughness grows.
+  const across = free.exponent_range ? "exponent" : "roughness", range = free[`${across}_range`], hasPlane = range || free.f0 !== undefined;
+  const low = range?.[0], span = range && range[1] / low;
+  const valueAt = (x) => (across === "exponent" ? low * span ** (1 - x) : low + x * (range[1] - low));
+  const placeOf = (value) => (across === "exponent" ? 1 - Math.log(value / low) / Math.log(span) : (value - low) / (range[1] - low));
+  const plane = hasPlane ? element("canvas", panel, { className: "plane", width: 128, height: 128, title: "roughness to the right (Blinn-Phong: a smaller exponent), reflectance at normal incidence up" }) : null;
   if (plane) {
     const drag = (event) => {
       const area = plane.getBoundingClientRect(), x = clamp((event.clientX - area.left) / area.width, 0, 1), y = clamp(1 - (event.clientY - area.top) / area.height, 0, 1);
-      change({ ...(range && { roughness: range[0] + x * (range[1] - range[0]) }), ...(free.f0 !== undefined && { f0: y * y }) });
+      change({ ...(range && { [across]: valueAt(x) }), ...(free.f0 !== undefined && { f0: y * y }) });
     };
     plane.onpointerdown = (event) => { plane.setPointerCapture(event.pointerId); drag(event); };
     plane.onpointermove = (event) => { if (plane.hasPointerCapture(event.pointerId)) drag(event); };
@@ -569,12 +573,12 @@ function materialOf(panel, part, state, moved) {
   const show = () => {
     for (const [name, input] of pickers) input.value = hex(value(name));
     if (!plane) return;
-    const c = plane.getContext("2d"), x = range ? (value("roughness") - range[0]) / (range[1] - range[0]) : 0.5, y = free.f0 !== undefined ? Math.sqrt(value("f0")) : 0.5;
+    const c = plane.getContext("2d"), x = range ? placeOf(value(across)) : 0.5, y = free.f0 !== undefined ? Math.sqrt(value("f0")) : 0.5;
     c.fillStyle = "#444";
     c.fillRect(0, 0, 128, 128);
     c.fillStyle = "#aaa";
     c.font = "10px sans-serif";
-    c.fillText("roughness →", 66, 122);
+    c.fillText(across === "exponent" ? "← exponent" : "roughness →", 66, 122);
     c.fillText("↑ F0", 4, 12);
     c.fillStyle = "#fd5";
     c.beginPath();

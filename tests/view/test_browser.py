@@ -360,3 +360,20 @@ def test_a_far_kernel_sends_bytes_of_what_is_seen_first(hand, session, monkeypat
     off = np.abs(hand.pixels() - near)  # bytes are interpolated as displays have them, and half floats as radiance
     assert off.mean() < 1 / 255
     assert off.max() < 0.1
+
+
+def test_the_plane_of_blinn_phong_changes_exponent_and_reflectance(browser, lights):
+    ball = prt.Part("ball", prt.scene.builtin.sphere(rings=8, sectors=16), prt.brdf.BlinnPhong(0.3, 0.2, 20.0))
+    made = prt.precompute(prt.Scene([ball]), system=prt.relit.Lobes(2), roughness=(0.15, 0.5), size=8, progress=False)
+    server = Server(Session(made, environments=lights))
+    hand = Hand(browser, server.url)
+    plane = hand.page.locator("canvas.plane")
+    box = plane.bounding_box()
+    plane.click(position={"x": 0.25 * box["width"], "y": 0.5 * box["height"]})
+    hand.settle()
+    found = hand.state()["materials"]["ball"]
+    assert found["exponent"] == pytest.approx(6 * (86.9 / 6) ** 0.75, rel=0.05)
+    assert found["f0"] == pytest.approx(0.25, abs=0.02)
+    assert hand.stats()["errors"] == 0
+    hand.page.close()
+    server.close()
