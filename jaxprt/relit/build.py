@@ -50,8 +50,9 @@ def precompute(
         rate: Frames per second with new light and new view, for the plan.
         bounces: How many times parts reflect light onto each other and themselves, 0 to 2; if None as many as the plan
             finds worth it, and none with `system`.
-        roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` or a `BlinnPhong` may get later,
-            beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and memory in tables.
+        roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` or a `BlinnPhong`
+            may get later, beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and
+            memory in tables.
         size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
         path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
         executor: Where blocks are computed; this machine's cores if None. A `jaxprt.visibility.Part` computes its part
