@@ -459,7 +459,11 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
 MATERIALS = {
     "list": ([wood()], TypeError, "the materials must be a dictionary from names of parts to materials, got list"),
     "unknown": ({"roof": wood()}, ValueError, "of the parts ['floor', 'ball', 'wall'], got one of 'roof'"),
-    "kind": ({"floor": GLOSSY}, TypeError, "'floor' must be of class TexturedMaterial or Appearance or Blend, which"),
+    "kind": (
+        {"floor": GLOSSY},
+        TypeError,
+        "'floor' must be of class TexturedMaterial or BlinnPhong or Appearance or Blend, which",
+    ),
     "brdf": ({"ball": wood()}, TypeError, "the material of part 'ball' is a BRDF, which cannot be replaced"),
     "rougher": ({"floor": wood(roughness=1.0)}, ValueError, "part 'floor' was precomputed for roughness from 0."),
     "term": ({"floor": wood(specular=0.5)}, ValueError, "part 'floor' was precomputed without the terms"),

@@ -195,7 +195,7 @@ WRONG = {
     "size": ({"kind": "still", "width": 0, "height": 4}, "width must be from 1 to 2048, got 0"),
     "part": ({"materials": {"cat": {"f0": 0.1}}}, "materials must be of the parts ball, ground, got one of 'cat'"),
     "range": ({"materials": {"ball": {"f0": 2}}}, "f0 must be from 0 to 1, got 2"),
-    "name": ({"materials": {"ball": {"fur": 1}}}, "must have some of roughness, f0, diffuse, specular"),
+    "name": ({"materials": {"ball": {"fur": 1}}}, "must have some of roughness, exponent, f0, diffuse, specular"),
     "rough": ({"materials": {"ball": {"roughness": 0.1}}}, "precomputed for roughness from 0.400 to 0.800"),
     "gloss": ({"materials": {"ground": {"f0": 0.1, "specular": [1, 1, 1]}}}, None),
     "lamp": ({"lamps": [{"direction": [0, 0, 0], "angle": 1, "radiance": [1, 1, 1]}]}, "must have a length"),
