@@ -19,7 +19,7 @@ Conventions, everywhere in this package:
 from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
 from jaxprt.relit import RelitScene, plan, precompute, refine
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
-from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lamps, lobe, reference, separable
 from jaxprt.systems.devices import shard
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
 
@@ -40,6 +40,7 @@ __all__ = [
     "harmonic",
     "image",
     "inverse",
+    "lamps",
     "load_environment",
     "load_mesh",
     "load_scene",

@@ -29,7 +29,7 @@ ROOMS += ["decompose", "sphere", "files", "compile", "require"]
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.
 LADDER = [
     {"bounces", "ranges"},
-    {"dynamic"},
+    {"dynamic", "lamps"},
     {"separable", "lobe"},
     {"harmonic"},
     {"reference", "bright_texels", "devices"},

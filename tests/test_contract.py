@@ -79,6 +79,7 @@ HOST = {
     "systems.lobe.pyramid.between": "indices, of a NumPy table",
     "systems.lobe.pyramid.corners": "indices beside the weights",
     "systems.lobe.relight.scales": "NumPy tables",
+    "systems.lamps.transport": "traces rays",
     "systems.lobe.relight.view_lobes": "gives indices beside weights, compiled in steps; lobe.radiance has them all",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
@@ -770,6 +771,14 @@ EXAMPLES = {
     ),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
+    "systems.lamps.relight.met": example(
+        lambda draw: call(
+            jnp.moveaxis(jnp.stack([draw.unit(4), draw.unit(4)]), -1, 0),
+            draw.uniform(2, 4, low=0.5, high=90),
+            list(draw.unit(4).T),
+            draw.uniform(4, low=0.01, high=0.5),
+        )
+    ),
     "systems.lobe.relight.prefilter": example(lambda draw: call(draw.light(8))),
     "systems.lobe.relight.combine": example(
         lambda draw: call(

@@ -14,7 +14,7 @@ from jaxprt import files, image
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.brdf.navigation import Family
 from jaxprt.cli.report import Made, View
-from jaxprt.relit import pictures
+from jaxprt.relit import regions
 from jaxprt.scene import Camera, TexturedMaterial
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import bounces, dynamic, protocol, separable
@@ -126,7 +126,7 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
         camera = _swung(view.camera, _ORBIT * np.sin(2 * np.pi * turn))
         lamp = rotate(light, _about(2 * np.pi * turn))
         now = materials(ready, view, turn=turn)
-        picture = pictures.of_regions(system, mesh, camera, materials=now).picture(lamp)
+        picture = regions.of_regions(system, mesh, camera, materials=now).picture(lamp)
         stops = image.automatic_exposure(picture) if stops is None else stops
         result.append(folder / f"frame_{number:04d}.png")
         files.write_png(result[-1], np.asarray(image.display(image.expose(picture, stops=stops))))

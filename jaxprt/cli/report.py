@@ -17,11 +17,12 @@ from jaxtyping import Array
 
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
-from jaxprt.relit import pictures
+from jaxprt.relit import regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
-from jaxprt.relit.pictures import PictureView, RegionsView
+from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target
+from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
@@ -83,7 +84,7 @@ class Made(NamedTuple):
         if isinstance(system, relit.RelitScene):
             return system.picture_view(camera)
         keep = camera.width * camera.height <= _KEPT
-        return pictures.of_regions(system, self.mesh, camera, materials=self.materials, keep=keep)
+        return regions.of_regions(system, self.mesh, camera, materials=self.materials, keep=keep)
 
     def pictures(self, lights: list[Environment], camera: Camera, *, reflected: bool = False) -> list[Array]:
         """Pictures of direct light, or with bounces, in several lights."""

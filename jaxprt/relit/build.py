@@ -11,7 +11,7 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
-from jaxprt.relit import reflection
+from jaxprt.relit import lamps, reflection
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.planning import Plan, key_of, plan
@@ -38,7 +38,8 @@ def precompute(
 ) -> RelitScene:
     """Makes a scene ready to be relit: traces what its vertices see, and fits the BRDFs of its parts.
 
-    All parts cast shadows on each other.
+    All parts cast shadows on each other. Parts that emit, and point lights, light all parts; their colors and strengths
+    may change afterwards.
 
     Args:
         scene: The scene, from `jaxprt.load_scene` or made of `jaxprt.Part`.
@@ -94,22 +95,23 @@ def precompute(
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
     mesh = scene.mesh
+    names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
+    options = {"size": size, "executor": executor, "progress": progress}
+    targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems, unfinished = [], []
-    for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
-        at = folder and folder / f"{number}_{_file_name(part.name)}"
-        target = Target(mesh, size=size, path=at, executor=executor, progress=progress)
+    for part, shading, target in zip(scene.parts, shadings, targets, strict=True):
         try:
             systems.append(recipes[part.name].make(shading, target))
         except UnfinishedError as others:  # The next part of the scene does not wait for this one.
             unfinished.append(others)
     if unfinished:
         raise UnfinishedError("; ".join(map(str, unfinished)))
+    lit = lamps.make(scene, shadings, systems, targets)
     reflected = None
     if bounces:
         # One store for one bounce and two: the second goes on from the first.
-        target = Target(mesh, size=size, path=folder and folder / "scene", executor=executor, progress=progress)
-        reflected = reflection.make(shadings, bounces, target)
-    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected)
+        reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
+    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lit)
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:

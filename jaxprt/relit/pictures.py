@@ -14,18 +14,17 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxprt import require
 from jaxprt.brdf import Lambert
 from jaxprt.compile import jit
-from jaxprt.image import raster, rasterize, resolve, shading_points
+from jaxprt.image import rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation
+from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
 from jaxprt.relit.channels import Appearance, Shading, at_points
 from jaxprt.scene import Camera, Environment, Mesh, Part
-from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
+from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
-CHUNK = 1 << 13  # points that are shaded at once
-_FEWEST = 1 << 10
 _ERROR = 0.01  # of radiance interpolated between vertices, from where it is made at the pixels
 
 
@@ -38,6 +37,7 @@ class Surface(eqx.Module):
         shading: What it is to systems.
         system: The system of its direct light.
         reflecting: What it makes of light that arrives from other surfaces; None without.
+        lit: What it makes of the light of lamps; None without.
         appearance: Its material at the vertices.
         material: What has its material at points: a `TexturedMaterial`, an `Appearance` at the vertices, or None for
             the part's own.
@@ -49,6 +49,7 @@ class Surface(eqx.Module):
     shading: Shading
     system: System
     reflecting: ReflectingPart | None
+    lit: LitByLamps | None
     appearance: Appearance
     material: Any
     curvature: Float[Array, ""]
@@ -70,21 +71,6 @@ class PartPixels(eqx.Module):
     kept: tuple[PyTree, ...] | None
 
 
-class Canvas(eqx.Module):
-    """What is shaded in a picture, and where it goes.
-
-    Attributes:
-        pixels: The points that are shaded.
-        order: Number of each point's color in the list of all colors, row after row.
-        ray: Unit directions in the world from the eye through the centers of the pixels; the light behind the scene is
-            read along them.
-    """
-
-    pixels: Pixels
-    order: Int[Array, " p"]
-    ray: Float[Array, "h w 3"]
-
-
 class PictureView(eqx.Module):
     """All of a picture but its light: what `RelitScene.picture_view` makes of a scene, a camera and materials.
 
@@ -95,6 +81,7 @@ class PictureView(eqx.Module):
         surface: The parts.
         canvas: What is shaded, and where it goes.
         part: What is shaded, by parts.
+        lamp: Radiance of each lamp; None without.
     """
 
     mesh: Mesh
@@ -103,6 +90,7 @@ class PictureView(eqx.Module):
     surface: tuple[Surface, ...]
     canvas: Canvas
     part: tuple[PartPixels, ...]
+    lamp: Float[Array, "n 3"] | None
 
     def picture(self, environment: Environment) -> Float[Array, "h w c"]:
         """The picture in a light, in linear radiance.
@@ -119,10 +107,10 @@ class PictureView(eqx.Module):
         if self.surface[0].reflecting is None:
             arriving = arriving, [None] * len(self.surface)
         direct, reflected = arriving
-        rows = [self._rows(own, (direct[own.number], reflected[own.number])) for own in self.part]
-        return _drawn(self.canvas, rows, environment)
+        rows = [self._rows(own, (direct[own.number], reflected[own.number], self.lamp)) for own in self.part]
+        return drawn(self.canvas, rows, environment)
 
-    def _rows(self, own: PartPixels, arriving: tuple[PyTree, PyTree]) -> Float[Array, "m p c"]:
+    def _rows(self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree]) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
         surface, eye = self.surface[own.number], self.camera.eye
         vertices = None if own.at_pixels else _at_vertices(surface, arriving, eye)
@@ -130,7 +118,7 @@ class PictureView(eqx.Module):
             return jnp.stack([_lit(surface, arriving, vertices, view) for view in own.kept])
 
         def shaded(index):
-            points = _points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
+            points = points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
             return _shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels)
 
         if not isinstance(own.index, Tracer):
@@ -144,42 +132,15 @@ class PictureView(eqx.Module):
         return jax.lax.map(some, own.index)
 
 
-class RegionsView(eqx.Module):
-    """All of a picture but its light, of a system whose parts are the regions of a mesh: `of_regions` makes it.
-
-    Attributes:
-        system: The system.
-        materials: The materials of the regions, as `System.view` takes them.
-        camera: From where.
-        canvas: What is shaded, and where it goes.
-        points: The points of each row that is shaded at once, of each region.
-        kept: What the system makes of the view of each row; None where that is made anew for each light.
-    """
-
-    system: System
-    materials: PyTree
-    camera: Camera
-    canvas: Canvas
-    points: tuple[tuple[Points, ...], ...]
-    kept: tuple[PyTree, ...] | None
-
-    def picture(self, environment: Environment) -> Float[Array, "h w c"]:
-        """The picture in a light, in linear radiance.
-
-        Raises:
-            TypeError: The light is no Environment.
-            ValueError: The light is a batch, or of another size.
-        """
-        arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
-        for number, points in enumerate(self.points):
-            system = self.system.at(points)
-            view = system.view(self.camera.eye, self.materials) if self.kept is None else self.kept[number]
-            rows.append(system.combine(arriving, view))
-        return _drawn(self.canvas, rows, environment)
-
-
 def make(
-    mesh: Mesh, system: System, surfaces: Sequence[Surface], camera: Camera, *, samples: int, keep: bool
+    mesh: Mesh,
+    system: System,
+    surfaces: Sequence[Surface],
+    camera: Camera,
+    *,
+    lamp: Float[Array, "n 3"] | None,
+    samples: int,
+    keep: bool,
 ) -> PictureView:
     """The view of a scene at the pixels of a camera.
 
@@ -188,6 +149,7 @@ def make(
         system: The system of all parts.
         surfaces: The parts.
         camera: From where.
+        lamp: Radiance of each lamp; None without.
         samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
     """
@@ -197,75 +159,17 @@ def make(
     owner, wrong = _judged(mesh, bend, pixels, camera)
     parts = []
     for number, surface in enumerate(surfaces):
-        index = _rows_of(owner == number)
+        index = rows_of(owner == number)
         if not index.size:
             continue
         at_pixels = _pays(surface, wrong, index)
         kept = None
         if keep and not isinstance(index, Tracer):
-            points = (_points_of(pixels, mesh.face, surface.first, each) for each in index)
+            points = (points_of(pixels, mesh.face, surface.first, each) for each in index)
             kept = tuple(_viewed(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
         parts.append(PartPixels(number, at_pixels, index, kept))
-    canvas = _canvas(pixels, [each.index for each in parts], camera)
-    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts))
-
-
-def of_regions(
-    system: System, mesh: Mesh, camera: Camera, *, materials: PyTree = None, samples: int = 4, keep: bool = False
-) -> RegionsView:
-    """The view of a mesh by a system that takes points of its regions: the dynamic system, alone or with bounces.
-
-    Radiance is made at all pixels. Not for `jax.jit`.
-
-    Args:
-        system: The system of the mesh.
-        mesh: The mesh.
-        camera: From where.
-        materials: As the system takes them.
-        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
-        keep: Whether what the system makes of the view is kept for other lights: about a kilobyte for each point.
-    """
-    pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
-    region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
-    owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
-    every = [np.flatnonzero(owner == number) for number in range(region.max() + 1)]
-    rows, width = _rows_of(owner == np.argmax([len(each) for each in every])).shape
-    index = np.stack([np.pad(each, (0, rows * width - len(each)), constant_values=-1) for each in every])
-    index = jnp.asarray(index.reshape(len(every), rows, width).swapaxes(0, 1))
-    # Numbers of the vertices in their regions.
-    place = np.zeros(len(region), np.int32)
-    for number in range(len(every)):
-        own = np.flatnonzero(region == number)
-        place[own] = np.arange(len(own))
-    corner = jnp.asarray(place[face])
-    points = tuple(tuple(_points_of(pixels, corner, 0, each) for each in row) for row in index)
-    kept = tuple(system.at(each).view(camera.eye, materials) for each in points) if keep else None
-    return RegionsView(system, materials, camera, _canvas(pixels, list(index), camera), points, kept)
-
-
-def _canvas(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
-    """The canvas of some points. `index` has their numbers in the order in which they are shaded, -1 in padding."""
-    every = [each.ravel() for each in index]
-    count = len(pixels.triangle)
-    if any(isinstance(each, Tracer) for each in every):
-        row = jnp.concatenate(every)
-        place = jnp.where(row < 0, count, row)
-        order = jnp.zeros(count, jnp.int32).at[place].set(jnp.arange(len(row), dtype=jnp.int32), mode="drop")
-    else:
-        row = np.concatenate([np.zeros(0, np.int32), *every])
-        order = np.zeros(count, np.int32)
-        order[row[row >= 0]] = np.flatnonzero(row >= 0)
-    return Canvas(pixels, jnp.asarray(order), raster.ray_direction(camera))
-
-
-@jit
-def _drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Float[Array, "h w c"]:
-    """The picture of the points with these colors, in rows as they were shaded, in front of the light."""
-    sky = background(environment, canvas.ray)
-    colors = max([sky.shape[-1], *(each.shape[-1] for each in rows)])
-    flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
-    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])  # Not empty where nothing is seen.
-    return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)
+    canvas = lay_out(pixels, [each.index for each in parts], camera)
+    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp)
 
 
 @jit
@@ -284,21 +188,6 @@ def _judged(
     return jnp.where(pixels.triangle >= 0, mesh.region[mesh.face[:, 0]][own], -1), wrong[own]
 
 
-def _rows_of(chosen: Array | np.ndarray) -> Int[Array, "m p"]:
-    """Numbers of the points that are chosen, in rows of few lengths, so that programs serve many pictures."""
-    if isinstance(chosen, Tracer):
-        count = len(chosen)
-        index = jnp.nonzero(chosen, size=count, fill_value=-1)[0]
-    else:
-        index = np.flatnonzero(np.asarray(chosen))
-        count = len(index)
-    row = CHUNK if count > CHUNK else max(_FEWEST, 1 << max(count - 1, 0).bit_length())
-    rows = -(-count // row)
-    # Not by JAX where the number of points is known: that would compile for each number.
-    pad = jnp.pad if isinstance(index, Tracer) else np.pad
-    return jnp.asarray(pad(index, (0, rows * row - count), constant_values=-1).reshape(rows, row))
-
-
 def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
     """Whether the radiance of a part is made at its points: it is too far off interpolated, or vertices are more.
 
@@ -313,21 +202,6 @@ def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
     return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
 
 
-@jit
-def _points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, index: Int[Array, " p"]) -> Points:
-    """Some points of a part of a picture, whose first vertex has a number in the mesh; padding lies on that vertex.
-
-    A program by itself, so that those that shade do not know how many points the picture has, and serve all pictures.
-    """
-    own = jnp.maximum(index, 0)
-    padding = index < 0
-    corner = face[jnp.maximum(pixels.triangle[own], 0)].T - first
-    # On a vertex, so that its colors are finite.
-    weight = jnp.where(padding, jnp.asarray([[1.0], [0], [0]], pixels.barycentric.dtype), pixels.barycentric[own].T)
-    slope = jnp.where(padding, 0, jnp.moveaxis(pixels.slope[own], 0, -1))
-    return Points(jnp.where(padding, 0, corner), weight, slope)
-
-
 @partial(jit, static_argnames="at_pixels")
 def _viewed(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
     """Some points of a part, the material there, and what systems make of the view of them."""
@@ -338,7 +212,7 @@ def _viewed(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) ->
 @jit
 def _lit(
     surface: Surface,
-    arriving: tuple[PyTree, PyTree],
+    arriving: tuple[PyTree, PyTree, PyTree],
     vertices: Float[Array, "k v c"] | None,
     viewed: tuple[Points, Appearance, PyTree],
 ) -> Float[Array, "p c"]:
@@ -366,7 +240,7 @@ def _shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool
 
 
 @jit
-def _at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
+def _at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
     """Radiance of the vertices of a part, of each channel of its BRDF by itself."""
     blend = surface.appearance.blend
     if blend is None:
@@ -378,17 +252,24 @@ def _at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree], eye: Array) 
     return jnp.stack(rows)
 
 
-def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree]:
+def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
     """What the systems of a part make of a view, at points or at the vertices."""
     system = surface.system if points is None else surface.system.at(points)
-    reflecting = surface.reflecting
-    return system.view(eye, blend), None if reflecting is None else reflecting.view(eye, blend, points)
+    reflected, lit = (
+        None if each is None else each.view(eye, blend, points) for each in (surface.reflecting, surface.lit)
+    )
+    return system.view(eye, blend), reflected, lit
 
 
 def _combine(
-    surface: Surface, arriving: tuple[PyTree, PyTree], view: tuple[PyTree, PyTree], points: Points | None
+    surface: Surface,
+    arriving: tuple[PyTree, PyTree, PyTree],
+    view: tuple[PyTree, PyTree, PyTree],
+    points: Points | None,
 ) -> Array:
     """Radiance of the systems of a part."""
     system = surface.system if points is None else surface.system.at(points)
     color = system.combine(arriving[0], view[0])
-    return color if surface.reflecting is None else color + surface.reflecting.combine(arriving[1], view[1], points)
+    if surface.reflecting is not None:
+        color = color + surface.reflecting.combine(arriving[1], view[1], points)
+    return color if surface.lit is None else color + surface.lit.combine(arriving[2], view[2])

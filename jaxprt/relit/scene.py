@@ -6,12 +6,15 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.relit import interpolation, measuring, pictures
+from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
+from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView, Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
@@ -27,10 +30,24 @@ class SceneView(eqx.Module):
     Attributes:
         part: The views of its parts, as their systems have them.
         emitted: Radiance that each vertex emits; None where none does.
+        lit: Radiance of the vertices of each part in the light of each lamp of radiance 1; None without lamps.
     """
 
     part: tuple[PyTree, ...]
     emitted: Float[Array, "v 3"] | None
+    lit: tuple[Float[Array, "n _ _"], ...] | None = None
+
+
+class SceneLight(eqx.Module):
+    """What arrives at a scene with lamps.
+
+    Attributes:
+        arriving: Of the environment, as the systems of the parts have it.
+        lamp: Radiance of each lamp.
+    """
+
+    arriving: PyTree
+    lamp: Float[Array, "n 3"]
 
 
 class RelitScene(System):
@@ -38,13 +55,15 @@ class RelitScene(System):
 
     Materials are a dictionary from names of parts to other materials: `TexturedMaterial`, `Appearance` for one that is
     evaluated at the vertices already, or `Blend` for its weights alone. Parts that are not named keep the material that
-    they were precomputed with. A part whose material is a BRDF keeps that.
+    they were precomputed with. A part whose material is a BRDF keeps that. Point lights may be among them, by their
+    names, with other intensities.
 
     Attributes:
         scene: The scene.
         direct: The systems of its parts.
         shading: What its parts are to the systems.
         bounces: Light that the parts reflect onto each other; None without.
+        lamps: Parts that emit, and point lights; None without. What bounces do not reflect again.
         mesh: The mesh of all parts, with the scene's own normals.
         camera: The scene's first camera; one around it, a little from above, where it has none.
         curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
@@ -56,13 +75,21 @@ class RelitScene(System):
     direct: Joined
     shading: tuple[Shading, ...]
     bounces: PartBounces | None
+    lamps: SceneLamps | None
     mesh: Mesh
     camera: Camera
     curvature: Float[Array, " n"]
     points: tuple[Points, ...] | None
     mipmapped: tuple[TexturedMaterial | None, ...]
 
-    def __init__(self, scene: Scene, direct: Joined, shading: Sequence[Shading], bounces: PartBounces | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        direct: Joined,
+        shading: Sequence[Shading],
+        bounces: PartBounces | None = None,
+        lamps: SceneLamps | None = None,
+    ):
         """Joins the parts' meshes.
 
         Args:
@@ -70,6 +97,7 @@ class RelitScene(System):
             direct: The systems of its parts, in order.
             shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
             bounces: Light that the parts reflect onto each other; None without.
+            lamps: What the scene's lamps are to its parts; None without.
         """
         # What is no array cannot be an argument of a jitted function.
         parts = [
@@ -79,7 +107,8 @@ class RelitScene(System):
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
-        self.direct, self.shading, self.bounces, self.mesh = direct, tuple(shading), bounces, scene.mesh
+        self.direct, self.shading, self.bounces, self.lamps = direct, tuple(shading), bounces, lamps
+        self.mesh = scene.mesh
         self.points = None
         self.mipmapped = tuple(
             part.material.mipmapped() if isinstance(part.material, TexturedMaterial) else None for part in scene.parts
@@ -99,7 +128,10 @@ class RelitScene(System):
 
     def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
         """What arrives at all parts."""
-        return self.system.shade(light, [each.blend for each in self._all(materials)])
+        given, changed = scene_lamps.split(self.lamps, materials)
+        every = self._all(given)
+        arriving = self.system.shade(light, [each.blend for each in every])
+        return arriving if self.lamps is None else SceneLight(arriving, self.lamps.radiance(every, changed))
 
     def view(self, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
         """What a view and the materials are to all parts.
@@ -110,32 +142,41 @@ class RelitScene(System):
             ValueError: There is no such part, or a material has what was not precomputed; see
                 `jaxprt.relit.channels.appearance`.
         """
-        every = self._all(materials)
+        every = self._all(scene_lamps.split(self.lamps, materials)[0])
         counts = [len(part.mesh.position) for part in self.scene.parts]
         if self.points is not None:
             counts = list(map(len, self.points))
             rows = zip(self.scene.parts, self.shading, every, self.points, strict=True)
             every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
-        view = self._placed.view(eye, [each.blend for each in every])
+        view, lit = self._placed.view(eye, [each.blend for each in every]), None
+        if self.lamps is not None:
+            places = [None] * len(every) if self.points is None else self.points
+            rows = zip(self.lamps.part, every, places, strict=True)
+            lit = tuple(part.view(eye, own.blend, points) for part, own, points in rows)
         if all(each.emitted is None for each in every):
-            return SceneView(view, None)
+            return SceneView(view, None, lit)
         emitted = [
             jnp.zeros((count, 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
             for count, each in zip(counts, every, strict=True)
         ]
-        return SceneView(view, jnp.concatenate(emitted))
+        return SceneView(view, jnp.concatenate(emitted), lit)
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, with what they emit."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
-        color = self._placed.combine(light, view.part)
+        if self.lamps is None or view.lit is None:
+            color = self._placed.combine(light, view.part)
+        else:
+            require.kind("the light", light, SceneLight, source="RelitScene.shade")
+            color = self._placed.combine(light.arriving, view.part) + self.lamps.combine(light.lamp, view.lit)
         return color if view.emitted is None else color + view.emitted
 
     def radiance(
         self, environment: Environment, *, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye: `jaxprt.radiance` of this scene."""
-        return protocol.radiance(self, environment, eye=eye, materials=self.appearances(materials))
+        given, changed = scene_lamps.split(self.lamps, materials)
+        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(given), **changed})
 
     def picture(
         self,
@@ -177,7 +218,9 @@ class RelitScene(System):
     def _picture_view(self, camera: Camera | None, materials, *, samples: int, keep: bool) -> PictureView:
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        materials, changed = scene_lamps.split(self.lamps, materials)
         given = self.appearances(materials)
+        lamp = None if self.lamps is None else self.lamps.radiance(self._all(given), changed)
         surfaces, first = [], 0
         for number, (part, shading, system) in enumerate(
             zip(self.scene.parts, self.shading, self.direct.part, strict=True)
@@ -186,9 +229,11 @@ class RelitScene(System):
             material = (materials or {}).get(part.name, self.mipmapped[number])
             material = own if isinstance(material, Blend) else material
             reflecting = None if self.bounces is None else self.bounces.part[number]
-            surfaces.append(Surface(part, first, shading, system, reflecting, own, material, self.curvature[number]))
+            lit = None if self.lamps is None else self.lamps.part[number]
+            curvature = self.curvature[number]
+            surfaces.append(Surface(part, first, shading, system, reflecting, lit, own, material, curvature))
             first += len(part.mesh.position)
-        return pictures.make(self.mesh, self.system, surfaces, camera, samples=samples, keep=keep)
+        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, samples=samples, keep=keep)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
@@ -245,6 +290,11 @@ class RelitScene(System):
             if isinstance(given, TexturedMaterial | BlinnPhong):
                 given = appearance(part, shading, given)
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
+            if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
+                raise ValueError(
+                    f"part {name!r} was precomputed without emission, so that its light would not reach other parts: "
+                    "precompute the scene with a material that emits"
+                )
         return result
 
     def at(self, points: Sequence[Points]) -> "RelitScene":

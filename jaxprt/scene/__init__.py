@@ -19,13 +19,14 @@ from jaxprt.scene.formats.scene_file import load_scene
 from jaxprt.scene.light_probes import light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
-from jaxprt.scene.scene import Part, Scene
+from jaxprt.scene.scene import Part, PointLight, Scene
 
 __all__ = [
     "Camera",
     "Environment",
     "Mesh",
     "Part",
+    "PointLight",
     "Scene",
     "Texture",
     "TexturedMaterial",

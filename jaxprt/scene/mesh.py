@@ -371,3 +371,11 @@ def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.n
     order = order[area[order] > 0]
     some[face[order]] = unit[order, None]
     return np.where((normal == 0).all(1, keepdims=True), some, normal)
+
+
+def areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
+    """A third of the area of the triangles around each vertex: weights by which means over vertices are over area."""
+    face = np.asarray(mesh.face)
+    corner = np.asarray(mesh.position, np.float64)[face]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
+    return np.bincount(face.ravel(), np.repeat(area / 3, 3), len(mesh.position))

@@ -92,6 +92,37 @@ class Part(eqx.Module):
         return self.material.at(first, second, color=color, handedness=side, slopes=slopes)
 
 
+def _three(value: Any) -> Array:
+    """A number or three of them as an array [3]."""
+    value = jnp.asarray(value, jnp.result_type(float))
+    return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
+
+
+class PointLight(eqx.Module):
+    """A light without extent near the objects, which shines in all directions alike.
+
+    Attributes:
+        name: What to call it; another one than those of all parts and point lights of a scene.
+        position: In world units.
+        intensity: Radiant intensity: radiance times area, in units of radiance times squared world units.
+
+    Raises:
+        TypeError: The name is no text.
+        ValueError: The position or the intensity is not finite, or the intensity is negative.
+    """
+
+    name: str = eqx.field(static=True)
+    position: Float[Array, "3"] = eqx.field(converter=_three)
+    intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+
+    def __check_init__(self):
+        """Refuses what is not finite."""
+        if not isinstance(self.name, str):
+            raise TypeError(f"the name of a point light must be text, got {self.name!r}")
+        require.position(f"the position of point light {self.name!r}", self.position)
+        require.at_least(f"the intensity of point light {self.name!r}", self.intensity, 0.0)
+
+
 def _tuple(items: Any) -> tuple:
     """A sequence as a tuple."""
     if isinstance(items, eqx.Module):
@@ -106,15 +137,17 @@ class Scene(eqx.Module):
         parts: The parts, in order.
         cameras: Cameras, as a file has them; empty if none.
         environments: Lights, as a file has them; empty if none.
+        point_lights: Lights near the parts; empty if none. Parts that emit are lamps too.
 
     Raises:
-        TypeError: Something else than parts, cameras and environments is among them.
-        ValueError: There are no parts, or two parts have one name.
+        TypeError: Something else than parts, cameras, environments and point lights is among them.
+        ValueError: There are no parts, or two parts or point lights have one name.
     """
 
     parts: tuple[Part, ...] = eqx.field(converter=_tuple)
     cameras: tuple[Camera, ...] = eqx.field(converter=_tuple, default=())
     environments: tuple[Environment, ...] = eqx.field(converter=_tuple, default=())
+    point_lights: tuple[PointLight, ...] = eqx.field(converter=_tuple, default=())
 
     def __check_init__(self):
         """Refuses scenes without parts, equal names, and objects of other classes."""
@@ -122,12 +155,13 @@ class Scene(eqx.Module):
             ("parts", Part, "scene.Part"),
             ("cameras", Camera, "scene.Camera"),
             ("environments", Environment, "load_environment"),
+            ("point_lights", PointLight, "scene.PointLight"),
         ):
             for each in getattr(self, name):
                 require.kind(f"each of the scene's {name}", each, kind, source=source)
         if not self.parts:
             raise ValueError("a scene must have at least one part, got none")
-        names = [part.name for part in self.parts]
+        names = [each.name for each in (*self.parts, *self.point_lights)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"each part of a scene must have a name of its own, got several called {twice}")

@@ -12,7 +12,7 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, channels, exact, pictures
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, exact, regions
 from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
@@ -33,8 +33,8 @@ def small(coarse, bound):
     with pytest.MonkeyPatch.context() as patch:
         bound(patch, lobe.tabulate, resolution=12)
         bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
-        patch.setattr(pictures, "CHUNK", 64)
-        patch.setattr(pictures, "_FEWEST", 16)
+        patch.setattr(canvas, "CHUNK", 64)
+        patch.setattr(canvas, "_FEWEST", 16)
         yield
 
 
@@ -304,7 +304,7 @@ def test_pictures_of_regions_are_shaded_where_their_pixels_are():
     camera = Camera([0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2 * np.arctan(1 / 3), 16, 16)
     black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
     for keep in (False, True):
-        view = pictures.of_regions(system, mesh, camera, materials=(1.0, 10.0), keep=keep)
+        view = regions.of_regions(system, mesh, camera, materials=(1.0, 10.0), keep=keep)
         assert len(view.points) > 1
         picture = np.asarray(view.picture(black))
         x = (np.arange(16) + 0.5) / 8 - 1

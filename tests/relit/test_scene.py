@@ -202,7 +202,7 @@ def test_a_batch_of_lights_is_each_light_by_itself():
 
 @pytest.mark.parametrize("name", ["harmonic", "lobe"])
 def test_another_material_is_the_scene_precomputed_with_it(name, close):
-    new = wood(seed=1, base_color=(0.9, 0.6, 0.3), specular_color=(0.4, 0.8, 1.0), ior=1.8, emissive=(0.0, 0.1, 0.2))
+    new = wood(seed=1, base_color=(0.9, 0.6, 0.3), specular_color=(0.4, 0.8, 1.0), ior=1.8)
     again = prt.precompute(scene(new), system=RECIPES[name], size=SIZE, progress=False)
     got, expected = (
         np.asarray(ready.radiance(light(), eye=EYE, materials=materials))
@@ -214,14 +214,6 @@ def test_another_material_is_the_scene_precomputed_with_it(name, close):
     before = np.asarray(relit(name).radiance(light(), eye=EYE))
     assert np.abs(got - before)[: BOUNDS[0]].max() > 0.1
     np.testing.assert_array_equal(got[BOUNDS[0] :], before[BOUNDS[0] :])
-
-
-def test_emitted_radiance_adds_to_what_is_reflected_and_goes_with_the_material(close):
-    glow = {"floor": wood(emissive=(0.5, 1.0, 2.0))}
-    ready = relit("harmonic")
-    dark, lit = (np.asarray(ready.radiance(light(), eye=EYE, materials=each)) for each in (None, glow))
-    close(lit[: BOUNDS[0]] - dark[: BOUNDS[0]], np.broadcast_to(np.float32([0.5, 1.0, 2.0]), (BOUNDS[0], 3)))
-    np.testing.assert_array_equal(lit[BOUNDS[0] :], dark[BOUNDS[0] :])
 
 
 def test_a_blend_takes_the_place_of_weights(close):

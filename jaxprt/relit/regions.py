@@ -1,0 +1,79 @@
+"""Pictures of systems whose parts are the regions of a mesh: the dynamic system, alone or with bounces."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxprt.image import rasterize, shading_points
+from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
+from jaxprt.scene import Camera, Environment, Mesh
+from jaxprt.scene.points import Points
+from jaxprt.systems.protocol import System
+
+
+class RegionsView(eqx.Module):
+    """All of a picture but its light, of a system whose parts are the regions of a mesh: `of_regions` makes it.
+
+    Attributes:
+        system: The system.
+        materials: The materials of the regions, as `System.view` takes them.
+        camera: From where.
+        canvas: What is shaded, and where it goes.
+        points: The points of each row that is shaded at once, of each region.
+        kept: What the system makes of the view of each row; None where that is made anew for each light.
+    """
+
+    system: System
+    materials: PyTree
+    camera: Camera
+    canvas: Canvas
+    points: tuple[tuple[Points, ...], ...]
+    kept: tuple[PyTree, ...] | None
+
+    def picture(self, environment: Environment) -> Float[Array, "h w c"]:
+        """The picture in a light, in linear radiance.
+
+        Raises:
+            TypeError: The light is no Environment.
+            ValueError: The light is a batch, or of another size.
+        """
+        arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
+        for number, points in enumerate(self.points):
+            system = self.system.at(points)
+            view = system.view(self.camera.eye, self.materials) if self.kept is None else self.kept[number]
+            rows.append(system.combine(arriving, view))
+        return drawn(self.canvas, rows, environment)
+
+
+def of_regions(
+    system: System, mesh: Mesh, camera: Camera, *, materials: PyTree = None, samples: int = 4, keep: bool = False
+) -> RegionsView:
+    """The view of a mesh by a system that takes points of its regions: the dynamic system, alone or with bounces.
+
+    Radiance is made at all pixels. Not for `jax.jit`.
+
+    Args:
+        system: The system of the mesh.
+        mesh: The mesh.
+        camera: From where.
+        materials: As the system takes them.
+        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
+        keep: Whether what the system makes of the view is kept for other lights: about a kilobyte for each point.
+    """
+    pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
+    region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
+    owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
+    every = [np.flatnonzero(owner == number) for number in range(region.max() + 1)]
+    rows, width = rows_of(owner == np.argmax([len(each) for each in every])).shape
+    index = np.stack([np.pad(each, (0, rows * width - len(each)), constant_values=-1) for each in every])
+    index = jnp.asarray(index.reshape(len(every), rows, width).swapaxes(0, 1))
+    # Numbers of the vertices in their regions.
+    place = np.zeros(len(region), np.int32)
+    for number in range(len(every)):
+        own = np.flatnonzero(region == number)
+        place[own] = np.arange(len(own))
+    corner = jnp.asarray(place[face])
+    points = tuple(tuple(points_of(pixels, corner, 0, each) for each in row) for row in index)
+    kept = tuple(system.at(each).view(camera.eye, materials) for each in points) if keep else None
+    return RegionsView(system, materials, camera, lay_out(pixels, list(index), camera), points, kept)

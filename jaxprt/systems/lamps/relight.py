@@ -1,0 +1,167 @@
+"""What surfaces make of the light of lamps.
+
+What a vertex sees of a lamp counts as a disk on the sphere: its mean direction d and the mean resultant length R of its
+directions are those of a disk of squared chord r^2 = 4 (1 - R). Around its mean m a von Mises-Fisher lobe of
+concentration k is a normal distribution of variance 1 / k in the chord, whose area is solid angle. So
+
+    ∫ p(wi; m, k) V dwi ~ Omega / (pi r^2) P(X <= k r^2)
+
+with X noncentral chi-squared of two degrees of freedom and noncentrality k |m - d|^2.
+
+For disks larger than the lobe P is by Sankaran's approximation; for smaller ones the disk is a lobe too, and variances
+add: r^2 / 4 + 1 / k.
+"""
+
+from collections.abc import Sequence
+from functools import partial, reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.brdf.models import color
+from jaxprt.compile import jit
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import directions
+from jaxprt.systems.lamps.transport import LampTransport
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.protocol import Blend, check_blend
+
+_SMALL, _LARGE = 0.5, 2.0  # squared chords in variances of a lobe between which a disk stops to be a lobe itself
+_TINY = 1e-30
+
+
+class LitByLamps(eqx.Module):
+    """Vertices that lamps light: their transport, and the BRDF in lobes.
+
+    Attributes:
+        transport: From `jaxprt.lamps.precompute`.
+        brdf: A table from `jaxprt.lobe.tabulate`; None for what is ideally diffuse.
+        albedo: Of what is ideally diffuse, gray or a color; a blend takes its place.
+    """
+
+    transport: LampTransport
+    brdf: LobeBrdf | None = None
+    albedo: Float[Array, " c"] = eqx.field(converter=color, default=1.0)
+
+    def __check_init__(self):
+        """Refuses transport and BRDFs of other kinds, and an albedo that is no color."""
+        require.kind("the transport", self.transport, LampTransport, source="jaxprt.lamps.precompute")
+        if self.brdf is not None:
+            require.kind("the BRDF", self.brdf, LobeBrdf, source="jaxprt.lobe.tabulate")
+        require.array("the albedo", self.albedo, "1", "3")
+        require.at_least("the albedo", self.albedo, 0.0)
+
+    def view(
+        self, eye: Float[Array, "3"], blend: Blend | None = None, points: Points | None = None
+    ) -> Float[Array, "n v c"]:
+        """Radiance that each vertex or point sends to the eye, for each lamp of radiance 1.
+
+        Args:
+            eye: Position of the viewer in world units.
+            blend: What each vertex, or point, is made of, over the channels of the BRDF; the albedo if there is none.
+            points: Where; None for the vertices.
+
+        Returns:
+            Radiance, to be multiplied by the radiance of each lamp. Differentiable in the eye, the blend and the table.
+
+        Raises:
+            TypeError: The blend is no `Blend`.
+            ValueError: It is of other vertices or channels, or the eye is not one finite position.
+        """
+        require.position("the eye", eye)
+        check_blend(blend)
+        if blend is not None:
+            count = len(self.transport.position) if points is None else len(points)
+            blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))
+        return _view(self, eye, blend, points)
+
+    def combine(self, radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
+        """Radiance of all lamps together.
+
+        Args:
+            radiance: Of each lamp; the intensity of a point light.
+            view: From `view`.
+
+        Raises:
+            ValueError: They are of other numbers of lamps.
+        """
+        require.length("the radiance of lamps", radiance, self.transport.lamps)
+        return _combine(radiance, view)
+
+
+@jit
+def _combine(radiance: Array, view: Array) -> Array:
+    return reduce(jnp.add, (own * each for own, each in zip(radiance, view, strict=True)))
+
+
+@jit
+def _view(lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | None) -> Float[Array, "n v c"]:
+    transport = lit.transport
+    solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
+    if points is not None:
+        solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
+    matte = cosine / np.pi
+    if lit.brdf is None:
+        each = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
+    else:
+        position, frame = placed(transport.position, transport.frame, points)
+        parameter = () if blend is None else blend.parameter
+        lobe = lit.brdf.lookup(directions.view(frame, position, eye), *parameter)
+        each = jax.lax.map(partial(_sent, lobe, frame), (solid, way, matte))
+    numbers = np.asarray(transport.lamp)
+    value = jax.ops.segment_sum(each, numbers, transport.lamps, indices_are_sorted=True)  # [n, k, v]
+    if blend is None:
+        return jnp.moveaxis(value, 1, 2)
+    return jnp.einsum("nkv,vkc->nvc", value, blend.weight, precision="highest")
+
+
+def _sent(lobe: Lobes, frame: Array, piece: tuple[Array, Array, Array]) -> Float[Array, "k v"]:
+    """What each channel of the BRDF sends of the light of one piece of a lamp."""
+    solid, way, matte = piece
+    length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
+    toward = [sum(way[j] * frame[:, i, j] for j in range(3)) / length for i in range(3)]
+    chord = 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
+    density = met(lobe.mean, lobe.concentration, toward, chord)
+    return jnp.sum(lobe.weight * density, 1) * solid + lobe.diffuse * matte
+
+
+def met(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
+    """Mean density of lobes over disks, in 1/sr.
+
+    Args:
+        mean: Unit directions of the lobes, [3 l v].
+        concentration: Of the lobes, [l v].
+        toward: Unit directions of the middles of the disks, three of [v].
+        chord: Squared chord from the middle of each disk to its rim, [v]; 0 for a point.
+
+    Returns:
+        Densities, whose integral over the disk is this times pi times the squared chord.
+    """
+    apart = sum((mean[i] - toward[i]) ** 2 for i in range(3))
+    variance = 1 / concentration + chord / 4
+    small = jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance)
+    size = concentration * chord
+    share = jnp.clip((size - _SMALL) / (_LARGE - _SMALL), 0, 1)
+    share = share**2 * (3 - 2 * share)
+    inside = _inside(jnp.maximum(size, _SMALL), concentration * apart)
+    large = inside / (np.pi * jnp.maximum(chord, _SMALL / concentration))
+    # The normal distribution ends at a chord of 2.
+    return (small + share * (large - small)) / -jnp.expm1(-2 * concentration)
+
+
+def _inside(size: Array, offset: Array) -> Array:
+    """Probability that a noncentral chi-squared variable of two degrees of freedom is no larger than some size.
+
+    Reference: Sankaran, "Approximations to the non-central chi-square distribution", Biometrika 1963.
+    """
+    first, second, third = 2 + offset, 2 + 2 * offset, 2 + 3 * offset
+    h = 1 - 2 * first * third / (3 * second**2)
+    p = second / first**2
+    m = (h - 1) * (1 - 3 * h)
+    center = 1 + h * p * (h - 1 - (2 - h) * m * p / 2)
+    return jax.scipy.special.ndtr(((size / first) ** h - center) / (h * jnp.sqrt(2 * p) * (1 + m * p / 2)))

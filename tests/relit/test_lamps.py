@@ -1,0 +1,121 @@
+"""Lamps of scenes: parts that emit, and point lights, free in color and strength."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import lobe
+from jaxprt.relit import Harmonics, RelitScene
+from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
+from jaxprt.scene.mesh import make_mesh
+
+EYE = jnp.array([0.4, 1.5, 2.0])
+CAMERA = Camera(EYE, [0.0, 0.3, 0.0], [0.0, 1.0, 0.0], 1.0, 24, 16)
+DARK = Environment(jnp.zeros((6, 8, 8, 3)))
+PLANE = builtin.plane(cells=4)
+BLACK = {"base_color": 0.0, "metallic": 0.0, "specular": 0.0}
+WARM = (4.0, 3.0, 2.0)
+BULB = PointLight("bulb", [-0.5, 0.8, 0.3], [0.5, 0.6, 0.7])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse, bound):
+    """Small tables of lobes."""
+    with pytest.MonkeyPatch.context() as patch:
+        bound(patch, lobe.tabulate, resolution=12, lobes=2)
+        yield
+
+
+@functools.cache
+def scene() -> Scene:
+    place = np.asarray(PLANE.position)
+    floor = make_mesh(place, PLANE.face, normal=PLANE.normal)
+    panel = make_mesh(0.3 * place[:, [0, 2, 1]] + [0, 0.6, -0.8], PLANE.face, normal=np.tile([0.0, 0.0, 1.0], (25, 1)))
+    clay = TexturedMaterial(base_color=(0.5, 0.6, 0.7), metallic=0.0, roughness=0.6)
+    parts = [Part("floor", floor, clay), Part("panel", panel, TexturedMaterial(**BLACK, emissive=WARM))]
+    return Scene(parts, [CAMERA], point_lights=[BULB])
+
+
+@functools.cache
+def relit() -> RelitScene:
+    return prt.precompute(scene(), system=Harmonics(degree=2), size=8, progress=False)
+
+
+def test_parts_that_emit_light_others_and_shine_themselves(close):
+    color = np.asarray(relit().radiance(DARK, eye=EYE))
+    np.testing.assert_array_equal(color[25:], np.broadcast_to(np.float32(WARM), (25, 3)))
+    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
+    assert not np.any(relit().radiance(DARK, eye=EYE, materials=off))
+    # What one lamp sends and what another sends add up, in each color by itself.
+    red = {"panel": TexturedMaterial(**BLACK, emissive=(4.0, 0.0, 0.0)), "bulb": off["bulb"]}
+    rest = {"panel": TexturedMaterial(**BLACK, emissive=(0.0, 3.0, 2.0))}
+    both = sum(np.asarray(relit().radiance(DARK, eye=EYE, materials=each)) for each in (red, rest))
+    close(both, color)
+
+
+def test_lamps_add_to_the_light_around(close):
+    around = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
+    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
+    whole, alone, dark = (
+        np.asarray(relit().radiance(light, eye=EYE, materials=each))
+        for light, each in ((around, None), (around, off), (DARK, None))
+    )
+    close(whole, alone + dark)
+    batch = relit().radiance(Environment(jnp.stack([around.radiance, DARK.radiance])), eye=EYE)
+    close(np.asarray(batch), np.stack([whole, dark]))
+
+
+def test_pictures_have_the_light_of_lamps(close):
+    """At one sample a pixel the floor is what its points have, in a new picture and in a kept view."""
+    picture = np.asarray(relit().picture(DARK, samples=1))
+    kept = np.asarray(relit().picture_view(samples=1).picture(DARK))
+    close(picture, kept)
+    vertices = prt.image.render(relit().mesh, relit().radiance(DARK, eye=EYE), CAMERA, samples=1)
+    shown = picture.sum(-1) > 0
+    off = (picture - np.asarray(vertices))[shown]
+    assert shown.mean() > 0.2
+    assert np.linalg.norm(off) < 0.1 * np.linalg.norm(picture)
+    dim = {"bulb": PointLight("bulb", BULB.position, 0.25)}
+    lamp = relit().picture(DARK, samples=1, materials=dim)
+    assert np.linalg.norm(np.asarray(lamp) - picture) > 0.05 * np.linalg.norm(picture)
+
+
+def test_gradients_in_color_and_strength_are_what_lamps_send():
+    """Radiance is linear in both, so that derivatives are differences."""
+    weight = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+
+    def sent(emissive, intensity):
+        given = {
+            "panel": TexturedMaterial(**BLACK, emissive=emissive),
+            "bulb": PointLight("bulb", BULB.position, intensity),
+        }
+        return jnp.sum(relit().radiance(DARK, eye=EYE, materials=given)[:25] * weight[:25])
+
+    one = (jnp.ones(3), jnp.ones(3))
+    for number in (0, 1):
+        got = np.asarray(jax.grad(sent, argnums=number)(*one))
+        every = [list(one) for _ in range(3)]
+        for color in range(3):
+            every[color][number] = one[number].at[color].add(1)
+        expected = np.array([sent(*each) - sent(*one) for each in every])
+        np.testing.assert_allclose(got, expected, rtol=1e-3)
+
+
+def test_what_was_not_precomputed_is_refused():
+    given = [
+        (
+            {"floor": TexturedMaterial(roughness=0.6, metallic=0.0, emissive=1.0)},
+            "'floor' was precomputed without emis",
+        ),
+        ({"bulb": PointLight("bulb", [0, 1, 0], 1.0)}, "point light 'bulb' was traced from"),
+        ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be of those of the scene, \['bulb'\]"),
+    ]
+    for materials, message in given:
+        with pytest.raises(ValueError, match=message):
+            relit().radiance(DARK, eye=EYE, materials=materials)
+    with pytest.raises(ValueError, match="several called"):
+        Scene(scene().parts, point_lights=[PointLight("floor", [0, 1, 0])])

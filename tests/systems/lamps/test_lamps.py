@@ -1,0 +1,193 @@
+"""Lamps: integrals of what is seen against closed forms, lobes over disks against SciPy, and what surfaces send."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from jaxprt import lamps, lobe
+from jaxprt.brdf import GGX
+from jaxprt.scene import Mesh, PointLight
+from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.scene.points import on_triangles
+from jaxprt.sphere import directions
+from jaxprt.systems.protocol import Blend
+
+HEIGHT, SIDE = 0.8, 0.3
+SAMPLED = 0.01  # what 256 points on a lamp leave of its irradiance, relative to the norm
+LAMP_SHAPED = 0.03  # what disks in the place of a sixteenth of a square leave of a highlight, relative to the norm
+
+
+def square(center, half: float, *, down: bool) -> Mesh:
+    """A square that lies flat."""
+    corner = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * half + center
+    normal = np.tile([0.0, -1.0 if down else 1.0, 0.0], (4, 1))
+    return make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=normal)
+
+
+def floor(cells: int = 6) -> Mesh:
+    x, z = np.meshgrid(np.linspace(-1, 1, cells), np.linspace(-1, 1, cells))
+    position = np.stack([x, 0 * x, z], -1).reshape(-1, 3)
+    first = (np.arange(cells - 1)[:, None] * cells + np.arange(cells - 1)).ravel()
+    face = np.concatenate([np.stack([first, first + cells, first + 1], 1)])
+    other = np.stack([first + 1, first + cells, first + cells + 1], 1)
+    return make_mesh(position, np.concatenate([face, other]), normal=np.tile([0.0, 1.0, 0.0], (len(position), 1)))
+
+
+GROUND, LAMP = floor(), square([0, HEIGHT, 0], SIDE, down=True)
+BULB = PointLight("bulb", [0.2, 0.5, -0.3], 2.0)
+
+
+@pytest.fixture(scope="module")
+def transport() -> lamps.LampTransport:
+    return lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP]), progress=False)
+
+
+def irradiance(point: np.ndarray) -> float:
+    """Of a rectangle parallel to a small surface: Lambert's formula over its edges."""
+    corner = np.asarray(LAMP.position, np.float64) - point
+    unit = corner / np.linalg.norm(corner, axis=1, keepdims=True)
+    following = np.roll(unit, -1, 0)
+    across = np.cross(unit, following)
+    angle = np.arccos(np.clip(np.sum(unit * following, 1), -1, 1))
+    return float(abs(np.sum(across[:, 1] / np.linalg.norm(across, axis=1) * angle)) / 2)
+
+
+def lamp_integral(value) -> np.ndarray:
+    """Sum over a fine grid on the lamp: value(direction [n 3]) at each vertex, times solid angle."""
+    grid = (np.arange(120) + 0.5) / 120 * 2 * SIDE - SIDE
+    x, z = np.meshgrid(grid, grid)
+    place = np.stack([x, 0 * x + HEIGHT, z], -1).reshape(-1, 3)
+    result = []
+    for number, point in enumerate(np.asarray(GROUND.position, np.float64)):
+        way = place - point
+        square_ = np.sum(way**2, 1)
+        unit = way / np.sqrt(square_)[:, None]
+        result.append(np.sum(value(number, unit) * unit[:, 1] / square_) * (2 * SIDE) ** 2 / len(place))
+    return np.array(result)
+
+
+def test_the_irradiance_of_a_square_is_lamberts_formula(transport):
+    expected = np.array([irradiance(point) for point in np.asarray(GROUND.position, np.float64)])
+    got = sum(np.asarray(each) for each, lamp in zip(transport.cosine, transport.lamp, strict=True) if lamp == 0)
+    assert np.linalg.norm(got - expected) <= SAMPLED * np.linalg.norm(expected)
+    solid = sum(np.asarray(each) for each, lamp in zip(transport.solid_angle, transport.lamp, strict=True) if lamp == 0)
+    expected = lamp_integral(lambda number, unit: np.ones(len(unit)))
+    assert np.linalg.norm(solid - expected) <= SAMPLED * np.linalg.norm(expected)
+
+
+def test_a_point_light_falls_with_the_square_of_the_distance(transport, close):
+    way = np.asarray(BULB.position) - np.asarray(GROUND.position)
+    square_ = np.sum(way**2, 1)
+    close(np.asarray(transport.solid_angle[-1]), 1 / square_, tolerance=1e-4)  # rays start off the surface
+    close(np.asarray(transport.cosine[-1]), way[:, 1] / square_**1.5, tolerance=1e-4)
+
+
+def test_what_stands_between_casts_a_shadow_and_backs_send_nothing():
+    wall = square([0, HEIGHT / 2, 0], 3.0, down=True)
+    dark = lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP, wall]), samples=16, progress=False)
+    assert not np.any(dark.solid_angle)
+    turned = square([0, HEIGHT, 0], SIDE, down=False)
+    away = lamps.precompute(GROUND, [turned], occluder=join([GROUND, turned]), samples=16, progress=False)
+    assert not np.any(away.solid_angle)
+    below = PointLight("below", [0.0, -1.0, 0.0], 1.0)
+    assert not np.any(lamps.precompute(GROUND, [below], progress=False).solid_angle)
+
+
+def test_half_a_lamp_behind_an_edge_sends_half_its_light():
+    """The edge of a wall in the plane x = 0 halves the lamp for vertices at x = 0, and hides nothing else's half."""
+    high = HEIGHT - 1e-3
+    corner = np.array([[0.0, high, -3], [3.0, high, -3], [3.0, high, 3], [0.0, high, 3]])
+    screen = make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=np.tile([0.0, 1.0, 0.0], (4, 1)))
+    ground = floor(5)
+    options = {"samples": 256, "pieces": 1, "progress": False}
+    whole = lamps.precompute(ground, [LAMP], occluder=join([ground, LAMP]), **options)
+    half = lamps.precompute(ground, [LAMP], occluder=join([ground, LAMP, screen]), **options)
+    middle = np.abs(np.asarray(ground.position)[:, 0]) < 1e-6
+    np.testing.assert_allclose(np.asarray(half.cosine / whole.cosine)[0, middle], 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize("chord", [0.0, 0.02, 0.3])
+def test_lobes_over_disks_are_normal_distributions_over_disks(chord):
+    apart = np.linspace(0, 0.9, 25)
+    toward = np.stack([np.sin(apart), 0 * apart, np.cos(apart)])
+    for concentration in (3.0, 40.0, 700.0):
+        mean = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0])[:, None, None], (3, 1, 25))
+        sharp, size = jnp.full((1, 25), concentration), jnp.full(25, chord)
+        got = np.asarray(lamps.relight.met(mean, sharp, [jnp.asarray(x, jnp.float32) for x in toward], size))[0]
+        offset = concentration * np.sum((toward - np.array([[0], [0], [1.0]])) ** 2, 0)
+        if chord:
+            inside = scipy.stats.ncx2.cdf(concentration * chord, 2, offset) / (np.pi * chord)
+        else:
+            inside = concentration / (2 * np.pi) * np.exp(-offset / 2)
+        expected = inside / -np.expm1(-2 * concentration)
+        assert np.abs(got - expected).max() <= 0.03 * expected.max()
+
+
+def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
+    """Of what the table of lobes says of the BRDF, so that its own error has no part."""
+    eye = jnp.array([0.4, 0.8, 0.6])  # sees the lamp mirrored around a vertex
+    options = {"pieces": 16, "occluder": join([GROUND, LAMP]), "progress": False}
+    fine = lamps.precompute(GROUND, [LAMP, BULB], **options)
+    for roughness in (0.3, 0.5):
+        table = lobe.tabulate(GGX(f0=0.9, roughness=roughness), lobes=4, resolution=12)
+        lit = lamps.LitByLamps(fine, table)
+        wo = directions.view(fine.frame, fine.position, eye)
+        frame = np.asarray(fine.frame)
+
+        def value(number, unit, table=table, wo=wo, frame=frame):
+            wi = jnp.asarray(unit @ frame[number].T, jnp.float32)
+            # The table holds the cosine.
+            return np.asarray(table(wi, jnp.broadcast_to(wo[number], wi.shape)))[:, 0]
+
+        sent = lit.view(eye)
+        expected = lamp_integral(value)
+        got = np.asarray(lit.combine(jnp.array([[1.0], [0.0]]), sent))[:, 0]
+        assert np.linalg.norm(got - expected) <= LAMP_SHAPED * np.linalg.norm(expected)
+        way = np.asarray(BULB.position) - np.asarray(GROUND.position)
+        unit = way / np.linalg.norm(way, axis=1, keepdims=True)
+        wi = jnp.asarray(np.einsum("vij,vj->vi", frame, unit), jnp.float32)
+        expected = np.asarray(table(wi, wo))[:, 0] / np.sum(way**2, 1)
+        got = np.asarray(lit.combine(jnp.array([[0.0], [1.0]]), sent))[:, 0]
+        close(got, expected, tolerance=1e-3)  # rays start off the surface, and lobes are sharp
+
+
+def test_points_on_vertices_are_these_vertices_and_matte_ones_do_not_depend_on_the_eye(transport, close):
+    blend = Blend(jnp.asarray(np.random.default_rng(0).uniform(size=(36, 1, 3)).astype(np.float32)))
+    lit, eye = lamps.LitByLamps(transport), jnp.array([0.3, 1.0, 0.5])
+    every = np.asarray(lit.view(eye, blend))
+    np.testing.assert_array_equal(every, lit.view(-eye, blend))
+    face = np.asarray(GROUND.face)
+    points = on_triangles(face, np.arange(len(face)), np.tile(np.float32([1, 0, 0]), (len(face), 1)))
+    there = jax.tree.map(points.carry, blend)
+    close(np.asarray(lit.view(eye, there, points)), every[:, face[:, 0]])
+    close(
+        np.asarray(lamps.LitByLamps(transport, albedo=[0.5]).view(eye))[..., 0] * 2, np.asarray(lit.view(eye))[..., 0]
+    )
+
+
+def test_stores_go_on_and_are_of_their_lamps(tmp_path):
+    options = {"samples": 8, "pieces": 2, "path": tmp_path / "lamps.prt", "progress": False}
+    once, again = (lamps.precompute(GROUND, [LAMP], **options) for _ in range(2))
+    np.testing.assert_array_equal(once.cosine, again.cosine)
+    with pytest.raises(ValueError, match="lamps"):
+        lamps.precompute(GROUND, [square([0, 2 * HEIGHT, 0], SIDE, down=True)], **options)
+
+
+def test_bad_lamps_are_refused(unchecked):
+    flat = make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), normal=np.tile([0.0, 1.0, 0.0], (3, 1)))
+    for given, message in (
+        ({"lamps": []}, "lamps must be at least one, got none"),
+        ({"lamps": [flat]}, "a lamp must have an area"),
+        ({"lamps": [LAMP], "pieces": 3}, "pieces must be a power of two, and at most the 256 samples, got 3"),
+        ({"lamps": [LAMP], "samples": 2}, "at most the 2 samples, got 4"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            lamps.precompute(GROUND, **given, progress=False)
+    with pytest.raises(TypeError, match="lamp 0 must be"):
+        lamps.precompute(GROUND, ["lamp"])
+    with pytest.raises(ValueError, match="intensity of point light 'dark' must be at least 0"):
+        PointLight("dark", [0, 0, 0], -1.0)
+    with pytest.raises(ValueError, match="position of point light 'lost'"):
+        PointLight("lost", [0, np.nan, 0], 1.0)
