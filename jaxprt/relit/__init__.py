@@ -1,6 +1,6 @@
 """Scenes made ready to be relit, by any of the systems."""
 
-from jaxprt.relit import build, channels, exact, measuring, planning, recipes, refinement, scene
+from jaxprt.relit import build, channels, exact, measuring, planning, probes, recipes, refinement, scene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import Plan, plan
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
@@ -21,6 +21,7 @@ __all__ = [
     "plan",
     "planning",
     "precompute",
+    "probes",
     "recipes",
     "refine",
     "refinement",

@@ -9,9 +9,11 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import lobe
-from jaxprt.relit import Harmonics, RelitScene
+from jaxprt.relit import Harmonics, RelitScene, probes
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
+from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import make_mesh
+from jaxprt.sphere import cubemap
 
 EYE = jnp.array([0.4, 1.5, 2.0])
 CAMERA = Camera(EYE, [0.0, 0.3, 0.0], [0.0, 1.0, 0.0], 1.0, 24, 16)
@@ -103,6 +105,19 @@ def test_gradients_in_color_and_strength_are_what_lamps_send():
             every[color][number] = one[number].at[color].add(1)
         expected = np.array([sent(*each) - sent(*one) for each in every])
         np.testing.assert_allclose(got, expected, rtol=1e-3)
+
+
+def test_probes_see_the_light_and_the_parts_where_they_are(close):
+    """Far above, a probe sees the environment alone; near the panel, the panel's radiance in its direction."""
+    around = Environment(jnp.asarray(np.random.default_rng(2).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
+    far, near = probes.sample(relit(), around, [[0, 80.0, 0], [0.0, 0.6, -0.5]], size=4)
+    close(np.asarray(far.radiance), np.asarray(background(around, cubemap.direction(size=4))))
+    # Faces are +x, -x, +y, -y, +z, -z: the panel fills most of the last, the floor most of the fourth.
+    np.testing.assert_allclose(np.asarray(near.radiance)[5, 1:3, 1:3], np.broadcast_to(WARM, (2, 2, 3)), rtol=1e-5)
+    behind = np.asarray(background(around, cubemap.direction(size=4)))[4]
+    close(np.asarray(near.radiance)[4, :2], behind[:2])
+    with pytest.raises(ValueError, match=r"positions must be \[p, 3\], got \[3\]"):
+        probes.sample(relit(), around, np.zeros(3))
 
 
 def test_what_was_not_precomputed_is_refused():
