@@ -694,6 +694,12 @@ EXAMPLES = {
         lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
     ),
     "systems.harmonic.transfer.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
+    "systems.harmonic.transfer.from_visibility": example(
+        lambda draw: call(draw.normal(9, 2), draw.rotation(2)), degree=1, gradient=("coefficient",)
+    ),
+    "systems.harmonic.transfer.to_visibility": example(
+        lambda draw: call(draw.normal(2, 4, 4), draw.rotation(2)), gradient=("matrix",)
+    ),
     "systems.harmonic.transfer.right_handed": example(lambda draw: call(draw.rotation(4))),
     # Rounding is constant; what it is relative to is differentiable in dequantize.
     "systems.separable.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),

@@ -35,8 +35,8 @@ def main(arguments: Sequence[str]) -> None:
     options = _parser().parse_args(arguments)
     if options.export is not None and options.export.suffix.lower() != ".html":
         raise ValueError(f"--export takes a file *.html, got {options.export}")
-    if options.export is not None and (options.system != ["lobe"] or len(options.lobes) > 1):
-        raise ValueError("--export takes the system lobe with one number of lobes, got several or another")
+    if options.export is not None and (len(options.system) > 1 or len(options.lobes) > 1):
+        raise ValueError("--export takes one system, and one number of lobes, got several")
     made, lights = ready(options)
     if options.export is not None:
         piece = export(next(iter(made.values())), options.export, environments=lights)

@@ -7,14 +7,15 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import GGX
+from jaxprt.brdf import GGX, BlinnPhong
 from jaxprt.brdf.varying import Channels
-from jaxprt.relit.channels import Shading
+from jaxprt.relit.channels import Shading, ShininessFamily
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import TexturedMaterial
 from jaxprt.scene.material import Texture
 from jaxprt.systems import harmonic, lobe
 from jaxprt.systems.lobe import pyramid, relight
+from jaxprt.view import matrices
 from jaxprt.view.reduced import (
     Exported,
     bits_of,
@@ -24,62 +25,82 @@ from jaxprt.view.reduced import (
     texels_of,
     vector_unit,
     vectors_of,
+    visibility_of,
 )
 
 NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # of scenes without glossy parts
+_STARTS = ("first", "tableStart", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
+_SHINY = [3, 4]  # terms that the page's module has for `ShininessFamily`
 _SKY = 64  # texels along the edge of a light's faces, at most
 
 
 def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes]]:
-    """What the page's module reads of the parts, and normals, vectors, visibility, tables and weights of all."""
-    systems = systems_of(reduced)
-    vectors = [vectors_of(each) for each in systems]
-    unit = vector_unit(vectors)
-    terms = -(-len(unit) // 4) * 4
-    place = {"first": 0, "tableStart": 0, "weightStart": 0, "pyramidStart": 0}
+    """What the page's module reads of the parts, and the arrays of all: see `Piece` in the module for their order."""
+    systems, bits = systems_of(reduced), bits_of(reduced)
+    vectors, visible = [vectors_of(each) for each in systems], visibility_of(reduced)
+    unit, visible_unit = vector_unit(vectors), vector_unit(visible)
+    terms = max(-(-len(unit) // 4) * 4, 4)
+    place: dict[str, int] = dict.fromkeys(_STARTS, 0)
     parts, stride = [], 0
-    arrays: list[list[np.ndarray]] = [[], [], [], [], []]
+    arrays: list[list[np.ndarray]] = [[] for _ in range(7)]
     for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
-        shading, table = reduced.shading[number], _table(system)
+        shading, table = reduced.shading[number], _table(part.name, system)
         weight, seen, described = _weights(shading, system), _means(system, level), _described(part.material, shading)
-        parts.append(
-            {
-                "name": part.name,
-                "count": vector.shape[1],
-                "lobes": system.brdf.lobes if isinstance(system, lobe.LobeSystem) else 0,
-                "channels": weight.shape[1] - 1,
-                "nodes": table.shape[1],
-                "knot": [] if isinstance(system, harmonic.DiffuseSystem) else _knot(system.brdf),
-                "terms": -(-len(vector) // 4) * 4,
-                "family": _family(shading),
-                "weightStep": 0 if described else weight.shape[1],
-                **(described or {}),
-                **place,
-            }
-        )
+        own = None if bits is None else bits[number]
+        bit = np.zeros((0, 0), np.uint8) if own is None else own
+        about = _about(system) | {"family": _family(shading), "texels": bool(bit.size)}
+        about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
+        about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
+        about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
+        parts.append(about | place)
         weight = weight[:1] if described else weight
         stride = max(stride, seen.shape[1])
-        padded = np.zeros((vector.shape[1], terms))
-        padded[:, : len(vector)] = (vector / unit[: len(vector), None]).T
-        every = np.round(32767 * np.asarray(shading.mesh.normal)), np.round(padded), seen, table, weight
-        for kept, array, kind in zip(arrays, every, ("<i2", "i1", "u1", "<f4", "<f4"), strict=True):
+        rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
+        normal = np.round(32767 * np.asarray(shading.mesh.normal))
+        kinds = "<i2", "i1", "u1", "<f4", "<f4", "i1", "u1"
+        for kept, array, kind in zip(arrays, (normal, rows[0], seen, table, weight, rows[1], bit), kinds, strict=True):
             kept.append(array.astype(kind).reshape(-1))
-        sizes = vector.shape[1], table.size // 4, weight.size // 4, seen.size
+        pairs = len(vector.T) * -(-(about["bands"] ** 2) // 2)
+        sizes = vector.shape[1], table.size // 4, weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
         place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
-    scale = scale_of(reduced)
-    visible: dict[str, Any] = NO_SCALES
-    if scale is not None:
-        starts = scale.start[level:] - scale.start[level]
-        visible = {"edges": scale.edge[level:].tolist(), "spreads": scale.spread[level:].tolist()}
-        visible["starts"] = starts.tolist()
-    bits = bits_of(reduced)
+    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(reduced, level)}
+    content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
+    edge = 0 if bits is None else math.isqrt(8 * next(each.shape[1] for each in bits if each is not None) // 6)
+    content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0}
     joined = [np.concatenate(each) for each in arrays]
-    joined.append(np.zeros(0, np.uint8) if bits is None else np.concatenate([each.reshape(-1) for each in bits]))
-    texel_edge = 0 if bits is None else math.isqrt(8 * bits[0].shape[1] // 6)
-    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **visible}
-    content |= {"texelEdge": texel_edge, "texels": texels_of(texel_edge) if texel_edge else 0}
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     return content, [each.tobytes() for each in joined]
+
+
+def _about(system: Exported) -> dict[str, Any]:
+    """What the page's module is told of the system of a part."""
+    about = {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": [], "laplacian": 1.0}
+    if isinstance(system, lobe.LobeSystem):
+        return about | {"lobes": system.brdf.lobes, "steps": float(system.brdf.weight.shape[-1] - 1), **_knot(system)}
+    if isinstance(system, harmonic.HarmonicSystem):
+        own = {"bands": system.degree + 1, "words": matrices.words(system), "laplacian": float(system.laplacian)}
+        return about | own | {"steps": system.brdf.steps, **_knot(system)}
+    return about
+
+
+def _knot(system: lobe.LobeSystem | harmonic.HarmonicSystem) -> dict[str, list[float]]:
+    return {"knot": np.asarray(system.brdf.knot[0], float).tolist() if system.brdf.knot else []}
+
+
+def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
+    """Whole numbers of units, in rows of a length."""
+    padded = np.zeros((value.shape[1], length))
+    padded[:, : len(value)] = np.round(value / unit[: len(value), None]).T
+    return padded
+
+
+def _scales(reduced: RelitScene, level: int) -> dict[str, Any]:
+    """The scales of visibility that are left."""
+    scale = scale_of(reduced)
+    if scale is None:
+        return NO_SCALES
+    starts = scale.start[level:] - scale.start[level]
+    return {"edges": scale.edge[level:].tolist(), "spreads": scale.spread[level:].tolist(), "starts": starts.tolist()}
 
 
 def mips(size: int) -> list[int]:
@@ -109,14 +130,11 @@ def blurring(size: int) -> dict[str, Any]:
 
 
 def _family(shading: Shading) -> dict[str, list]:
-    """Terms of `MetallicRoughness` that the channels are, and their factors; empty for other BRDFs."""
+    """Terms that the channels are, as the page's module numbers them, and their factors; empty for other BRDFs."""
     if shading.blend is None or shading.scale is None:
         return {"terms": [], "scale": []}
-    return {"terms": list(shading.term), "scale": np.asarray(shading.scale, float).tolist()}
-
-
-def _knot(brdf: lobe.LobeBrdf) -> list[float]:
-    return np.asarray(brdf.knot[0]).tolist() if brdf.knot else []
+    terms = _SHINY if isinstance(shading.brdf, ShininessFamily) else list(shading.term)
+    return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
 
 
 def _means(system: Exported, level: int) -> np.ndarray:
@@ -126,8 +144,13 @@ def _means(system: Exported, level: int) -> np.ndarray:
     return np.ascontiguousarray(np.asarray(transport.pyramid)[:, pyramid.scales(edge_of(transport)).start[level] :])
 
 
-def _table(system: Exported) -> Float[np.ndarray, "h q e 4"]:
-    """A table of lobes: for each knot and node the mean and log concentration of each lobe, its weights; albedos."""
+def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
+    """A table of lobes: for each knot and node the mean and log concentration of each lobe, its weights; albedos.
+
+    That of a part with matrices: `jaxprt.view.matrices.plane_table`.
+    """
+    if isinstance(system, harmonic.HarmonicSystem):
+        return matrices.plane_table(name, system.brdf)
     if not isinstance(system, lobe.LobeSystem):
         return np.ones((1, 1, 1, 4))
     brdf = system.brdf
@@ -151,7 +174,8 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     elif isinstance(system, harmonic.DiffuseSystem):
         weight = np.broadcast_to(np.asarray(system.albedo), (count, 1, len(system.albedo)))
     else:
-        channels = len(system.brdf.weight)
+        brdf = system.brdf
+        channels = len(brdf.weight) if isinstance(brdf, lobe.LobeBrdf) else brdf.table.shape[1]
         weight = np.broadcast_to(np.eye(channels) if channels > 1 else np.ones((1, 3)), (count, channels, 3))
     result = np.zeros((count, weight.shape[1] + 1, 4))
     result[:, :-1, :3] = weight
@@ -166,6 +190,12 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
 
 def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
     """A material that is one for all vertices, by its numbers; None for others."""
+    if isinstance(material, BlinnPhong) and isinstance(shading.brdf, ShininessFamily):
+        values = {
+            name: np.broadcast_to(np.asarray(getattr(material, name), float), 3) for name in ("diffuse", "specular")
+        }
+        own = {name: each.tolist() for name, each in values.items()}
+        return {"material": own | {"exponent": float(material.exponent)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None:
         return None
     if any(isinstance(each, Texture) for each in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):

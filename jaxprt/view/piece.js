@@ -1,15 +1,16 @@
 // A relit scene without Python: answers the questions of `viewer.js` from what `export` has written, on the GPU.
-// Diffuse light by transfer vectors, glossy light by lobes and means of visibility, as the lobe system does.
+// Diffuse light by transfer vectors; glossy light by lobes and means of visibility, as the lobe system does, or by transfer
+// matrices, as the harmonic system does: harmonics of the visibility are kept, and a light is taken through them once.
 
 const WIDTH = 4096; // columns of all textures
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
 const SHADE = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp isampler2D; precision highp usampler2D;
-uniform sampler2D place, weights, table, light, bright; uniform isampler2D vectors; uniform usampler2D pyramid, bits;
+uniform sampler2D place, weights, table, light, bright; uniform isampler2D vectors; uniform usampler2D pyramid, bits, arrived;
 uniform vec3 irradiance[TERMS], eye; uniform vec2 turn; // cosine and sine
-uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, terms, term[4], families, texels;
-uniform float knot[16], scale[4], logRoughness;
+uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart, weightStep, pyramidStart, terms, term[4], families, texels, bands, entries, arrivedStart, bitStart;
+uniform float knot[KNOTS], scale[4], logRoughness, steps;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
 out uvec4 o;
@@ -93,32 +94,33 @@ vec3 seen(int row, vec3 d, float concentration) {
   return v.x * radiance(unproject(face, s + alongS * reach, t + alongT * reach), spread * (1. + across) / 2.);
 }
 // Whether a vertex sees a direction: bits of texels, bilinear between their middles.
-float bit(int id, int face, int row, int column) {
+float bit(int vertex, int face, int row, int column) {
   row = clamp(row, 0, TEXELS - 1);
   column = clamp(column, 0, TEXELS - 1);
-  int address = id * (6 * TEXELS * TEXELS / 8) + (face * (TEXELS / 2) + row / 2) * (TEXELS / 4) + column / 4;
+  int address = bitStart + vertex * (6 * TEXELS * TEXELS / 8) + (face * (TEXELS / 2) + row / 2) * (TEXELS / 4) + column / 4;
   uint word = texelFetch(bits, at(address >> 2), 0).r;
   return float((word >> uint(8 * (address & 3) + (column / 2 & 1) * 4 + (row & 1) * 2 + (column & 1))) & 1u);
 }
-float clear(int id, vec3 d) {
+float clear(int vertex, vec3 d) {
   int face;
   float s, t;
   project(d, face, s, t);
   vec2 place = (vec2(s, t) + 1.) * (float(TEXELS) / 2.) - .5, low = floor(place + 1e-3), part = max(place - low, 0.);
   ivec2 near = ivec2(low);
-  float a = bit(id, face, near.y, near.x), b = bit(id, face, near.y, near.x + 1);
-  float c = bit(id, face, near.y + 1, near.x), d4 = bit(id, face, near.y + 1, near.x + 1);
+  float a = bit(vertex, face, near.y, near.x), b = bit(vertex, face, near.y, near.x + 1);
+  float c = bit(vertex, face, near.y + 1, near.x), d4 = bit(vertex, face, near.y + 1, near.x + 1);
   return mix(mix(a, b, part.x), mix(c, d4, part.x), part.y);
 }
-// Terms of MetallicRoughness, in 1/sr: see jaxprt/brdf/microfacet.py.
-vec4 family(vec3 wi, vec3 wo, vec3 normal, float alpha) {
+// Terms of MetallicRoughness, and the lobe of BlinnPhong as the fifth, in 1/sr: see jaxprt/brdf/microfacet.py and models.py.
+vec4 family(vec3 wi, vec3 wo, vec3 normal, float rough) {
   vec3 h = normalize(wi + wo);
-  float ci = dot(wi, normal), co = dot(wo, normal), z = dot(h, normal), schlick = pow(1. - min(dot(wo, h), 1.), 5.), a = alpha * alpha;
+  float ci = dot(wi, normal), co = dot(wo, normal), z = dot(h, normal), schlick = pow(1. - min(dot(wo, h), 1.), 5.), alpha = max(exp(2. * rough), 1e-3), a = alpha * alpha;
   vec3 flat_ = h - normal * z;
   float tilt = dot(flat_, flat_) / a + z * z, mask = .5 / (co * sqrt(a * (1. - ci * ci) + ci * ci) + ci * sqrt(a * (1. - co * co) + co * co));
-  float lobe = mask / (3.14159265 * a * tilt * tilt);
+  float lobe = mask / (3.14159265 * a * tilt * tilt), n = 2. * exp(-2. * rough) - 2.;
+  float shiny = (n + 2.) * (n + 4.) / (25.1327412 * (exp2(-n / 2.) + n)) * exp(n / 2. * log(max(1. - dot(flat_, flat_), 1e-30)));
   vec4 result = vec4(0);
-  for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 1 ? lobe : term[k] == 2 ? lobe * schlick : 1. / 3.14159265);
+  for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 1 ? lobe : term[k] == 2 ? lobe * schlick : term[k] == 4 ? shiny : 1. / 3.14159265);
   return result;
 }
 vec3 texelWay(int i) {
@@ -126,7 +128,47 @@ vec3 texelWay(int i) {
   return vec3(turn.x * d.x + turn.y * d.z, d.y, turn.x * d.z - turn.y * d.x);
 }
 vec4 entry(int number, int node, int which) { // a table's entries: for each lobe its mean and log concentration, and its weights
-  return texelFetch(table, at(tableStart + (number * nodes + node) * (2 * lobes + 1) + which), 0);
+  return texelFetch(table, at(tableStart + (number * nodes + node) * entries + which), 0);
+}
+float factor(int l, int m) { return sqrt(float(4 * l * l - 1) / float(l * l - m * m)); }
+// The light that has come through a transfer matrix times the BRDF: see plane_table in jaxprt/view/matrices.py.
+vec3 transferred(int vertex, vec3 ahead, vec3 normal, ivec2 number, float between, int node, float upper, vec3 w[4]) {
+  vec3 lit[HARMONICS], tint[BANDS], result = vec3(0);
+  int pairs = (bands * bands + 1) / 2;
+  for (int i = 0; i < pairs; i++) {
+    uvec4 each = texelFetch(arrived, at(arrivedStart + vertex * pairs + i), 0);
+    vec2 middle = unpackHalf2x16(each.y);
+    lit[2 * i] = vec3(unpackHalf2x16(each.x), middle.x);
+    lit[2 * i + 1] = vec3(middle.y, unpackHalf2x16(each.z));
+  }
+  for (int j = 0; j < bands; j++) {
+    float angle = 3.14159265 * (float(j) + .5) / float(bands);
+    vec3 d = ahead * sin(angle) + normal * cos(angle);
+    for (int l = 0; l < bands; l++) {
+      int i = l * bands + j;
+      vec4 a = mix(entry(number.x, node, i), entry(number.x, node + 1, i), upper);
+      vec4 s = between > 0. ? mix(a, mix(entry(number.y, node, i), entry(number.y, node + 1, i), upper), between) : a;
+      tint[l] = s.x * w[0] + s.y * w[1] + s.z * w[2] + s.w * w[3];
+    }
+    float real = 1., imaginary = 0., diagonal = .28209479;
+    for (int m = 0; m < bands; m++) {
+      if (m > 0) {
+        float old = real;
+        real = real * d.x - imaginary * d.y;
+        imaginary = old * d.y + imaginary * d.x;
+        diagonal *= sqrt((m == 1 ? 2. : 1.) * float(2 * m + 1) / float(2 * m));
+      }
+      float before = 0., value = diagonal;
+      for (int l = m; l < bands; l++) {
+        int i = l * (l + 1);
+        result += tint[l] * value * (real * lit[i + m] + imaginary * lit[i - m]);
+        float next = factor(l + 1, m) * (d.z * value - (l > m ? before / factor(l, m) : 0.));
+        before = value;
+        value = next;
+      }
+    }
+  }
+  return result;
 }
 void main() {
   int id = int(gl_FragCoord.x) + ${WIDTH} * int(gl_FragCoord.y), row = id - first;
@@ -144,7 +186,7 @@ void main() {
   vec4 diffuse = vec4(1);
   vec3 wo = normal;
   float rough = weightStep > 0 ? texelFetch(weights, at(weight), 0).a : logRoughness;
-  if (lobes > 0) {
+  if (lobes > 0 || bands > 0) {
     wo = normalize(eye - position);
     vec3 flat_ = wo - normal * dot(wo, normal);
     float up = dot(wo, normal);
@@ -152,15 +194,16 @@ void main() {
     up = max(up, .01); // as views are raised above the horizon
     wo = ahead * sqrt(1. - up * up) + normal * up;
     vec3 aside = cross(normal, ahead);
-    float node = clamp(sqrt(max(1. - up * up, 0.)) / (1. + up) * float(nodes - 1), 0., float(nodes - 1));
+    float node = clamp(sqrt(max(1. - up * up, 0.)) / (1. + up) * steps, 0., float(nodes - 1));
     int low = min(int(node), nodes - 2), knotLow = 0;
     float upper = node - float(low), between = 0.;
     if (knots > 1) {
-      for (int i = 1; i < 15; i++) if (i < knots - 1 && rough >= knot[i]) knotLow = i;
+      for (int i = 1; i < KNOTS; i++) if (i < knots - 1 && rough >= knot[i]) knotLow = i;
       between = clamp((rough - knot[knotLow]) / (knot[knotLow + 1] - knot[knotLow]), 0., 1.);
     }
     int knotHigh = knots > 1 ? knotLow + 1 : knotLow;
-    for (int l = 0; l <= lobes; l++) {
+    if (bands > 0) color += transferred(row, ahead, normal, ivec2(knotLow, knotHigh), between, low, upper, w);
+    for (int l = 0; lobes > 0 && l <= lobes; l++) {
       vec4 lobe = vec4(0), strength = vec4(0);
       for (int n = 0; n < 2; n++) {
         float share = n == 0 ? 1. - upper : upper;
@@ -184,7 +227,7 @@ void main() {
       for (int i = 0; i < texels; i++) {
         vec3 d = texelWay(i), away = d - middle;
         float value = dot(d, normal) > 0. ? k / (6.28318531 * (1. - exp(-2. * k))) * exp(-k * dot(away, away) / 2.) : 0.;
-        if (value > 1e-6) color += tint * value * clear(id, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
+        if (value > 1e-6) color += tint * value * clear(row, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
       }
     }
   }
@@ -192,12 +235,36 @@ void main() {
     vec3 d = texelWay(i);
     float cosine = dot(d, normal);
     if (cosine <= 0.) continue;
-    vec4 value = families > 0 ? family(d, wo, normal, max(exp(2. * rough), 1e-3)) : diffuse / 3.14159265;
-    color += (value.x * w[0] + value.y * w[1] + value.z * w[2] + value.w * w[3]) * cosine * clear(id, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
+    vec4 value = families > 0 ? family(d, wo, normal, rough) : diffuse / 3.14159265;
+    color += (value.x * w[0] + value.y * w[1] + value.z * w[2] + value.w * w[3]) * cosine * clear(row, d) * texelFetch(bright, at(2 * i + 1), 0).rgb;
   }
   color += arriving * (diffuse.x * w[0] + diffuse.y * w[1] + diffuse.z * w[2] + diffuse.w * w[3]);
   color = clamp(color, -65504., 65504.);
   o = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0)), 0, 0);
+}`;
+// The harmonics of the light that arrives at a vertex, two at a time: those of its visibility times the light's table.
+const GATHER = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp isampler2D;
+uniform isampler2D visible; uniform sampler2D gathered; uniform int count, bands, words, visibleStart, arrivedStart;
+out uvec4 o;
+ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }
+vec3 light(int harmonic, int i) { return texelFetch(gathered, at(harmonic * 4 * words + i), 0).rgb; }
+void main() {
+  int pairs = (bands * bands + 1) / 2, i = int(gl_FragCoord.x) + ${WIDTH} * int(gl_FragCoord.y) - arrivedStart;
+  if (i < 0 || i >= count * pairs) discard;
+  int vertex = i / pairs, first = 2 * (i - vertex * pairs);
+  bool both = first + 1 < bands * bands;
+  vec3 a = vec3(0), b = vec3(0);
+  for (int k = 0; k < words; k++) {
+    vec4 each = vec4(texelFetch(visible, at(visibleStart + vertex * words + k), 0));
+    for (int c = 0; c < 4; c++) {
+      a += each[c] * light(first, 4 * k + c);
+      if (both) b += each[c] * light(first + 1, 4 * k + c);
+    }
+  }
+  a = clamp(a, -65504., 65504.);
+  b = clamp(b, -65504., 65504.);
+  o = uvec4(packHalf2x16(a.rg), packHalf2x16(vec2(a.b, b.r)), packHalf2x16(b.gb), 0);
 }`;
 const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 1., 0, 1); }`;
@@ -227,6 +294,63 @@ function harmonics(x, y, z, degree, result) {
       [before, value] = [value, factor(l + 1, m) * (z * value - (l > m ? before / factor(l, m) : 0))];
     }
   }
+}
+
+// The window of `jaxprt.sphere.harmonics.least_laplacian`: a factor for each band.
+function leastLaplacian(light, degree, kept) {
+  const band = Array.from({ length: degree + 1 }, (_, l) => l), weight = band.map((l) => (l * (l + 1)) ** 2), spectrum = band.map(() => 0);
+  for (const l of band) for (let i = 3 * l * l; i < 3 * (l + 1) ** 2; i++) spectrum[l] += weight[l] * light[i] ** 2;
+  const total = spectrum.reduce((a, b) => a + b);
+  if (!total || kept >= 1) return band.map(() => 1);
+  if (kept === 0) return band.map((l) => (l ? 0 : 1));
+  let strength = 0;
+  for (let step = 0; step < 12; step++) {
+    const factor = weight.map((each) => 1 / (1 + strength * each));
+    const remains = spectrum.reduce((sum, each, l) => sum + (each / total) * factor[l] ** 2, 0);
+    const slope = spectrum.reduce((sum, each, l) => sum + (each / total) * factor[l] ** 3 * weight[l], 0);
+    strength += (remains / slope) * (Math.sqrt(remains / kept) - 1);
+  }
+  return weight.map((each) => 1 / (1 + Math.max(strength, 0) * each));
+}
+
+// Heights and weights of Gauss and Legendre.
+function gauss(count) {
+  return Array.from({ length: count }, (_, i) => {
+    let x = Math.cos((Math.PI * (i + 0.75)) / (count + 0.5)), slope = 1;
+    for (let step = 0; step < 20; step++) {
+      let value = 1, before = 0;
+      for (let l = 1; l <= count; l++) [value, before] = [((2 * l - 1) * x * value - (l - 1) * before) / l, value];
+      slope = (count * (before - x * value)) / (1 - x * x);
+      x -= value / slope;
+    }
+    return { height: x, weight: 2 / ((1 - x * x) * slope * slope) };
+  });
+}
+const rules = new Map(); // of quadrature on the sphere, exact for products of harmonics of degrees d, d and 2 d
+function rule(degree) {
+  if (!rules.has(degree)) {
+    const around = 4 * degree + 1, nodes = [];
+    for (const { height, weight } of gauss(2 * degree + 1)) for (let i = 0; i < around; i++) {
+      const angle = (2 * Math.PI * i) / around, ring = Math.sqrt(1 - height * height), value = new Float64Array((2 * degree + 1) ** 2);
+      harmonics(ring * Math.cos(angle), ring * Math.sin(angle), height, 2 * degree, value);
+      nodes.push({ value, weight: (weight * 2 * Math.PI) / around });
+    }
+    rules.set(degree, nodes);
+  }
+  return rules.get(degree);
+}
+// For each harmonic that arrives and each of the visibility the integral of both times the light, times the visibility's unit.
+function gathered(light, { bands, words, laplacian }, unit) {
+  const degree = bands - 1, window = leastLaplacian(light, degree, laplacian), terms = bands ** 2, result = new Float64Array(16 * terms * words), shown = [0, 0, 0];
+  for (const { value, weight } of rule(degree)) {
+    shown.fill(0);
+    for (let l = 0; l < bands; l++) for (let i = l * l; i < (l + 1) ** 2; i++) for (let c = 0; c < 3; c++) shown[c] += weight * window[l] * value[i] * light[3 * i + c];
+    for (let i = 0; i < terms; i++) for (let k = 0; k < value.length; k++) {
+      const each = value[i] * value[k] * unit[k], to = 4 * (4 * i * words + k);
+      for (let c = 0; c < 3; c++) result[to + c] += each * shown[c];
+    }
+  }
+  return Float32Array.from(result);
 }
 
 // Directions and solid angles of the texels of cubemaps.
@@ -361,6 +485,7 @@ class Piece {
     this.pyramid = next(Uint8Array);
     this.table = next(Float32Array);
     this.weights = next(Float32Array);
+    this.visible = next(Int8Array);
     this.bits = next(Uint8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = content.scene.lights.map(() => next(Float32Array));
@@ -372,16 +497,9 @@ class Piece {
   build() {
     const gl = (this.gl = this.canvas.getContext("webgl2")), { content } = this;
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
-    const text = SHADE.replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride).replaceAll("TEXELS", Math.max(content.texelEdge, 4));
-    this.program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, WHOLE], [gl.FRAGMENT_SHADER, text]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-      gl.attachShader(this.program, shader);
-    }
-    gl.linkProgram(this.program);
+    const bands = Math.max(1, ...content.parts.map((part) => part.bands)), knots = Math.max(2, ...content.parts.map((part) => part.knot.length));
+    const text = SHADE.replaceAll("HARMONICS", 2 * Math.ceil(bands ** 2 / 2)).replaceAll("BANDS", bands).replaceAll("KNOTS", knots).replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride).replaceAll("TEXELS", Math.max(content.texelEdge, 4));
+    this.program = this.link(text);
     gl.useProgram(this.program);
     gl.bindVertexArray(gl.createVertexArray());
     const count = content.scene.vertices, place = new Float32Array(8 * count);
@@ -400,20 +518,56 @@ class Piece {
     const set = { ints: gl.uniform1iv, floats: gl.uniform1fv };
     for (const [kind, name, value] of [["ints", "edges", content.edges], ["ints", "starts", content.starts], ["floats", "spreads", content.spreads],
       ["ints", "lightEdges", content.light.edges], ["ints", "lightStarts", content.light.starts], ["floats", "lightSpreads", content.light.spreads]]) set[kind].call(gl, this.at(name), value);
-    this.rows = Math.ceil(count / WIDTH);
-    const target = gl.createTexture();
-    gl.activeTexture(gl.TEXTURE0 + 10);
-    gl.bindTexture(gl.TEXTURE_2D, target);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, this.rows);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
-    gl.viewport(0, 0, WIDTH, this.rows);
-    [this.lit, this.turned, this.kept] = ["", "", null];
+    this.arrived = this.target(content.arrived, this.unit++);
+    gl.uniform1i(this.at("arrived"), this.unit - 1);
+    this.color = this.target(count, this.unit++);
+    if (content.arrived) {
+      this.gather = this.link(GATHER);
+      this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4, this.gather);
+    }
+    this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), ...content.parts.map((part) => part.bands)) - 1;
+    this.use(this.program, this.color);
+    for (const part of content.parts) part.written = "";
+    [this.lit, this.turned] = ["", ""];
   }
-  at(name) { return placeOf(this.gl, this.program, name); }
-  texture(name, internal, format, type, data, channels) {
+  link(text) {
+    const gl = this.gl, program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, WHOLE], [gl.FRAGMENT_SHADER, text]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    return program;
+  }
+  // A texture of so many entries that is drawn into.
+  target(entries, unit) {
+    const gl = this.gl, made = gl.createTexture(), frame = gl.createFramebuffer(), rows = Math.max(1, Math.ceil(entries / WIDTH));
+    this.check(rows);
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, rows);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+    return { frame, rows };
+  }
+  use(program, target) {
+    const gl = this.gl;
+    gl.useProgram(program);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+    gl.viewport(0, 0, WIDTH, target.rows);
+  }
+  check(rows) {
+    const most = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE);
+    if (rows > most) throw new Error(`this browser has textures of ${most} rows, and the scene needs ${rows}`);
+  }
+  at(name, program = this.program) { return placeOf(this.gl, program, name); }
+  texture(name, internal, format, type, data, channels, program = this.program) {
     const gl = this.gl, entries = data.length / channels, rows = Math.max(1, Math.ceil(entries / WIDTH));
-    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`this browser has textures of ${gl.getParameter(gl.MAX_TEXTURE_SIZE)} rows, and the scene needs ${rows}`);
+    this.check(rows);
     const unit = (this.textures[name] ??= { unit: this.unit++ }).unit;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.deleteTexture(this.textures[name].made ?? null);
@@ -423,7 +577,8 @@ class Piece {
     padded.set(data);
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, WIDTH, rows, 0, format, type, padded);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-    gl.uniform1i(this.at(name), unit);
+    gl.useProgram(program);
+    gl.uniform1i(this.at(name, program), unit);
   }
   // A light with its lamps: disks; one that is smaller than a texel keeps its flux.
   radiance(message) {
@@ -448,8 +603,11 @@ class Piece {
     const { gl, content } = this, key = JSON.stringify([message.light, message.lamps]);
     if (this.lit !== key) {
       this.mips = new Map();
-      let light = this.radiance(message);
-      light = this.split(light);
+      const all = this.radiance(message);
+      let light = this.split(all);
+      // Parts without single texels are lit by all of the light.
+      this.all = light === all || content.parts.every((part) => part.texels) ? null : all;
+      for (let edge = content.mips[0]; this.all && edge > 32 && edge > content.mips.at(-1); edge /= 2) this.all = halved(this.all, edge);
       for (const edge of content.mips) {
         this.mips.set(edge, light);
         if (edge > content.mips.at(-1)) light = halved(light, edge);
@@ -461,24 +619,46 @@ class Piece {
       [this.lit, this.turned] = [key, ""];
     }
     if (this.turned === `${key} ${message.turn}`) return;
-    const edge = content.mips.find((each) => each <= 32) ?? content.mips.at(-1), light = this.mips.get(edge);
-    const parts = Math.max(1, Math.floor(32 / edge)), { way, area } = grid(edge * parts);
-    const degree = Math.round(Math.sqrt(content.vectorUnit.length)) - 1, basis = new Float64Array((degree + 1) ** 2), value = new Float32Array(3 * content.terms);
     const c = Math.cos(message.turn), s = Math.sin(message.turn);
+    const edge = content.mips.find((each) => each <= 32) ?? content.mips.at(-1), rest = this.project(this.mips.get(edge), edge, c, s);
+    const all = this.all ? this.project(this.all, edge, c, s) : rest;
+    [this.irradiance, this.irradianceOfAll] = [rest, all].map((each) => {
+      const result = new Float32Array(3 * content.terms);
+      content.vectorUnit.forEach((unit, k) => { for (let j = 0; j < 3; j++) result[3 * k + j] = unit * each[3 * k + j]; });
+      return result;
+    });
+    gl.uniform2f(this.at("turn"), c, s);
+    if (content.arrived) this.arrive(all);
+    this.turned = `${key} ${message.turn}`;
+  }
+  // Harmonics of a light that is turned.
+  project(light, edge, c, s) {
+    const parts = Math.max(1, Math.floor(32 / edge)), { way, area } = grid(edge * parts), basis = new Float64Array((this.degree + 1) ** 2), value = new Float64Array(3 * basis.length);
     for (let i = 0; i < area.length; i++) {
       const [x, y, z] = [way[3 * i], way[3 * i + 1], way[3 * i + 2]], from = whole(i, edge, parts);
-      harmonics(c * x + s * z, y, c * z - s * x, degree, basis);
+      harmonics(c * x + s * z, y, c * z - s * x, this.degree, basis);
       for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] += basis[k] * area[i] * light[3 * from + j];
     }
-    for (let k = 0; k < basis.length; k++) for (let j = 0; j < 3; j++) value[3 * k + j] *= content.vectorUnit[k];
-    gl.uniform3fv(this.at("irradiance"), value);
-    gl.uniform2f(this.at("turn"), c, s);
-    this.turned = `${key} ${message.turn}`;
+    return value;
+  }
+  // Takes a light through the transfer matrices: what arrives is kept until the light changes.
+  arrive(light) {
+    const { gl, content } = this;
+    let key = "";
+    this.use(this.gather, this.arrived);
+    for (const part of content.parts) {
+      if (!part.bands) continue;
+      const own = `${part.bands} ${part.laplacian}`;
+      if (own !== key) this.texture("gathered", gl.RGBA32F, gl.RGBA, gl.FLOAT, gathered(light, part, content.visibleUnit), 4, this.gather);
+      key = own;
+      for (const name of ["count", "bands", "words", "visibleStart", "arrivedStart"]) gl.uniform1i(this.at(name, this.gather), part[name]);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    this.use(this.program, this.color);
   }
   // Takes the brightest texels out of a light, as far as they stand out: `jaxprt.bright_texels.split`.
   split(light) {
     const { gl, content } = this, edge = content.mips[0], { way, area } = grid(edge), count = content.texels;
-    gl.uniform1i(this.at("texels"), count);
     if (!count) return light;
     const flux = area.map((each, i) => each * (light[3 * i] + light[3 * i + 1] + light[3 * i + 2]));
     const order = Array.from(flux.keys()).sort((a, b) => flux[b] - flux[a]), rest = light.slice(), data = new Float32Array(8 * count);
@@ -502,7 +682,10 @@ class Piece {
     gl.uniform3fv(this.at("eye"), message.eye);
     for (const part of content.parts) {
       const { weightStep, log } = this.material(part, message.materials[part.name]);
-      for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "terms"]) gl.uniform1i(this.at(name), part[name]);
+      for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "terms", "bands", "entries", "arrivedStart", "bitStart"]) gl.uniform1i(this.at(name), part[name]);
+      gl.uniform1f(this.at("steps"), part.steps);
+      gl.uniform1i(this.at("texels"), part.texels ? content.texels : 0);
+      gl.uniform3fv(this.at("irradiance"), part.texels ? this.irradiance : this.irradianceOfAll);
       gl.uniform1i(this.at("weightStep"), weightStep);
       gl.uniform1f(this.at("logRoughness"), log);
       gl.uniform1i(this.at("families"), part.family.terms.length);
@@ -514,8 +697,8 @@ class Piece {
       if (part.knot.length) gl.uniform1fv(this.at("knot"), part.knot);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
-    const count = content.scene.vertices, found = new Uint32Array(4 * WIDTH * this.rows), result = new Uint16Array(3 * count);
-    gl.readPixels(0, 0, WIDTH, this.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
+    const count = content.scene.vertices, found = new Uint32Array(4 * WIDTH * this.color.rows), result = new Uint16Array(3 * count);
+    gl.readPixels(0, 0, WIDTH, this.color.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
     for (let i = 0; i < count; i++) {
       result[3 * i] = found[4 * i] & 65535;
       result[3 * i + 1] = found[4 * i] >>> 16;
@@ -528,7 +711,14 @@ class Piece {
   material(part, change) {
     const own = part.material;
     if (!own) return { weightStep: part.weightStep, log: 0 };
-    const value = { ...own, ...change }, white = ((1 - own.ior) / (1 + own.ior)) ** 2, f0White = Math.max(white, 1e-6);
+    const value = { ...own, ...change };
+    if (own.exponent !== undefined) {
+      const most = Math.max(...own.specular), strength = change?.f0 ?? most;
+      const specular = change?.f0 === undefined && !change?.specular ? own.specular : (change.specular ?? own.specular.map((x) => x / Math.max(most, 1e-6))).map((x) => x * strength);
+      this.write(part, { 3: value.diffuse, 4: specular });
+      return { weightStep: 0, log: Math.log(2 / (value.exponent + 2)) / 2 };
+    }
+    const white = ((1 - own.ior) / (1 + own.ior)) ** 2, f0White = Math.max(white, 1e-6);
     let tint = own.specular_color;
     if (change?.f0 !== undefined || change?.specular) {
       const most = Math.max(...tint), strength = change.f0 !== undefined ? change.f0 / (own.ior === 0 ? 1 : f0White) : most;
@@ -541,17 +731,18 @@ class Piece {
       f0.map((x, c) => layer * (1 - x) + own.metallic * (1 - base[c])),
       base.map((x) => dielectric * (1 - own.specular) * x),
     ];
-    const key = JSON.stringify(every);
-    if (key !== part.written) {
-      const gl = this.gl;
-      part.family.terms.forEach((term, k) => {
-        const at = part.weightStart + k;
-        gl.activeTexture(gl.TEXTURE0 + this.textures.weights.unit);
-        gl.texSubImage2D(gl.TEXTURE_2D, 0, at % WIDTH, Math.floor(at / WIDTH), 1, 1, gl.RGBA, gl.FLOAT, Float32Array.of(...every[term].map((x) => x / part.family.scale[k]), 0));
-      });
-      part.written = key;
-    }
+    this.write(part, every);
     return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)) };
+  }
+  write(part, every) {
+    const gl = this.gl, key = JSON.stringify(every);
+    if (key === part.written) return;
+    part.family.terms.forEach((term, k) => {
+      const at = part.weightStart + k;
+      gl.activeTexture(gl.TEXTURE0 + this.textures.weights.unit);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, at % WIDTH, Math.floor(at / WIDTH), 1, 1, gl.RGBA, gl.FLOAT, Float32Array.of(...every[term].map((x) => x / part.family.scale[k]), 0));
+    });
+    part.written = key;
   }
   sky(message) {
     const edge = this.content.mips[0], light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);

@@ -7,7 +7,7 @@ import os
 import pathlib
 import zlib
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +17,14 @@ from jaxprt import require
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
-from jaxprt.view import messages, parts, stages
-from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of
+from jaxprt.systems import harmonic, lobe
+from jaxprt.view import matrices, messages, parts, stages
+from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of, systems_of
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
 _MOST_BITS = 2**27  # bytes of visibility of single texels, which graphics cards take
+_SPARE = 64  # bytes that a page may differ by for another error
 _FIRST = 2  # scale of visibility that is the finest one in bytes
 _VIEWS = 4  # from which the error is measured
 _PAGE = """<!doctype html>
@@ -50,6 +52,7 @@ class Piece(NamedTuple):
         nbytes: Its size.
         edge: Texels along the edge of the faces of the finest visibility in it; 0 without glossy parts.
         texels: Whether the brightest texels of the light are summed one by one, for shadows of a small sun.
+        degree: Highest degree of the transfer matrices in it; None without parts of the harmonic system.
         error: Relative L2 error of its radiance at the vertices against that of the scene, over four views, in the
             light where it is largest.
     """
@@ -58,6 +61,7 @@ class Piece(NamedTuple):
     nbytes: int
     edge: int
     texels: bool
+    degree: int | None
     error: float
 
 
@@ -70,13 +74,14 @@ def export(
 ) -> Piece:
     """Writes a page that relights a scene without Python, by the browser's GPU: the viewer, and what it needs.
 
-    Direct light alone: ideally diffuse parts by transfer vectors in bytes, others by lobes and by means of visibility,
-    as fine as fit in the size that is asked for; and the brightest texels of the light one by one, where they fit. What
-    the viewer changes can be changed in it: light, turned or another, lamps, and materials that are one for all of a
-    part. A Radiance HDR file that is dropped on it is a light.
+    Direct light alone: ideally diffuse parts by transfer vectors in bytes, parts of the system "harmonic" by transfer
+    matrices, as harmonics of their visibility in bytes, and others by lobes and by means of visibility, all as fine as
+    fit in the size that is asked for; and the brightest texels of the light one by one, where they fit, on the parts
+    that have them. What the viewer changes can be changed in it: light, turned or another, lamps, and materials that
+    are one for all of a part. A Radiance HDR file that is dropped on it is a light.
 
     Args:
-        scene: From `jaxprt.precompute`, with the systems "lobe", or with any for parts that are ideally diffuse.
+        scene: From `jaxprt.precompute`, with the systems "lobe" and "harmonic".
         path: The file, `*.html`.
         environments: Lights by names; the scene's own or the two embedded ones if None.
         most: Largest size of the file in bytes.
@@ -94,20 +99,51 @@ def export(
         raise ValueError(f"path must end in .html, got {path.name!r}")
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
-    scale, bits = scale_of(scene), bits_of(scene)
-    levels = [0] if scale is None else range(_FIRST, len(scale.edge))
+    bits = bits_of(scene)
     # Shadows of a small sun are worth more than fine means of visibility.
-    fits = bits is not None and sum(each.size for each in bits) <= _MOST_BITS
+    fits = bits is not None and sum(each.size for each in bits if each is not None) <= _MOST_BITS
     least = 0
-    for texels, level in itertools.product([True, False] if fits else [False], levels):
-        reduced = coarse(scene, level, texels=texels)
+    for texels, size in itertools.product([True, False] if fits else [False], _sizes(scene)):
+        reduced = coarse(scene, size.level, texels=texels, degree=size.degree)
+        kept = parts.content(reduced, size.level)
+        least = len(_page(session, reduced, lights, kept, error=0.0, title=path.stem))
+        if least > most + _SPARE:
+            continue
         error = max(_error(scene, reduced, each) for each in lights.values())
-        page = _page(session, reduced, lights, level, error=error, title=path.stem)
+        page = _page(session, reduced, lights, kept, error=error, title=path.stem)
         if len(page) <= most:
             path.write_bytes(page)
-            return Piece(path, len(page), 0 if scale is None else int(scale.edge[level]), texels, error)
-        least = len(page)
+            return Piece(path, len(page), size.edge, texels, size.degree, error)
     raise ValueError(f"most must be at least the {least} bytes of the scene with its coarsest visibility, got {most}")
+
+
+class _Size(NamedTuple):
+    """How fine a page is: the finest scale of visibility, texels along its edge, and the degree of matrices."""
+
+    level: int
+    edge: int
+    degree: int | None
+
+
+def _sizes(scene: RelitScene) -> list[_Size]:
+    """Sizes, from the finest to the coarsest: what takes more bytes becomes coarser first."""
+    systems, scale = systems_of(scene), scale_of(scene)
+    lobes = sum(each.vertices for each in systems if isinstance(each, lobe.LobeSystem))
+    matrix = [each for each in systems if isinstance(each, harmonic.HarmonicSystem)]
+    degree = max((each.degree for each in matrix), default=None)
+    level = 0 if scale is None else _FIRST
+    result = []
+    while True:
+        result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))
+        means = 0 if scale is None or level == len(scale.edge) - 1 else lobes * int(scale.total - scale.start[level])
+        bands = 0 if degree is None or degree <= 1 else sum(matrices.nbytes(each, degree) for each in matrix)
+        if not means and not bands:
+            return result
+        if means >= bands:
+            level += 1
+        else:
+            assert degree is not None
+            degree -= 1
 
 
 def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
@@ -124,11 +160,17 @@ def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
 
 
 def _page(
-    session: Session, reduced: RelitScene, lights: Mapping[str, Environment], level: int, *, error: float, title: str
+    session: Session,
+    reduced: RelitScene,
+    lights: Mapping[str, Environment],
+    kept: tuple[dict[str, Any], list[bytes]],
+    *,
+    error: float,
+    title: str,
 ) -> bytes:
     """The file."""
     reply = session.answer({"kind": "scene"})
-    content, arrays = parts.content(reduced, level)
+    content, arrays = kept
     mips = parts.mips(next(iter(lights.values())).radiance.shape[-2])
     size = light_size(reduced)
     blurring = parts.blurring(size) if size else parts.NO_SCALES
@@ -143,7 +185,7 @@ def _page(
         "note": f"no Python; {100 * error:.1f} % off the whole system",
     }
     rims = sorted({mips[0], *blurring["edges"]}, reverse=True)
-    content |= {"scene": head, "light": blurring, "mips": mips, "rims": rims, "glossy": bool(size)}
+    content = content | {"scene": head, "light": blurring, "mips": mips, "rims": rims, "glossy": bool(size)}
     buffers = [
         *reply.buffers,
         *arrays,

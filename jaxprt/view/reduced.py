@@ -5,19 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxprt.relit.channels import Shading, ShininessFamily
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels, harmonic, lobe
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.protocol import Joined, System
+from jaxprt.view import matrices
 
 _LIGHT = 32  # texels along the edge of the light's faces that lobes are read from
 _TEXELS = 64  # brightest texels that are summed one by one
 _GRAZING = 1e-3
+_KNOTS = 64  # of a table's parameter, at most
 
-Exported = lobe.LobeSystem | harmonic.DiffuseSystem
+Exported = lobe.LobeSystem | harmonic.DiffuseSystem | harmonic.HarmonicSystem
 
 
 class CoarseTransport(lobe.LobeTransport):
@@ -59,19 +61,25 @@ class LobesAlone(eqx.Module):
         return self.table(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
 
 
-def coarse(scene: RelitScene, level: int, *, texels: bool) -> RelitScene:
-    """A scene as a page has it: without bounces and fine visibility of lobes, its vectors rounded to bytes.
+def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = None) -> RelitScene:
+    """A scene as a page has it: without bounces and fine visibility of lobes, its vectors and matrices of bytes.
 
     Args:
         scene: The scene.
         level: Finest scale of visibility, as `jaxprt.systems.lobe.pyramid.scales` numbers them.
-        texels: Whether the brightest texels of the light are summed one by one.
+        texels: Whether the brightest texels of the light are summed one by one, on the parts that have them.
+        degree: Highest degree of transfer matrices; None for that which they have.
     """
     systems = systems_of(scene)
     vectors = [vectors_of(each) for each in systems]
-    unit = vector_unit(vectors)
+    visible = [matrices.truncated(each, degree) for each in visibility_of(scene)]
+    unit, visible_unit = vector_unit(vectors), vector_unit(visible)
     made: list[System] = []
-    for system, vector in zip(systems, vectors, strict=True):
+    for system, vector, seen_in_part in zip(systems, vectors, visible, strict=True):
+        own = visible_unit[: len(seen_in_part), None]
+        if isinstance(system, harmonic.HarmonicSystem):
+            made.append(matrices.reduced(system, np.round(seen_in_part / own) * own))
+            continue
         own = unit[: len(vector), None]
         rounded = jnp.asarray(np.round(vector / own) * own, jnp.result_type(float))
         if isinstance(system, harmonic.DiffuseSystem):
@@ -81,9 +89,10 @@ def coarse(scene: RelitScene, level: int, *, texels: bool) -> RelitScene:
         size, least = min(_LIGHT, old.size), float(pyramid.scales(old.size).spread[level])
         seen = CoarseTransport(old.pyramid, rounded, old.position, old.frame, size, old.size, least)
         made.append(CoarseSystem(seen, system.brdf))
-    if texels:
-        full = zip(made, scene.direct.part, scene.shading, strict=True)
-        made = [_with_texels(each, system, shading) for each, system, shading in full]
+    bits = bits_of(scene) if texels else None
+    if bits is not None:
+        full = zip(made, scene.direct.part, scene.shading, bits, strict=True)
+        made = [each if own is None else _with_texels(each, system, shading) for each, system, shading, own in full]
     return RelitScene(scene.scene, Joined(tuple(made)), scene.shading)
 
 
@@ -101,18 +110,25 @@ def texels_of(size: int) -> int:
     return min(_TEXELS, 6 * size**2 - 1)
 
 
-def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"]] | None:
-    """Visibility of single texels for each part; None where a part has none."""
-    result = []
-    for system in scene.direct.part:
-        seen = system.visibility if isinstance(system, bright_texels.BrightTexels) else None
-        if isinstance(seen, lobe.TexelBits):
-            result.append(np.asarray(seen.bit).T)
-        elif isinstance(seen, lobe.LobeTransport):
-            result.append(np.asarray(seen.pyramid)[:, : 6 * seen.size**2 // 8])
-        else:
-            return None
+def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"] | None] | None:
+    """Visibility of single texels for each part, None for one that has none; None where no part or not all lobes do."""
+    result = [_bits(each) for each in scene.direct.part]
+    lobes = [isinstance(each, lobe.LobeSystem) for each in systems_of(scene)]
+    missing = [each is None for each in result]
+    if all(missing) or any(np.logical_and(missing, lobes)):
+        return None
     return result
+
+
+def _bits(system: System) -> UInt8[np.ndarray, "v n"] | None:
+    if not isinstance(system, bright_texels.BrightTexels) or isinstance(system.system, harmonic.HarmonicSystem):
+        return None
+    seen = system.visibility
+    if isinstance(seen, lobe.TexelBits):
+        return np.asarray(seen.bit).T
+    if isinstance(seen, lobe.LobeTransport):
+        return np.asarray(seen.pyramid)[:, : 6 * seen.size**2 // 8]
+    return None
 
 
 def resized(light: Environment, *, size: int) -> Environment:
@@ -132,15 +148,15 @@ def resized(light: Environment, *, size: int) -> Environment:
 def systems_of(scene: RelitScene) -> list[Exported]:
     """The systems of the parts without single texels; refuses those that a page does not have."""
     result: list[Exported] = []
-    for part, shading, system in zip(scene.scene.parts, scene.shading, scene.direct.part, strict=True):
-        if isinstance(shading.brdf, ShininessFamily):
-            raise ValueError(f"part {part.name!r} must have one exponent to be exported: precompute without roughness")
+    for part, system in zip(scene.scene.parts, scene.direct.part, strict=True):
         own = system.system if isinstance(system, bright_texels.BrightTexels) else system
-        if not isinstance(own, lobe.LobeSystem | harmonic.DiffuseSystem):
+        if not isinstance(own, Exported):
             raise ValueError(
-                f"part {part.name!r} must be ideally diffuse or made by the system 'lobe' to be exported, "
-                f"got {type(own).__name__}"
+                f"part {part.name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be "
+                f"exported, got {type(own).__name__}"
             )
+        if isinstance(own, harmonic.HarmonicSystem):
+            matrices.check(part.name, own)
         if isinstance(own, lobe.LobeSystem):
             _check(part.name, own.brdf)
         result.append(own)
@@ -150,10 +166,10 @@ def systems_of(scene: RelitScene) -> list[Exported]:
 def _check(name: str, brdf: lobe.LobeBrdf) -> None:
     if not brdf.isotropic:
         raise ValueError(f"part {name!r} must have an isotropic BRDF to be exported, got an anisotropic one")
-    if len(brdf.knot) > 1 or len(brdf.weight) > 4 or any(len(each) > 16 for each in brdf.knot):
+    if len(brdf.knot) > 1 or len(brdf.weight) > 4 or any(len(each) > _KNOTS for each in brdf.knot):
         raise ValueError(
-            f"part {name!r} must have a table of at most four channels and one parameter of 16 knots to be exported, "
-            f"got {len(brdf.weight)} and {[len(each) for each in brdf.knot]}"
+            f"part {name!r} must have a table of at most 4 channels and one parameter of {_KNOTS} knots to be "
+            f"exported, got {len(brdf.weight)} and {[len(each) for each in brdf.knot]}"
         )
 
 
@@ -176,13 +192,25 @@ def light_size(scene: RelitScene) -> int:
 
 
 def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
-    """Transfer vectors of a part's vertices."""
+    """Transfer vectors of a part's vertices; none of one with matrices."""
+    if isinstance(system, harmonic.HarmonicSystem):
+        return np.zeros((0, system.vertices))
     found = system.transport.vector
     if isinstance(system, harmonic.DiffuseSystem):
         if found.shape[1] != 1:
             raise ValueError(f"transfer vectors must be gray to be exported, got {found.shape[1]} colors")
         found = found[:, 0]
     return np.asarray(found, np.float64)
+
+
+def visibility_of(scene: RelitScene) -> list[Float[np.ndarray, "k v"]]:
+    """Harmonics of the visibility of the vertices of each part; none of one without transfer matrices."""
+    return [
+        matrices.visibility_of(part.name, system)
+        if isinstance(system, harmonic.HarmonicSystem)
+        else np.zeros((0, system.vertices))
+        for part, system in zip(scene.scene.parts, systems_of(scene), strict=True)
+    ]
 
 
 def vector_unit(vectors: list[np.ndarray]) -> Float[np.ndarray, " lm"]:

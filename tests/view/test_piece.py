@@ -2,14 +2,18 @@
 
 import re
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxprt as prt
 from jaxprt import view
+from jaxprt.brdf import BlinnPhong
+from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
+from jaxprt.systems.protocol import Joined
 from jaxprt.view import messages, stages
 from jaxprt.view.reduced import coarse
 
@@ -18,6 +22,10 @@ ASKED = """async (message) => {
   const { content, buffers } = await window.ask(message, message.file ? [Uint8Array.from(message.file).buffer] : []);
   return { content, data: buffers.length ? Array.from(new Uint16Array(buffers[0].buffer)) : [] };
 }"""
+
+
+DISK = 6e-3  # At 6 x 8 x 8 a texel is .4 % off the disk that the page takes it for.
+HALF = 2e-3  # of what arrives, in half floats, and of colors
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +71,16 @@ MATERIALS = {"roughness": 0.7, "f0": 0.2, "specular": [1.0, 0.5, 0.2], "diffuse"
 LAMPS = [{"direction": [0.2, 1.0, 0.5], "angle": 0.4, "radiance": [5.0, 4.0, 3.0]}]
 
 
+def reduced_radiance(scene, lights, message, **sizes):
+    """What Python makes of a scene that has been reduced as a page has it."""
+    known = messages.look(message, systems=["lobes"], lights=2)
+    made = stages.Stages({"lobes": coarse(scene, 2, **sizes)}, lights)
+    light = made.unturned(known.light, known.lamps)
+    if known.turn:
+        light = rotate(light, stages.about(known.turn))
+    return np.asarray(made.scene.radiance(light, eye=jnp.asarray(known.eye), materials=made.materials(known)))
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -77,15 +95,65 @@ LAMPS = [{"direction": [0.2, 1.0, 0.5], "angle": 0.4, "radiance": [5.0, 4.0, 3.0
 )
 def test_page_makes_the_radiance_of_the_reduced_scene(change, page, systems, lights, look):
     message = look | change
-    known = messages.look(message, systems=["lobes"], lights=2)
-    made = stages.Stages({"lobes": coarse(systems["lobes"], 2, texels=True)}, lights)
-    light = made.unturned(known.light, known.lamps)
-    if known.turn:
-        light = rotate(light, stages.about(known.turn))
-    true = made.scene.radiance(light, eye=jnp.asarray(known.eye), materials=made.materials(known))
-    assert (
-        off(page.color(message), np.asarray(true)) < 5e-3
-    )  # at 6 x 8 x 8 a texel is .4 % off the disk that the page takes it for
+    true = reduced_radiance(systems["lobes"], lights, message, texels=True)
+    assert off(page.color(message), true) < DISK
+
+
+def test_page_makes_the_radiance_of_transfer_matrices(browser, systems, lights, look, tmp_path):
+    scene = systems["harmonics"]
+    whole = view.export(scene, tmp_path / "whole.html", environments=lights)
+    small = view.export(scene, tmp_path / "small.html", environments=lights, most=whole.nbytes - 5000)
+    assert (whole.degree, small.degree) == (2, 1)
+    assert whole.error < 5e-3  # of bytes
+    assert small.error > 2e-2
+    changes = {"turn": np.pi / 2}, {"eye": [-1.0, 3.0, -2.0], "materials": {"ball": MATERIALS}}, {"lamps": LAMPS}
+    for piece in (whole, small):
+        page = Page(browser, piece.path)
+        for change in changes:
+            message = look | change
+            true = reduced_radiance(scene, lights, message, texels=False, degree=piece.degree)
+            assert off(page.color(message), true) < HALF
+        page.page.close()
+
+
+@pytest.fixture(scope="module")
+def mixed(lights, tmp_path_factory):
+    """Two balls whose exponents are free, by lobes and by harmonics of a light with a window, over a matte plane."""
+    ball = builtin.sphere(rings=8, sectors=16)
+    beside = eqx.tree_at(lambda mesh: mesh.position, ball, ball.position + np.array([2.2, 0.0, 0.0], np.float32))
+    ground = prt.scene.mesh.make_mesh(
+        np.array([[-3, -1, -3], [-3, -1, 3], [5, -1, 3], [5, -1, -3]], float), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    parts = [
+        Part("shiny", ball, BlinnPhong([0.4, 0.1, 0.05], 0.3, 20.0)),
+        Part("soft", beside, BlinnPhong(0.2, [0.3, 0.5, 0.2], 10.0)),
+        Part("ground", ground, TexturedMaterial(base_color=(0.4, 0.5, 0.4), metallic=0.0, specular=0.0)),
+    ]
+    lobes = prt.relit.Lobes(2, texels=2)
+    recipes = {"shiny": lobes, "soft": prt.relit.Harmonics(2, laplacian=0.4), "ground": lobes}
+    made = prt.precompute(Scene(parts), system=recipes, roughness=(0.2, 0.5), size=8, progress=False)
+    return made, view.export(made, tmp_path_factory.mktemp("mixed") / "mixed.html", environments=lights)
+
+
+def test_lobes_and_matrices_share_a_page_and_exponents_change(browser, mixed, lights, look):
+    scene, piece = mixed
+    assert piece.texels
+    assert piece.degree == 2
+    page = Page(browser, piece.path)
+    head, _ = page.ask({"kind": "scene"})
+    least, most = head["parts"][0]["free"]["exponent_range"]
+    assert least < 10 < 40 < most
+    shiny = {"exponent": 40.0, "f0": 0.5, "specular": [1.0, 0.8, 0.3], "diffuse": [0.1, 0.2, 0.3]}
+    before = None
+    for change in {}, {"materials": {"shiny": shiny, "soft": {"exponent": 30.0, "diffuse": [0.0, 0.1, 0.2]}}}:
+        message = look | {"turn": np.pi / 2} | change
+        found = page.color(message)
+        true = reduced_radiance(scene, lights, message, texels=True)
+        for part, most in zip(np.split(np.arange(len(true)), [114, 228]), (DISK, HALF, DISK), strict=True):
+            assert off(found[part], true[part]) < most
+        assert before is None or off(found, before) > 0.1
+        before = found
+    page.page.close()
 
 
 def test_error_is_told_against_the_whole_scene(made, systems, lights):
@@ -185,8 +253,22 @@ def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
 
 
 def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
-    with pytest.raises(ValueError, match=r"part 'ball' must be ideally diffuse or made by the system 'lobe'"):
-        view.export(systems["harmonics"], tmp_path / "a.html")
+    scene = systems["harmonics"]
+    ball, ground = scene.direct.part
+
+    def refused(system, told):
+        changed = RelitScene(scene.scene, Joined((system, ground)), scene.shading)
+        with pytest.raises(ValueError, match=f"part 'ball' must {told}"):
+            view.export(changed, tmp_path / "a.html")
+
+    refused(prt.total(ball, ball), "be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got")
+    matrix = ball.transport.matrix
+    reflected = eqx.tree_at(lambda each: each.transport.matrix, ball, matrix.at[:, 0, 0, 1].add(0.5))
+    refused(reflected, "have the transfer matrices of direct light")
+    colored = eqx.tree_at(lambda each: each.transport.matrix, ball, jnp.concatenate([matrix] * 3, 1))
+    refused(colored, "have gray transfer matrices to be exported, got 3 colors")
+    skewed = eqx.tree_at(lambda each: each.brdf.table, ball, ball.brdf.table.at[1].add(ball.brdf.table[3]))
+    refused(skewed, "have a BRDF that is symmetric about the plane of the view")
     with pytest.raises(ValueError, match=r"path must end in \.html, got 'a\.htm'"):
         view.export(systems["lobes"], tmp_path / "a.htm")
 

@@ -65,6 +65,12 @@ class HarmonicBrdf(eqx.Module):
         return self.table.ndim - len(self.knot) == 3
 
     @property
+    def steps(self) -> float:
+        """Nodes for one unit of tan(theta / 2), in the table of an isotropic BRDF."""
+        resolution = self.table.shape[-1]
+        return (resolution - 1) / _outermost(resolution)
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the table."""
         return self.table.nbytes
@@ -91,8 +97,7 @@ class HarmonicBrdf(eqx.Module):
         # At the normal the azimuth is undefined; there (x, y) / sin_o is 0, as all orders but m = 0 are.
         sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
         if self.isotropic:
-            spot = sin_o / (1 + jnp.maximum(wo[:, 2], 0)) * ((resolution - 1) / _outermost(resolution))
-            place = [spot]
+            place = [sin_o / (1 + jnp.maximum(wo[:, 2], 0)) * self.steps]
         else:
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
             place = [spot[:, 1], spot[:, 0]]

@@ -143,11 +143,49 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
     visible = seen.astype(frame.dtype) / visibility.LEVELS
     mean = jnp.sum(visible * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
     coefficient = _project(jnp.where(flux > 0, visible, mean), degree=2 * degree)
+    return from_visibility(coefficient, frame, degree=degree)
+
+
+@partial(jit, static_argnames="degree")
+def from_visibility(
+    coefficient: Float[Array, "k b"], frame: Float[Array, "b 3 3"], *, degree: int
+) -> Float[Array, "b lm lm"]:
+    """Transfer matrices of a visibility that is given by its harmonics: M_oi = ∫ V y_o (in the local frame) y_i.
+
+    A matrix has no more in it than these (2 degree + 1)^2 numbers and the frame: `to_visibility` is the inverse.
+
+    Args:
+        coefficient: Coefficients of the visibility in the world, of twice the degree.
+        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+        degree: Highest degree of the matrices.
+    """
     node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ coefficient)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
     return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
+
+
+@jit
+def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "k b"]:
+    """Coefficients of the visibility that matrices were made of, in the world: the inverse of `from_visibility`.
+
+    Of other matrices, such as those with interreflection, it is the visibility whose matrices are nearest to them.
+    Turned to the world on both sides, the function sum_oi y_o(s) M_oi y_i(s) is the visibility convolved with the
+    square of the kernel sum_i y_i(s) y_i(t), which is zonal: a division for each band undoes that.
+
+    Args:
+        matrix: Transfer matrices.
+        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+    """
+    degree = harmonics.degree_of(matrix.shape[-1])
+    back = right_handed(frame).swapaxes(1, 2)
+    world = jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(matrix, 0, -1), back), -1, 0)
+    node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
+    basis = harmonics.evaluate(node, degree=degree)
+    convolved = jax.lax.map(lambda each: jnp.sum((basis @ each) * basis, -1), world)
+    coefficient = (weight[:, None] * harmonics.evaluate(node, degree=2 * degree)).T @ convolved.T
+    return harmonics.convolve(coefficient, jnp.asarray(1 / _squared_kernel(degree), frame.dtype))
 
 
 @partial(jit, static_argnames="degree")
@@ -198,6 +236,13 @@ def _rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
     radius = np.sqrt(1 - height**2)[:, None]
     node = np.stack([radius * np.cos(angle), radius * np.sin(angle), height[:, None] + 0 * angle], -1)
     return node.reshape(-1, 3), np.repeat(weight * 2 * np.pi / (degree + 1), degree + 1)
+
+
+def _squared_kernel(degree: int) -> np.ndarray:
+    """Factors of the zonal function (sum_i y_i(s) y_i(t))^2, whose sum goes up to a degree, for twice as many bands."""
+    height, weight = np.polynomial.legendre.leggauss(2 * degree + 1)
+    kernel = np.polynomial.legendre.legval(height, (2 * np.arange(degree + 1) + 1) / (4 * np.pi))
+    return 2 * np.pi * (weight * kernel**2) @ np.polynomial.legendre.legvander(height, 2 * degree)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join, make_mesh, rotate
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.systems.harmonic import precompute, precompute_diffuse
-from jaxprt.systems.harmonic.transfer import transfer, transfer_diffuse
+from jaxprt.systems.harmonic.transfer import from_visibility, to_visibility, transfer, transfer_diffuse
 
 SIZE = 8
 UP = directions.frame(jnp.array([[0.0, 1, 0]]), jnp.array([[1.0, 0, 0]]))
@@ -129,6 +129,16 @@ def test_transfer_is_a_dimming_in_the_world_followed_by_the_rotation(random):
     value = np.linalg.eigvalsh((dimming + dimming.swapaxes(1, 2)) / 2)
     assert value.min() > -EXACT
     assert value.max() < 1 + EXACT
+
+
+@pytest.mark.parametrize("degree", [1, 4])
+def test_matrices_hold_the_harmonics_of_the_visibility_and_no_more(random, close, degree):
+    frame = frames(random, 3)
+    coefficient = jnp.asarray(random.normal(size=((2 * degree + 1) ** 2, 3)), jnp.float32)
+    matrix = from_visibility(coefficient, frame, degree=degree)
+    close(to_visibility(matrix, frame), coefficient, tolerance=EXACT)
+    traced = transfer(visible(random, 3), frame, degree=degree)
+    close(from_visibility(to_visibility(traced, frame), frame, degree=degree), traced, tolerance=EXACT)
 
 
 def test_the_two_sides_of_a_matrix_do_not_mix_frames_and_light(random, close):
