@@ -1,0 +1,210 @@
+"""How wrong are pictures of scenes whose parts light each other, and their indirect part alone? Beside Mitsuba 3's.
+
+    python -m benchmarks.reflections [--quick] [--only SCENE] [--store FOLDER] [--pictures FOLDER] [--output FILE]
+
+Four scenes by the lobe system with two bounces, made ready for every roughness from .05 to .8: spheres on a ground, the
+Duck of Khronos' samples on a ground, two sides of chess, and a room. Each is looked at in ten random triples of a light
+(turned about), a view and materials; parts are metals or dielectrics with roughness between .05 and .8. Lines
+`roughness` have one roughness on all parts that are not grounds, half of them metals.
+
+Mitsuba traces the same triangles and materials, as many bounces, twice with unlike seeds, so that noise falls out of
+each squared error. Pixels are points of 4 samples here and means over squares there. `error` is that of the whole
+picture, `indirect_error` that of light that was reflected at least once, relative to that light; both are relative L2
+over the pixels that the scene fills, and the medians over the triples. `indirect_fraction` is how much of the picture
+the indirect part is. `seconds` are of a new picture, rays included. Without LLVM of version 17 or newer, which Mitsuba
+needs, there are no errors.
+"""
+
+import dataclasses
+import pathlib
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness, path_tracing
+from benchmarks.scenes import spheres, traced_parts
+from jaxprt import RelitScene, files, image, memory, precompute
+from jaxprt.image import raster
+from jaxprt.relit import Lobes
+from jaxprt.scene import (
+    Camera,
+    Environment,
+    Part,
+    Scene,
+    TexturedMaterial,
+    builtin,
+    interiors,
+    load_environment,
+    load_scene,
+)
+from jaxprt.scene.camera import orbit
+from jaxprt.scene.environment import rotate
+from jaxprt.scene.mesh import ground_plane, split
+
+EDGE, SAMPLES, TRIPLES, BOUNCES = 256, 144, 10, 2
+RANGE = (0.05, 0.8)
+ROUGHNESS = (0.05, 0.1, 0.2, 0.4, 0.8)
+SCENES = ("spheres", "duck", "chess", "room")
+LIGHTS = ("grace_cross.hdr", "eucalyptus_rnl_cross.hdr", "polyhaven_courtyard_1k.exr", "uffizi_latlong_256x128.hdr")
+_MATTE = TexturedMaterial(base_color=0.5, metallic=0.0, roughness=0.6)
+
+
+class Triple(NamedTuple):
+    """A light, a view and materials."""
+
+    light: Environment
+    camera: Camera
+    materials: dict[str, TexturedMaterial]
+
+
+def main(options: Sequence[str] | None = None) -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
+    parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write ours and Mitsuba's, both parts")
+    parser.add_argument("--only", metavar="SCENE", help=f"one of {', '.join(SCENES)}")
+    arguments = parser.parse_args(options)
+    for name in SCENES[:1] if arguments.quick else SCENES:
+        if arguments.only in (None, name):
+            for line in measure(name, arguments.quick, arguments.store, arguments.pictures):
+                harness.report(line, arguments.output)
+
+
+def scene_of(name: str, quick: bool) -> Scene:
+    """What is relit; parts without textures."""
+    if name == "spheres":
+        parts = spheres(sectors=12 if quick else 96, ground=36 if quick else 4900).parts
+        return Scene(
+            [dataclasses.replace(each, material=_MATTE) for each in (parts[:1] if quick else parts[:3]) + parts[3:]]
+        )
+    if name == "duck":
+        duck = load_scene(harness.data() / "scenes" / "Duck.glb")
+        plain = [dataclasses.replace(each, material=_MATTE) for each in duck.parts]
+        return Scene([*plain, Part("ground", ground_plane(duck.mesh, vertices=4900), _MATTE)])
+    mesh = interiors.chess_sides() if name == "chess" else interiors.room()
+    return Scene([Part(f"region {number}", each, _MATTE) for number, each in enumerate(split(mesh))])
+
+
+def measure(name: str, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None):
+    """Lines of one scene."""
+    scene = scene_of(name, quick)
+    lights = lights_of(quick)
+    path = store and store / f"reflections_{name}"
+    sizes = Lobes(lobes=2, texels=2) if quick else Lobes(lobes=8)
+    low = (0.4, 0.5) if quick else RANGE
+    size = lights[0].radiance.shape[-2]
+    whole = precompute(scene, system=sizes, bounces=BOUNCES, roughness=low, size=size, path=path, progress=False)
+    common = {"benchmark": "reflections", "scene": name, "vertices": whole.vertices, "bytes": memory(whole)}
+    random = np.random.default_rng(5)
+    every = [drawn(random, scene, lights, low, quick) for _ in range(1 if quick else TRIPLES)]
+    yield {**common, "case": f"{name}, random materials", **judged(whole, every, quick, pictures and pictures / name)}
+    for roughness in ROUGHNESS[2:3] if quick else ROUGHNESS:
+        rough = max(roughness, low[0])
+        alike = [each._replace(materials=of_roughness(each.materials, rough)) for each in every[:3]]
+        folder = pictures and pictures / f"{name}_{roughness}"
+        yield {**common, "case": f"{name}, roughness {roughness}", **judged(whole, alike, quick, folder)}
+
+
+def lights_of(quick: bool) -> list[Environment]:
+    """What scenes are lit by."""
+    paths = [harness.data() / "env" / file for file in LIGHTS]
+    found = [] if quick else [load_environment(path) for path in paths if path.is_file()]
+    return found or ([builtin.studio(size=8)] if quick else [builtin.daylight(), builtin.studio()])
+
+
+def drawn(random, scene: Scene, lights: list[Environment], roughness: tuple[float, float], quick: bool) -> Triple:
+    """A random triple."""
+    light = lights[random.integers(len(lights))]
+    turn = 2 * np.pi * random.random()
+    about = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    turned = rotate(light, jnp.asarray(about, jnp.float32))
+    edge = 16 if quick else EDGE
+    angle, height = 2 * np.pi * random.random(), random.uniform(0.2, 0.6)
+    camera = orbit(scene.mesh, azimuth=angle, elevation=height, width=edge, height=edge)
+    materials = {}
+    for part in scene.parts:
+        color = random.uniform(0.2, 0.9, 3)
+        rough = float(np.exp(random.uniform(*np.log(roughness))))
+        metal = float(random.random() < 0.5 and part.name != "ground")
+        materials[part.name] = TexturedMaterial(base_color=jnp.asarray(color), metallic=metal, roughness=rough)
+    return Triple(turned, camera, materials)
+
+
+def of_roughness(materials: dict[str, TexturedMaterial], roughness: float) -> dict[str, TexturedMaterial]:
+    """The same materials with one roughness, but for grounds; every second one a metal."""
+    return {
+        name: each
+        if name == "ground"
+        else TexturedMaterial(base_color=each.base_color, metallic=float(number % 2 == 0), roughness=roughness)
+        for number, (name, each) in enumerate(materials.items())
+    }
+
+
+def judged(whole: RelitScene, triples: list[Triple], quick: bool, folder: pathlib.Path | None) -> dict:
+    """Medians over some triples."""
+    direct = RelitScene(whole.scene, whole.direct, whole.shading)
+    first = triples[0]
+    timing = harness.measure(lambda: whole.picture(first.light, first.camera, materials=first.materials), repeats=3)
+    rows = []
+    for number, (light, camera, materials) in enumerate(triples):
+        mine, alone = (np.asarray(each.picture(light, camera, materials=materials)) for each in (whole, direct))
+        if not path_tracing.available():
+            continue
+        parts = [dataclasses.replace(each, material=materials[each.name]) for each in whole.scene.parts]
+        start = time.perf_counter()
+        exact = reference(Scene(parts), light, camera, 4 if quick else SAMPLES)
+        spent = (time.perf_counter() - start) / 4  # two of four pictures have the bounces
+        shown = np.asarray(raster.rasterize(whole.mesh, camera).triangle)[..., None] >= 0
+        rows.append(
+            off(mine * shown, alone * shown, [(a * shown, b * shown) for a, b in exact]) | {"peer_seconds": spent}
+        )
+        print(number, {key: round(value, 4) for key, value in rows[-1].items()}, flush=True)
+        if folder is not None:
+            write(folder / f"triple_{number}.png", mine, alone, exact[0])
+    none = {"error": None, "peer_seconds": None, "peer_error": None}
+    found = {key: float(np.median([row[key] for row in rows])) for key in rows[0]} if rows else none
+    return {**timing.line(), **found, "peer": "mitsuba", "peer_samples": SAMPLES}
+
+
+def reference(scene: Scene, light: Environment, camera: Camera, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Two pictures with bounces and two of direct light, of unlike seeds."""
+    parts = traced_parts(scene)
+    depths = (2 + BOUNCES, 2)
+    return [
+        tuple(path_tracing.trace(parts, light, camera, depth=depth, samples=samples, seed=seed) for depth in depths)
+        for seed in (1, 2)
+    ]  # pyright: ignore[reportReturnType]
+
+
+def off(mine: np.ndarray, alone: np.ndarray, exact: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """Errors of the whole picture and of its indirect part."""
+    (one, one_direct), (other, other_direct) = exact
+    indirect = one - one_direct, other - other_direct
+    part = norm(0, *indirect)
+    return {
+        "error": norm(mine, one, other) / norm(0, one, other),
+        "peer_error": float(np.linalg.norm(one - other) / 2**0.5) / norm(0, one, other),
+        "direct_error": norm(alone, one_direct, other_direct) / norm(0, one_direct, other_direct),
+        "indirect_error": norm(mine - alone, *indirect) / part,
+        "indirect_fraction": part / norm(0, one, other),
+        "indirect_bias": float(np.sum(mine - alone) / np.mean([np.sum(each) for each in indirect]) - 1),
+    }
+
+
+def norm(value, one: np.ndarray, other: np.ndarray) -> float:
+    """Of the difference from what two noisy pictures are means of: their noise has no part in the product."""
+    return float(np.sqrt(max(np.sum((value - one) * (value - other), dtype=np.float64), 0)))
+
+
+def write(path: pathlib.Path, mine: np.ndarray, alone: np.ndarray, exact: tuple[np.ndarray, np.ndarray]) -> None:
+    """Writes our picture and Mitsuba's, and the indirect parts of both, at the exposure of Mitsuba's."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stops = image.automatic_exposure(jnp.asarray(exact[0]))
+    row = np.concatenate([mine, exact[0], np.maximum(mine - alone, 0), np.maximum(exact[0] - exact[1], 0)], 1)
+    files.write_png(path, np.asarray(image.display(image.expose(jnp.asarray(row), stops=stops))))
+
+
+if __name__ == "__main__":
+    main()
