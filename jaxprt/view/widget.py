@@ -18,7 +18,8 @@ from jaxprt.view.session import Session
 class Viewer(anywidget.AnyWidget):
     """A viewer in a cell.
 
-    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel.
+    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel. Of
+    pictures at rest there is one at a time.
 
     Attributes:
         session: What it shows.
@@ -32,12 +33,13 @@ class Viewer(anywidget.AnyWidget):
         """Shows a session."""
         super().__init__(height=height)
         self.session = session
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="jaxprt-view")
+        self._looks, self._rests = (ThreadPoolExecutor(1, thread_name_prefix="jaxprt-view") for _ in range(2))
         self.on_msg(self._heard)
 
     def close(self) -> None:
         """Takes the viewer out of the notebook."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for each in (self._looks, self._rests):
+            each.shutdown(wait=False, cancel_futures=True)
         super().close()
 
     def __repr__(self) -> str:
@@ -58,7 +60,8 @@ class Viewer(anywidget.AnyWidget):
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
-            self._threads.submit(self._answer, message, [bytes(each) for each in buffers])
+            threads = self._rests if message["content"].get("kind") in ("still", "exact") else self._looks
+            threads.submit(self._answer, message, [bytes(each) for each in buffers])
 
     def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:
         content, arrays = self.session.answer(message["content"], buffers)
