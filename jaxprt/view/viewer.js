@@ -701,6 +701,7 @@ function render({ model, el }) {
     const each = waiting.get(content.id);
     if (!each) return;
     waiting.delete(content.id);
+    el.classList.add("jaxprt-live"); // which hides the picture that a notebook without a kernel shows
     each.resolve({ content: content.content, buffers });
   };
   const restarted = () => new Error("the kernel was restarted; run the cell again");

@@ -1,6 +1,7 @@
 """The viewer in a notebook, by anywidget."""
 
 import base64
+import html
 import pathlib
 import tempfile
 from collections.abc import Sequence
@@ -9,10 +10,19 @@ from typing import Any
 
 import anywidget
 import traitlets
+from IPython.display import display
 
 from jaxprt import files
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
+
+# JupyterLab's outputs of one cell follow each other. The picture goes when the viewer has its first answer. Without a
+# kernel there is no viewer, and JupyterLab's words in its place, which are all that is in there, go.
+_STYLE = """<style>
+.jp-OutputArea-child:has(.jaxprt-picture):has(+ .jp-OutputArea-child .jaxprt-live),
+.jp-OutputArea-child:has(.jaxprt-picture) + .jp-OutputArea-child .jp-OutputArea-output.jupyter-widgets:not(:has(*))
+{ display: none }
+</style>"""
 
 
 class Viewer(anywidget.AnyWidget):
@@ -46,17 +56,20 @@ class Viewer(anywidget.AnyWidget):
         """The names of what it shows, the same in every run."""
         return f"Viewer of {', '.join(part.name for part in self.session.stages.scene.scene.parts)}"
 
-    def _repr_mimebundle_(self, **options: Any) -> tuple[dict, dict] | None:
-        """The widget, and a picture for where there is no kernel: a saved notebook, or its page on the web."""
-        found = super()._repr_mimebundle_(**options)
-        if found is None:
-            return None
-        data, more = found
+    def _ipython_display_(self, **options: Any) -> None:
+        """Shows a picture, and the widget that takes its place: a saved notebook has the picture without a kernel."""
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder) / "picture.png"
             files.write_png(path, self.session.picture())
             picture = base64.b64encode(path.read_bytes()).decode()
-        return {**data, "image/png": picture}, more
+        words = repr(self)
+        page = f'<img class="jaxprt-picture" alt="{html.escape(words)}" src="data:image/png;base64,{picture}">{_STYLE}'
+        display({"text/html": page, "image/png": picture, "text/plain": words}, raw=True)
+        found = super()._repr_mimebundle_(**options)
+        if found is not None:
+            data, more = found
+            data.pop("text/plain")  # which pages would show under the picture
+            display(data, metadata=more, raw=True)
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
