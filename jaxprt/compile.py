@@ -21,6 +21,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
+Between = Callable[[], None] | None  # called between steps of long work
 Fixed = TypeVar("Fixed", bound=PyTree)
 
 _ROOM = 1 << 28  # bytes of what loops make at once on GPUs
@@ -83,6 +84,17 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
         return (inside if traced else compiled)(*argument, **named)
 
     return step
+
+
+def finished(made: PyTree, between: Between) -> PyTree:
+    """The result of a step, after the device has computed it and `between` was called, which may raise to give up.
+
+    Without `between` the result is returned at once, while the device may still compute it. Not for `jax.jit`.
+    """
+    if between is not None:
+        jax.block_until_ready(made)
+        between()
+    return made
 
 
 def _always(_: Array) -> Array:

@@ -1,7 +1,6 @@
 """Executes notebooks in place: `python notebooks/execute.py NOTEBOOK...`.
 
-A saved viewer keeps its picture alone: without a kernel there is no widget to show, and JupyterLab would print an error
-instead.
+A saved viewer keeps its picture alone, and that once.
 """
 
 import pathlib
@@ -25,8 +24,11 @@ def execute(path: pathlib.Path) -> None:
     )
     client.execute()
     for cell in notebook.cells:
+        if "outputs" in cell:
+            cell.outputs = [output for output in cell.outputs if _WIDGET not in output.get("data", {})]
         for output in cell.get("outputs", []):
-            output.get("data", {}).pop(_WIDGET, None)
+            if "jaxprt-picture" in output.get("data", {}).get("text/html", ""):
+                del output["data"]["text/html"]
     nbformat.write(notebook, path)
 
 

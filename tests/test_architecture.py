@@ -46,6 +46,7 @@ ONLY_IN = {
     "OpenImageIO": "jaxprt.files",
     "mmap": "jaxprt.files.mapped",
     "jaxopt": "jaxprt.inverse.solve",
+    "IPython": "jaxprt.view.widget",
     "anywidget": "jaxprt.view.widget",
     "traitlets": "jaxprt.view.widget",
     "fast_simplification": "jaxprt.scene.occluder",

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxprt.brdf import Lambert
 from jaxprt.brdf.varying import PerVertex
+from jaxprt.compile import Between, finished
 from jaxprt.image import Pixels, front, raster, rasterize, relative_l2, resolve, shading_points
 from jaxprt.relit.channels import Shading, at_points, exact_at
 from jaxprt.scene import Camera, Environment, Mesh, Scene
@@ -80,6 +81,7 @@ def exact_pixels(
     importance: Float[ArrayLike, "h w"] | None = None,
     points: int = 4,
     progress: bool = False,
+    between: Between = None,
 ) -> ExactPixels:
     """Pixels of a picture, exact but for the number of points: the yardstick of pictures.
 
@@ -94,10 +96,12 @@ def exact_pixels(
         importance: How likely each of them is one, up to a factor; of each part alike many if None.
         points: Of each pixel and part that are shaded, by chance. One costs some milliseconds.
         progress: Whether to show progress bars.
+        between: Called after each stage and after each block of 64 points, by several threads; an exception that it
+            raises gives the work up.
     """
     mesh, lights = scene.mesh, Environment(jnp.stack([each.radiance for each in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
-    fragments = rasterize(mesh, fine)
+    fragments = finished(rasterize(mesh, fine), between)
     every = fragments.triangle, fragments.barycentric, front(fragments, mesh, fine)
     triangle, barycentric, seen = (_squares(np.asarray(each)) for each in every)
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
@@ -119,7 +123,7 @@ def exact_pixels(
             continue
         where = on_triangles(face, triangle[row, place], barycentric[row, place])
         brdf, emitted = exact_at(part, shading, where)
-        options = {"eye": camera.eye, "occluder": mesh, "progress": progress}
+        options = {"eye": camera.eye, "occluder": mesh, "progress": progress, "between": between}
         value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
         value = value if emitted is None else value + np.asarray(emitted)
         share = own.mean(1)[:, None]
@@ -140,6 +144,7 @@ def exact_picture(
     camera: Camera,
     *,
     progress: bool = False,
+    between: Between = None,
 ) -> ExactPicture:
     """The picture by the exact sum at each of its shading points, with rays of their own.
 
@@ -153,8 +158,9 @@ def exact_picture(
         environments: Lights of one size.
         camera: From where.
         progress: Whether to show progress bars.
+        between: As in `exact_pixels`.
     """
-    shown = _Shown.of(scene, camera)
+    shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
     if count > _MOST:
@@ -164,7 +170,7 @@ def exact_picture(
         shown = _Shown.of(scene, camera)
     lights = Environment(jnp.stack([each.radiance for each in environments]))
     color = np.zeros((len(environments), len(shown.owner), lights.radiance.shape[-1]), np.float32)
-    options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress}
+    options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress, "between": between}
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         index = np.flatnonzero(shown.owner == number)
         if not len(index):

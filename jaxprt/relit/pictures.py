@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
-from jaxprt.compile import jit
+from jaxprt.compile import Between, finished, jit
 from jaxprt.image import rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation
@@ -92,8 +92,8 @@ class PictureView(eqx.Module):
     part: tuple[PartPixels, ...]
     lamp: Float[Array, "n 3"] | None
 
-    def picture(self, environment: Environment) -> Float[Array, "h w c"]:
-        """The picture in a light, in linear radiance.
+    def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
+        """The picture in a light, in linear radiance. `between` is that of `RelitScene.picture`.
 
         Raises:
             TypeError: The light is no Environment.
@@ -103,23 +103,26 @@ class PictureView(eqx.Module):
         if environment.radiance.ndim != 4:
             raise ValueError(f"a picture has one light [6, n, n, c], got {list(environment.radiance.shape)}")
         blends = [each.appearance.blend for each in self.surface]
-        arriving = self.system.shade(self.system.light(environment), blends)
+        arriving = finished(self.system.shade(self.system.light(environment), blends), between)
         if self.surface[0].reflecting is None:
             arriving = arriving, [None] * len(self.surface)
         direct, reflected = arriving
-        rows = [self._rows(own, (direct[own.number], reflected[own.number], self.lamp)) for own in self.part]
+        arrived = ((own, (direct[own.number], reflected[own.number], self.lamp)) for own in self.part)
+        rows = [self._rows(*each, between) for each in arrived]
         return drawn(self.canvas, rows, environment)
 
-    def _rows(self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree]) -> Float[Array, "m p c"]:
+    def _rows(
+        self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree], between: Between
+    ) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
         surface, eye = self.surface[own.number], self.camera.eye
-        vertices = None if own.at_pixels else _at_vertices(surface, arriving, eye)
+        vertices = None if own.at_pixels else finished(_at_vertices(surface, arriving, eye), between)
         if own.kept is not None:
-            return jnp.stack([_lit(surface, arriving, vertices, view) for view in own.kept])
+            return jnp.stack([finished(_lit(surface, arriving, vertices, view), between) for view in own.kept])
 
         def shaded(index):
             points = points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
-            return _shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels)
+            return finished(_shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels), between)
 
         if not isinstance(own.index, Tracer):
             return jnp.stack([shaded(index) for index in own.index])
@@ -141,6 +144,7 @@ def make(
     lamp: Float[Array, "n 3"] | None,
     samples: int,
     keep: bool,
+    between: Between,
 ) -> PictureView:
     """The view of a scene at the pixels of a camera.
 
@@ -152,10 +156,12 @@ def make(
         lamp: Radiance of each lamp; None without.
         samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
+        between: As in `RelitScene.picture`.
     """
     bend = _bends([each.curvature for each in surfaces], mesh.region)
-    fragments = rasterize(mesh, camera, samples=samples)
+    fragments = finished(rasterize(mesh, camera, samples=samples), between)
     pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
+    finished(pixels, between)
     owner, wrong = _judged(mesh, bend, pixels, camera)
     parts = []
     for number, surface in enumerate(surfaces):

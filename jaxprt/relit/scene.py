@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
+from jaxprt.compile import Between
 from jaxprt.relit import interpolation, measuring, pictures
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
@@ -185,6 +186,7 @@ class RelitScene(System):
         *,
         materials: Mapping[str, Any] | None = None,
         samples: int = 4,
+        between: Between = None,
     ) -> Float[Array, "h w c"]:
         """The picture of the scene in a light, in linear radiance.
 
@@ -196,6 +198,8 @@ class RelitScene(System):
             camera: From where; `self.camera` if None.
             materials: Other materials of some parts.
             samples: Of the coverage of each pixel: 4, or 1 for no anti-aliasing.
+            between: Called after each stage and after each row of 8,192 points; an exception that it raises gives the
+                picture up. Not inside `jax.jit`.
 
         Returns:
             The picture. `jaxprt.image.display` makes it fit for the screen.
@@ -204,7 +208,8 @@ class RelitScene(System):
             TypeError: The light is no Environment, or the camera no Camera.
             ValueError: The light is a batch, or as in `view`.
         """
-        return self._picture_view(camera, materials, samples=samples, keep=False).picture(environment)
+        view = self._picture_view(camera, materials, samples=samples, keep=False, between=between)
+        return view.picture(environment, between=between)
 
     def picture_view(
         self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
@@ -213,9 +218,9 @@ class RelitScene(System):
 
         It holds about a kilobyte for each pixel that is shaded. Arguments and errors are those of `picture`.
         """
-        return self._picture_view(camera, materials, samples=samples, keep=True)
+        return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 
-    def _picture_view(self, camera: Camera | None, materials, *, samples: int, keep: bool) -> PictureView:
+    def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         materials, changed = scene_lamps.split(self.lamps, materials)
@@ -233,7 +238,7 @@ class RelitScene(System):
             curvature = self.curvature[number]
             surfaces.append(Surface(part, first, shading, system, reflecting, lit, own, material, curvature))
             first += len(part.mesh.position)
-        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, samples=samples, keep=keep)
+        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, UInt8
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.compile import jit, mapped
+from jaxprt.compile import Between, finished, jit, mapped
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points, placed
@@ -34,6 +34,7 @@ def radiance(
     points: Points | None = None,
     error: float = 1e-3,
     progress: bool = False,
+    between: Between = None,
 ) -> Float[Array, "..."]:
     """Radiance that vertices or points send to the eye: visibility traced, BRDF and cosine integrated over every texel.
 
@@ -52,6 +53,7 @@ def radiance(
             direction only. The light counts as constant over each texel, and visibility as a share of it, in
             sixteenths; this error leaves theirs out. With infinity each texel counts with the BRDF at its center.
         progress: Whether to show a progress bar.
+        between: Called after each block of 64 vertices; an exception that it raises gives the work up.
 
     Returns:
         Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
@@ -89,7 +91,7 @@ def radiance(
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
         seen, _ = visibility.fractional(rays, start[part], np.asarray(frame[part, 2], np.float32), size=size)
         own = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
-        block = integrate(seen, position[part], frame[part], own, light, eye, error=error)
+        block = finished(integrate(seen, position[part], frame[part], own, light, eye, error=error), between)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
 

@@ -6,6 +6,7 @@ import pathlib
 import tempfile
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -28,13 +29,19 @@ from jaxprt.view.stages import Stages
 _LARGEST = 2048.0  # pixels along an edge of a picture
 _PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
 _PIXELS = 400  # of a picture that the exact sum is compared at
+_COARSE = {"still": 2, "exact": 4}  # edge of a pixel of coarse pictures, in pixels
+_VIEWERS = 64  # whose newest look is remembered
+
+
+class _LateError(Exception):
+    """A later look has come from the viewer that a picture is for."""
 
 
 class Session:
     """What a viewer shows, and how it answers: the same for notebooks and for browsers.
 
-    Nothing queues: the browser asks for one look at a time. Looks are answered beside pictures at rest, which are given
-    up when a later look has come.
+    Nothing queues: the browser asks for one look at a time. Looks are answered beside pictures at rest. A picture is
+    given up, between two of its steps, when a later look has come from the same viewer.
 
     Attributes:
         stages: Lights, materials and views.
@@ -66,7 +73,8 @@ class Session:
         lights = _named(lights_of(scene.scene)) if environments is None else dict(environments)
         _check_lights(lights)
         self.stages = Stages(every, lights)
-        self._lock, self._newest = threading.Lock(), 0
+        self._lock = threading.Lock()
+        self._newest: OrderedDict[str, int] = OrderedDict()  # number of the newest look of each viewer
 
     def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
         """The answer to a message of the browser. A message that is wrong is answered by one that says why."""
@@ -83,6 +91,8 @@ class Session:
             if kind not in kinds:
                 raise ValueError(f"the kind of a message must be one of {', '.join(kinds)}, got {kind!r}")
             return kinds[kind](message, buffers)
+        except _LateError:
+            return Reply({"kind": "late", "seq": message.get("seq")}, [])
         except (ValueError, TypeError, OSError, MemoryError) as error:
             return Reply({"kind": "error", "of": message.get("kind"), "message": str(error)}, [])
 
@@ -125,8 +135,11 @@ class Session:
 
     def _look(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         look, seq = self._parse(message)
+        viewer = _viewer(message)
         with self._lock:
-            self._newest = max(self._newest, seq)
+            self._newest[viewer] = max(self._newest.pop(viewer, 0), seq)
+            while len(self._newest) > _VIEWERS:
+                self._newest.popitem(last=False)
         began = time.perf_counter()
         self.stages.light_side(look)
         lit = time.perf_counter()
@@ -152,36 +165,32 @@ class Session:
 
     def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         look, seq = self._parse(message)
-        width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
-        began = time.perf_counter()
-        if self._is_late(seq):
-            return Reply({"kind": "late", "seq": seq}, [])
-        picture = self.stages.picture(look, width, height)
+        width, height, coarse = _size(message)
+        began, between = time.perf_counter(), self._between(message, seq)
+        between()
+        picture = self.stages.picture(look, width, height, samples=1 if coarse else 4, between=between)
         data, scale = messages.encode(picture, stops=_stops(message))
         spent = 1000 * (time.perf_counter() - began)
         size = {"width": width, "height": height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """The exact picture in direct light, and the error of the picture at rest against some exact pixels."""
+        """The exact picture in direct light; and the error of the picture at rest, by some exact pixels of its size."""
         look, seq = self._parse(message)
-        width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
+        width, height, coarse = _size(message)
+        between = self._between(message, seq)
+        between()
         look = look._replace(bounces=False)
         scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
-        shadings = [of_part(part) for part in scene.parts]
-        given = scene, shadings, [self.stages.environment(look)], camera
-        if self._is_late(seq):
-            return Reply({"kind": "late", "seq": seq}, [])
-        pixels = exact.exact_pixels(*given, pixels=_PIXELS)
-        if self._is_late(seq):
-            return Reply({"kind": "late", "seq": seq}, [])
-        error, spread = pixels.relative_l2(self.stages.picture(look, width, height))
-        if self._is_late(seq):
-            return Reply({"kind": "late", "seq": seq}, [])
-        truth = exact.exact_picture(*given)
+        given = scene, [of_part(part) for part in scene.parts], [self.stages.environment(look)], camera
+        told = {}
+        if not coarse:
+            pixels = exact.exact_pixels(*given, pixels=_PIXELS, between=between)
+            error, spread = pixels.relative_l2(self.stages.picture(look, width, height, between=between))
+            told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
+        truth = exact.exact_picture(*given, between=between)
         data, scale = messages.encode(truth.color[0], stops=_stops(message))
         size = {"width": truth.camera.width, "height": truth.camera.height}
-        told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
 
     def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
@@ -211,9 +220,30 @@ class Session:
             self.stages.name.append(file.stem)
             return Reply({"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}, [])
 
-    def _is_late(self, seq: int) -> bool:
-        with self._lock:
-            return seq < self._newest
+    def _between(self, message: Mapping[str, Any], seq: int) -> Callable[[], None]:
+        """What is called between the steps of a picture: it raises when a later look of its viewer has come."""
+        viewer = _viewer(message)
+
+        def between() -> None:
+            with self._lock:
+                late = seq < self._newest.get(viewer, 0)
+            if late:
+                raise _LateError
+
+        return between
+
+
+def _viewer(message: Mapping[str, Any]) -> str:
+    """The name that a viewer gave itself: each numbers its own looks."""
+    return str(message.get("viewer", ""))[:64]
+
+
+def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
+    """Columns and rows of the picture that a message asks for, and whether it is a coarse one, which has fewer."""
+    width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
+    coarse = bool(message.get("coarse", False))
+    step = _COARSE[message["kind"]] if coarse else 1
+    return max(width // step, 1), max(height // step, 1), coarse
 
 
 def _named(lights: Sequence[Environment]) -> dict[str, Environment]:

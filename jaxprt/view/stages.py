@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxprt.brdf import BlinnPhong, Lambert
+from jaxprt.compile import Between
 from jaxprt.relit.channels import Appearance, Shading, exponent_range, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
@@ -133,10 +134,13 @@ class Stages:
 
         return self._once("facing", look.eye, seen)
 
-    def picture(self, look: Look, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
-        """The picture at pixels."""
-        environment = self.environment(look)
-        found = self.system(look).picture(environment, camera(look, width, height), materials=self.materials(look))
+    def picture(
+        self, look: Look, width: int, height: int, *, samples: int = 4, between: Between = None
+    ) -> Float[np.ndarray, "h w 3"]:
+        """The picture at pixels. Options are those of `RelitScene.picture`."""
+        given = self.environment(look), camera(look, width, height)
+        options = {"samples": samples, "between": between}
+        found = self.system(look).picture(*given, materials=self.materials(look), **options)
         return np.broadcast_to(np.asarray(found), (height, width, 3))
 
     def changed_scene(self, look: Look) -> Scene:

@@ -27,6 +27,9 @@ const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb), alpha); }`;
 
+const FADE = 200; // milliseconds in which a picture at rest appears
+const SLOW = 500; // milliseconds of a whole picture from which on a coarse one comes first
+
 const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -138,7 +141,8 @@ class Drawing {
     this.empty = gl.createVertexArray();
     this.array = gl.createVertexArray();
     [this.position, this.color, this.index] = [0, 1, 2].map(() => gl.createBuffer());
-    this.skyImage = this.stillImage = null;
+    this.skyImage = null;
+    this.stills = []; // pictures at rest: the last one appears over the one before
   }
   setMesh(position, face) {
     const gl = this.gl;
@@ -180,12 +184,11 @@ class Drawing {
     this.skyImage = this.texture(data, width, height, false, true);
     this.skyScale = scale;
   }
-  setStill(data, width, height, encoded, scale) {
-    if (this.stillImage) this.gl.deleteTexture(this.stillImage);
-    this.stillImage = data && this.texture(data, width, height, encoded, false);
-    this.stillEncoded = encoded;
-    this.stillScale = scale;
+  addStill(data, width, height, encoded, scale) {
+    this.dropStills(1);
+    this.stills.push({ image: this.texture(data, width, height, encoded, false), encoded, scale, since: performance.now() });
   }
+  dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
   quad(program, image, gain, encoded) {
     const gl = this.gl;
     gl.useProgram(program.made);
@@ -194,7 +197,7 @@ class Drawing {
     gl.uniform1f(program.at("gain"), gain);
     gl.uniform1i(program.at("encoded"), encoded ? 1 : 0);
   }
-  draw(camera, state, center, alpha) {
+  draw(camera, state, center, now) { // true while a picture at rest appears
     const gl = this.gl, { width, height } = this.canvas, gain = 2 ** state.stops;
     gl.viewport(0, 0, width, height);
     gl.clearColor(0.1, 0.1, 0.1, 1);
@@ -225,14 +228,17 @@ class Drawing {
       gl.disable(gl.CULL_FACE);
       gl.disable(gl.DEPTH_TEST);
     }
-    if (this.stillImage && alpha > 0) {
-      gl.enable(gl.BLEND);
-      gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-      this.quad(this.still, this.stillImage, gain * this.stillScale, this.stillEncoded);
+    let alpha = 1;
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    for (const each of this.stills) {
+      alpha = clamp((now - each.since) / FADE, 0, 1);
+      this.quad(this.still, each.image, gain * each.scale, each.encoded);
       gl.uniform1f(this.still.at("alpha"), alpha);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
-      gl.disable(gl.BLEND);
     }
+    gl.disable(gl.BLEND);
+    return alpha < 1;
   }
   close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
 }
@@ -264,10 +270,14 @@ export function mount(root, ask) {
   const line = element("div", frame, { className: "line" }), told = element("div", frame, { className: "told" });
   const help = element("pre", frame, { className: "help", textContent: HELP, hidden: true });
   const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, background: true, bounces: false, still: true, exact: false, materials: {} };
-  const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, draws: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
-  let scene = null, camera = null, first = null, drawing = null, closed = false, far = false;
-  let bytes = null, partial = false; // colors as bytes for a far kernel: what the eye can see comes first
-  let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillAt = 0, stillBusy = false, skyKey = "", framed = 0;
+  const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
+  let scene = null, camera = null, first = null, drawing = null, closed = false;
+  // Whether round trips are long: the kernel is far away, or the browser draws slowly. Then colors come as bytes, and
+  // those that the eye can see first.
+  let long = false, bytes = null, partial = false;
+  let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = "", framed = 0;
+  let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
+  const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
 
   const tell = (text) => { told.textContent = text; told.hidden = !text; };
   const resize = () => {
@@ -282,22 +292,21 @@ export function mount(root, ask) {
   const draw = (now) => {
     wanted = 0;
     if (!camera || closed || drawing.gl.isContextLost()) return;
-    const alpha = stillAt ? Math.min((now - stillAt) / 200, 1) : 0;
-    drawing.draw(camera, state, scene.center, alpha);
+    const appears = drawing.draw(camera, state, scene.center, now);
     stats.draws++;
-    if (stillAt && alpha < 1) redraw();
+    if (appears) redraw();
   };
   const message = (kind) => ({
-    kind, seq, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
+    kind, viewer, seq, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
     target: camera.target, field_of_view: camera.angle, bounces: state.bounces, materials: state.materials,
-    stops: far ? state.stops : null,
+    stops: long ? state.stops : null,
   });
   // Anything that changes the picture: the newest state is asked for as soon as the last answer has come.
   const moved = () => {
     if (!scene) return;
     seq++;
     stats.seq = seq;
-    stillAt = 0;
+    drawing.dropStills(0);
     clearTimeout(stillTimer);
     redraw();
     look();
@@ -306,7 +315,7 @@ export function mount(root, ask) {
     if (flying) { dirty = true; return; }
     if (closed) return;
     [flying, dirty] = [true, false];
-    const began = performance.now(), own = { ...message("look"), vertices: far && bytes ? vertices : "all" };
+    const began = performance.now(), own = { ...message("look"), vertices: long && bytes ? vertices : "all" };
     stats.sent++;
     try {
       const { content, buffers } = await ask(own);
@@ -325,7 +334,7 @@ export function mount(root, ask) {
         }
         stats.trip = performance.now() - began;
         const spent = content.ms.light + content.ms.view + content.ms.combine;
-        far = far ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
+        long = long ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
         stats.got++;
         stats.bytes += sent;
         stats.shown = content.seq;
@@ -364,23 +373,27 @@ export function mount(root, ask) {
       redraw();
     } catch { skyKey = ""; }
   };
-  // At rest: the picture at pixels, then the exact one; the next move makes them late.
+  // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first picture
+  // of a size does not count: its programs are compiled. Python gives up what it is at when the next look comes.
   const still = async () => {
     if (!state.still || !scene.rests.length || stillBusy || closed || flying) return;
     stillBusy = true;
-    const own = seq, size = { width: canvas.width, height: canvas.height };
+    const own = seq, size = { width: canvas.width, height: canvas.height }, name = `${size.width} ${size.height}`;
+    if (rest.size !== name) rest = { size: name, made: 0, ms: 0 };
+    const steps = rest.made > 1 && rest.ms > SLOW ? [["still", true], ["still", false]] : [["still", false]];
+    if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
-      for (const kind of state.exact ? ["still", "exact"] : ["still"]) {
+      for (const [kind, coarse] of steps) {
         if (kind === "exact") tell("the exact picture is on its way");
-        const { content, buffers } = await ask({ ...message(kind), ...size });
+        const asked = { ...message(kind), ...size, coarse }, { content, buffers } = await ask(asked);
         if (closed || own !== seq || content.kind === "late") break;
         if (content.kind === "error") { tell(content.message); break; }
-        const compressed = far, count = content.width * content.height;
+        const compressed = asked.stops !== null, count = content.width * content.height;
         const data = compressed ? await inflate(buffers[0], count) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
-        drawing.setStill(data, content.width, content.height, compressed, content.scale);
-        stillAt = performance.now();
-        stats.stills++;
-        if (kind === "exact") {
+        drawing.addStill(data, content.width, content.height, compressed, content.scale);
+        stats[coarse ? "coarse" : "stills"]++;
+        if (kind === "still" && !coarse) rest = { size: name, made: rest.made + 1, ms: content.ms };
+        if (kind === "exact" && !coarse) {
           const error = content.error === undefined ? "" : `: the picture is ${(100 * content.error).toFixed(1)} ± ${(100 * content.spread).toFixed(1)} % off`;
           tell(`exact, direct light alone${error}`);
         }
@@ -398,7 +411,7 @@ export function mount(root, ask) {
   const expose = (stops) => {
     state.stops = clamp(stops, -20, 20);
     controls?.show();
-    if (far) moved(); else redraw();
+    if (long) moved(); else redraw();
   };
   const drop = async (file) => {
     try {
@@ -688,6 +701,7 @@ function render({ model, el }) {
     const each = waiting.get(content.id);
     if (!each) return;
     waiting.delete(content.id);
+    el.classList.add("jaxprt-live"); // which hides the picture that a notebook without a kernel shows
     each.resolve({ content: content.content, buffers });
   };
   const restarted = () => new Error("the kernel was restarted; run the cell again");

@@ -1,6 +1,7 @@
 """The viewer in a notebook, by anywidget."""
 
 import base64
+import html
 import pathlib
 import tempfile
 from collections.abc import Sequence
@@ -9,16 +10,26 @@ from typing import Any
 
 import anywidget
 import traitlets
+from IPython.display import display
 
 from jaxprt import files
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
+# JupyterLab's outputs of one cell follow each other. The picture goes when the viewer has its first answer. Without a
+# kernel there is no viewer, and JupyterLab's words in its place, which are all that is in there, go.
+_STYLE = """<style>
+.jp-OutputArea-child:has(.jaxprt-picture):has(+ .jp-OutputArea-child .jaxprt-live),
+.jp-OutputArea-child:has(.jaxprt-picture) + .jp-OutputArea-child .jp-OutputArea-output.jupyter-widgets:not(:has(*))
+{ display: none }
+</style>"""
+
 
 class Viewer(anywidget.AnyWidget):
     """A viewer in a cell.
 
-    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel.
+    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel. Of
+    pictures at rest there is one at a time.
 
     Attributes:
         session: What it shows.
@@ -32,33 +43,38 @@ class Viewer(anywidget.AnyWidget):
         """Shows a session."""
         super().__init__(height=height)
         self.session = session
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="jaxprt-view")
+        self._looks, self._rests = (ThreadPoolExecutor(1, thread_name_prefix="jaxprt-view") for _ in range(2))
         self.on_msg(self._heard)
 
     def close(self) -> None:
         """Takes the viewer out of the notebook."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for each in (self._looks, self._rests):
+            each.shutdown(wait=False, cancel_futures=True)
         super().close()
 
     def __repr__(self) -> str:
         """The names of what it shows, the same in every run."""
         return f"Viewer of {', '.join(part.name for part in self.session.stages.scene.scene.parts)}"
 
-    def _repr_mimebundle_(self, **options: Any) -> tuple[dict, dict] | None:
-        """The widget, and a picture for where there is no kernel: a saved notebook, or its page on the web."""
-        found = super()._repr_mimebundle_(**options)
-        if found is None:
-            return None
-        data, more = found
+    def _ipython_display_(self, **options: Any) -> None:
+        """Shows a picture, and the widget that takes its place: a saved notebook has the picture without a kernel."""
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder) / "picture.png"
             files.write_png(path, self.session.picture())
             picture = base64.b64encode(path.read_bytes()).decode()
-        return {**data, "image/png": picture}, more
+        words = repr(self)
+        page = f'<img class="jaxprt-picture" alt="{html.escape(words)}" src="data:image/png;base64,{picture}">{_STYLE}'
+        display({"text/html": page, "image/png": picture, "text/plain": words}, raw=True)
+        found = super()._repr_mimebundle_(**options)
+        if found is not None:
+            data, more = found
+            data.pop("text/plain")  # which pages would show under the picture
+            display(data, metadata=more, raw=True)
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
-            self._threads.submit(self._answer, message, [bytes(each) for each in buffers])
+            threads = self._rests if message["content"].get("kind") in ("still", "exact") else self._looks
+            threads.submit(self._answer, message, [bytes(each) for each in buffers])
 
     def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:
         content, arrays = self.session.answer(message["content"], buffers)

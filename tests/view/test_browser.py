@@ -4,6 +4,7 @@ Headless Chromium, found as `chromium`; skipped where there is none, unless JAXP
 """
 
 import io
+import threading
 import time
 
 import numpy as np
@@ -271,11 +272,78 @@ def test_many_fast_drags_leave_no_queue_and_end_at_the_newest_state(hand):
     assert hand.stats()["sent"] == after["sent"]
 
 
+@pytest.fixture
+def pictures(session, monkeypatch):
+    """Pictures at rest that take 600 ms more, and counts of them."""
+    picture, lock = session.stages.picture, threading.Lock()
+    counts = {"under way": 0, "most": 0, "given up": 0, "asked": []}
+
+    def count(change):
+        with lock:
+            counts["under way"] += change
+            counts["most"] = max(counts["most"], counts["under way"])
+
+    def slow(look, width, height, *, samples, between):
+        counts["asked"].append((width, height, samples))
+        count(1)
+        try:
+            last = time.monotonic() + 0.6
+            while time.monotonic() < last:
+                between()
+                time.sleep(0.01)
+            return picture(look, width, height, samples=samples, between=between)
+        except Exception:
+            counts["given up"] += 1
+            raise
+        finally:
+            count(-1)
+
+    monkeypatch.setattr(session.stages, "picture", slow)
+    return counts
+
+
+def test_fast_moves_leave_at_most_one_picture_under_way_and_the_last_one_arrives(hand, pictures):
+    hand.page.mouse.move(50, 50)
+    hand.page.mouse.down()
+    for k in range(200):
+        hand.page.mouse.move(50 + k % 60, 50 + k % 45)
+        if k % 50 == 49:
+            asked = len(pictures["asked"])
+            while len(pictures["asked"]) == asked:  # a picture begins as soon as the hand rests
+                time.sleep(0.01)
+            assert pictures["under way"] == 1
+    hand.page.mouse.move(60, 60)
+    hand.page.mouse.up()
+    moved = hand.stats()["stills"]
+    hand.wait(f"stills > {moved}")
+    assert pictures["most"] == 1
+    assert pictures["given up"] >= 4
+    assert pictures["under way"] == 0
+
+
+def test_a_coarse_picture_comes_first_where_whole_ones_take_long(hand, pictures, systems, lights):
+    hand.page.locator("canvas.canvas").focus()
+    pictures["asked"].clear()
+    for _ in range(3):
+        hand.page.keyboard.press("]")
+        hand.still()
+    whole = (*hand.pixels().shape[1::-1], 4)
+    coarse = (whole[0] // 2, whole[1] // 2, 1)
+    assert pictures["asked"][-2:] == [coarse, whole]
+    assert pictures["asked"].count(coarse) == hand.stats()["coarse"]
+    np.testing.assert_allclose(hand.pixels(), drawn(hand, systems, lights), atol=2.5 / 255)
+
+
 def test_two_viewers_at_once_and_a_tab_opened_again(browser, server, hand):
     other = Hand(browser, server.url)
-    other.drag((50, 50), (90, 50))
+    other.drag((50, 50), (90, 50), steps=15)
     hand.drag((50, 50), (50, 90))
     assert hand.camera()["azimuth"] != other.camera()["azimuth"]
+    for each in (other, hand):  # each counts its own looks: one that moves less gets its pictures, too
+        before = each.stats()["stills"]
+        each.page.keyboard.press("]")
+        each.settle()
+        each.wait(f"stills > {before}")
     other.page.close()
     again = Hand(browser, server.url)
     assert (

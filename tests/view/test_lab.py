@@ -78,9 +78,9 @@ def _url(server, folder, log):
     raise AssertionError(f"JupyterLab did not start: {log.read_text()}")
 
 
-def ask(url, path, *, method="GET"):
+def ask(url, path):
     """What JupyterLab's interface answers."""
-    request = urllib.request.Request(url + path, method=method, headers={"Authorization": f"token {TOKEN}"})
+    request = urllib.request.Request(url + path, headers={"Authorization": f"token {TOKEN}"})
     with urllib.request.urlopen(request, timeout=30) as response:
         return json.loads(response.read() or "null")
 
@@ -120,8 +120,29 @@ def drag(page):
     page.mouse.up()
 
 
-def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told(page, lab):
+def reopened(page, lab, browser, path):
+    """The notebook, saved, closed and opened again by another browser; its kernel, restarted, knows no widget."""
+
+    def saved():
+        try:
+            return json.loads(path.read_text())["cells"][0]["outputs"]
+        except ValueError:  # half written
+            return False
+
+    page.keyboard.press("Control+s")
+    until(saved)
+    page.close()
+    page = browser.new_context(viewport={"width": 1100, "height": 800}).new_page()
+    page.set_default_timeout(1000 * PATIENCE)
+    page.goto(f"{lab}doc/tree/play.ipynb?token={TOKEN}")
+    return page
+
+
+def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told_and_a_saved_notebook_shows_its_picture(
+    page, lab, browser, tmp_path
+):
     until(lambda: stats(page)["shown"] == stats(page)["seq"] > 0)
+    assert not page.locator("img.jaxprt-picture").is_visible()  # the viewer has taken its place
     before = stats(page)
     drag(page)
     until(lambda: stats(page)["shown"] == stats(page)["seq"] > before["seq"])
@@ -140,3 +161,12 @@ def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told(page, l
     drag(page)  # the page goes on
     assert stats(page)["seq"] > after["seq"]
     assert stats(page)["got"] == after["got"]
+
+    page = reopened(page, lab, browser, tmp_path / "files" / "play.ipynb")
+    words = page.get_by_text("Error displaying widget")
+    words.wait_for(state="attached")
+    assert not words.is_visible()
+    picture = page.locator("img.jaxprt-picture")
+    assert picture.is_visible()
+    assert picture.evaluate("image => [image.naturalWidth, image.naturalHeight]") == [480, 360]
+    page.context.close()

@@ -11,10 +11,13 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import files, image
+from jaxprt.relit import pictures
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap
+from jaxprt.systems import reference
 from jaxprt.view import Session, messages, stages
+from jaxprt.visibility import blocks
 
 EYE = jnp.array([2.0, 1.5, 4.0])
 
@@ -124,6 +127,62 @@ def test_pictures_are_given_up_when_a_later_look_has_come(session, look):
     for kind in ("still", "exact"):
         reply = session.answer(look | {"kind": kind, "seq": 4, "width": 16, "height": 16})
         assert reply.content == {"kind": "late", "seq": 4}
+
+
+def counted(monkeypatch, module, name, then=lambda count: None):
+    """Counts the calls of a function; `then` is called with their number after each."""
+    function, calls = getattr(module, name), []
+
+    def counting(*argument, **named):
+        result = function(*argument, **named)
+        calls.append(name)
+        then(len(calls))
+        return result
+
+    monkeypatch.setattr(module, name, counting)
+    return calls
+
+
+def test_a_picture_under_way_is_given_up_within_a_row_of_the_next_look(session, look, monkeypatch):
+    monkeypatch.setattr(pictures, "CHUNK", 128)
+    asked = look | {"kind": "still", "viewer": "a", "width": 48, "height": 32}
+    moved = {3: {"viewer": "b", "seq": 9}}  # after how many rows which viewer moves
+
+    def move(count):
+        if count in moved:
+            assert session.answer(look | moved[count]).content["kind"] == "color"
+
+    rows = counted(monkeypatch, pictures, "_shaded", move)
+    whole = session.answer(asked)
+    assert whole.content["kind"] == "still"  # another viewer's moves leave it alone
+    count = len(rows)
+    assert count > 4
+    moved[count + 2] = {"viewer": "a", "seq": 2}
+    assert session.answer(asked).content == {"kind": "late", "seq": 1}
+    assert len(rows) == count + 2
+    again = session.answer(asked | {"seq": 2})
+    assert again.buffers == whole.buffers
+
+
+def test_the_exact_picture_is_given_up_within_a_block_of_the_next_look(session, look, monkeypatch):
+    asked = look | {"kind": "exact", "width": 24, "height": 24}
+    sums = counted(monkeypatch, reference, "integrate", lambda count: count == 2 and session.answer(look | {"seq": 2}))
+    assert session.answer(asked).content == {"kind": "late", "seq": 1}
+    assert 2 <= len(sums) <= 2 + blocks.cores()
+    given_up = len(sums)
+    assert session.answer(asked | {"seq": 2}).content["exact"]
+    assert len(sums) > given_up + 2 * (2 + blocks.cores())
+
+
+def test_coarse_pictures_are_smaller_and_like_the_others(session, look):
+    size = {"width": 48, "height": 32}
+    whole, coarse = (session.answer(look | size | {"kind": "still", "coarse": each}) for each in (False, True))
+    assert [coarse.content[name] for name in size] == [24, 16]
+    mean = halves(whole).reshape(16, 2, 24, 2, 3).mean((1, 3)).reshape(-1, 3)
+    assert image.relative_l2(halves(coarse), mean) < 0.3  # edges have steps
+    exact = session.answer(look | {"kind": "exact", "coarse": True, "width": 96, "height": 96})
+    assert [exact.content[name] for name in size] == [24, 24]
+    assert "error" not in exact.content
 
 
 def test_bytes_are_exposed_and_encoded_for_a_display(session, look):

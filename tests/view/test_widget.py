@@ -50,13 +50,18 @@ def test_what_is_no_question_is_not_answered(viewer, heard, look):
     assert [content["id"] for content, _ in sent] == ["last"]
 
 
-def test_a_saved_notebook_has_a_picture(viewer):
-    data, _ = viewer._repr_mimebundle_()
-    assert "application/vnd.jupyter.widget-view+json" in data
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data["image/png"]))))
-    assert picture.shape == (360, 480, 3)
-    assert np.ptp(picture) > 100
-    ball = picture[180, 240].astype(int)
+def test_a_saved_notebook_has_a_picture_and_a_widget_after_it(viewer, monkeypatch):
+    shown = []
+    monkeypatch.setattr("jaxprt.view.widget.display", lambda data, **options: shown.append(data))
+    viewer._ipython_display_()
+    picture, widget = shown
+    assert list(widget) == ["application/vnd.jupyter.widget-view+json"]
+    assert picture["text/plain"] == "Viewer of ball, ground"
+    assert picture["image/png"] in picture["text/html"]
+    color = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture["image/png"]))))
+    assert color.shape == (360, 480, 3)
+    assert np.ptp(color) > 100
+    ball = color[180, 240].astype(int)
     assert ball[0] > ball[2]  # which is red
 
 

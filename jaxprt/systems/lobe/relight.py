@@ -347,11 +347,13 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
     return result
 
 
+@lru_cache(maxsize=8)
 def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
     """For each texel those that lie to the six faces as it lies to the first."""
     place = np.asarray(cubemap.point(size=2), np.float64)
     axes = np.stack([place[:, 0, 1] - place[:, 0, 0], place[:, 1, 0] - place[:, 0, 0], place.mean((1, 2))], 1)
-    moved = np.einsum("ti,ji,fjk->tfk", np.asarray(cubemap.direction(size=size)).reshape(-1, 3), axes[0], axes)
+    turn = np.einsum("ji,fjk->fik", axes[0], axes)
+    moved = np.swapaxes(np.asarray(cubemap.direction(size=size)).reshape(-1, 3) @ turn, 0, 1)
     face, s, t = cubemap.project(*np.moveaxis(moved, -1, 0))
     column, row = (np.clip((np.asarray(x) + 1) / 2 * size, 0, size - 1).astype(np.int32) for x in (s, t))
     return np.asarray(face, np.int32) * size * size + row * size + column
