@@ -175,18 +175,17 @@ class Session:
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """The exact picture in direct light; and the error of the picture at rest, by some exact pixels of its size."""
+        """The exact picture in direct light of the environment; and the error of the picture at rest, by some exact pixels of its size."""
         look, seq = self._parse(message)
         width, height, coarse = _size(message)
         between = self._between(message, seq)
         between()
-        look = look._replace(bounces=False)
         scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
         given = scene, [of_part(part) for part in scene.parts], [self.stages.environment(look)], camera
         told = {}
         if not coarse:
             pixels = exact.exact_pixels(*given, pixels=_PIXELS, between=between)
-            error, spread = pixels.relative_l2(self.stages.picture(look, width, height, between=between))
+            error, spread = pixels.relative_l2(self.stages.direct_picture(look, width, height, between=between))
             told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
         truth = exact.exact_picture(*given, between=between)
         data, scale = messages.encode(truth.color[0], stops=_stops(message))

@@ -40,7 +40,10 @@ class Stages:
         """Keeps what there is; a light more may come."""
         self.systems = dict(systems)
         self.name, self.lights = list(environments), list(environments.values())
-        self._bare = {name: RelitScene(each.scene, each.direct, each.shading) for name, each in systems.items()}
+        # Without bounces; and without lamps too, as exact pictures are.
+        given = {name: (each.scene, each.direct, each.shading) for name, each in systems.items()}
+        self._bare = {name: RelitScene(*each, lamps=systems[name].lamps) for name, each in given.items()}
+        self._direct = {name: RelitScene(*each) for name, each in given.items()}
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
         self._lock = threading.Lock()
 
@@ -96,7 +99,7 @@ class Stages:
         system = self.system(look)
         light_key = look.system, look.bounces, look.light, look.lamps, look.turn
         light = self._once("light", light_key, lambda: system.light(self.environment(look)))
-        if not look.bounces:
+        if not look.bounces and system.lamps is None:
             return light
         key = (*light_key, look.material)
         return self._once("shade", key, lambda: system.shade(light, self.appearances(look)))
@@ -141,6 +144,12 @@ class Stages:
         given = self.environment(look), camera(look, width, height)
         options = {"samples": samples, "between": between}
         found = self.system(look).picture(*given, materials=self.materials(look), **options)
+        return np.broadcast_to(np.asarray(found), (height, width, 3))
+
+    def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
+        """The picture in direct light of the environment alone."""
+        given = self.environment(look), camera(look, width, height)
+        found = self._direct[look.system].picture(*given, materials=self.materials(look), between=between)
         return np.broadcast_to(np.asarray(found), (height, width, 3))
 
     def changed_scene(self, look: Look) -> Scene:

@@ -395,7 +395,7 @@ export function mount(root, ask) {
         if (kind === "still" && !coarse) rest = { size: name, made: rest.made + 1, ms: content.ms };
         if (kind === "exact" && !coarse) {
           const error = content.error === undefined ? "" : `: the picture is ${(100 * content.error).toFixed(1)} ± ${(100 * content.spread).toFixed(1)} % off`;
-          tell(`exact, direct light alone${error}`);
+          tell(`exact, direct light of the environment alone${error}`);
         }
         redraw();
       }
