@@ -11,7 +11,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import files, image
-from jaxprt.relit import pictures
+from jaxprt.relit import canvas, pictures
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap
@@ -144,7 +144,7 @@ def counted(monkeypatch, module, name, then=lambda count: None):
 
 
 def test_a_picture_under_way_is_given_up_within_a_row_of_the_next_look(session, look, monkeypatch):
-    monkeypatch.setattr(pictures, "CHUNK", 128)
+    monkeypatch.setattr(canvas, "CHUNK", 128)
     asked = look | {"kind": "still", "viewer": "a", "width": 48, "height": 32}
     moved = {3: {"viewer": "b", "seq": 9}}  # after how many rows which viewer moves
 
