@@ -4,6 +4,7 @@ Weights are not negative and sum to one. `jaxprt.brdf.navigation` makes sets of 
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -48,6 +49,11 @@ class Line(eqx.Module):
         low, upper = _neighbors(knot, self.chart(_checked(coordinate, ())), len(knot))
         return jnp.zeros(len(knot), upper.dtype).at[low].set(1 - upper).at[low + 1].set(upper)
 
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        return np.stack([np.arange(len(self.knot) - 1), np.arange(1, len(self.knot))], -1)
+
     def inside(self, coordinate: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the coordinate is between the ends, or at one."""
         return (self.knot[0] <= coordinate) & (coordinate <= self.knot[-1])
@@ -82,6 +88,11 @@ class Plane(eqx.Module):
             ValueError: There are not two coordinates.
         """
         return _weight(self, _checked(coordinate, (2,)))
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        return _pairs(np.asarray(self.triangle))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is inside the boundary or on it, up to rounding."""
@@ -119,6 +130,19 @@ class Columns(eqx.Module):
             ValueError: There are not two coordinates.
         """
         return _column_weight(self, _checked(coordinate, (2,)))
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        height = np.asarray(self.chart(self.point), np.float64)[:, 1]
+        column = [each[:count] for each, count in zip(np.asarray(self.order), np.asarray(self.count), strict=True)]
+        found = []
+        for sides in itertools.pairwise(column):
+            knot = np.unique(height[np.concatenate(sides)])
+            middle = (knot[1:] + knot[:-1]) / 2
+            low = [np.clip(np.searchsorted(height[each], middle) - 1, 0, len(each) - 2) for each in sides]
+            found.append(np.stack([each[n + up] for each, n in zip(sides, low, strict=True) for up in (0, 1)], -1))
+        return _pairs(np.concatenate(found))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is between the ends of both coordinates, or at one."""
@@ -206,6 +230,13 @@ def columns(
     order = np.stack([np.pad(each, (0, most - len(each)), mode="edge") for each in found])
     order, count = (jax.device_put(np.asarray(each, np.int32)) for each in (order, [len(each) for each in found]))
     return Columns(jax.device_put(point), order, count, chart)
+
+
+def _pairs(group: Int[np.ndarray, "g n"]) -> Int[np.ndarray, "p 2"]:
+    """All pairs within groups of numbers, each once."""
+    first, second = np.triu_indices(group.shape[1], 1)
+    each = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
+    return np.unique(each, axis=0)
 
 
 def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:
