@@ -195,7 +195,7 @@ def in_columns(point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array
     if point.ndim != 2 or point.shape[1] != 2 or len(point) < 4 or not np.isfinite(point).all():
         return False
     scaled = np.asarray(_scaled(chart, point, point), np.float64)
-    rounding = _ROUNDING * np.finfo(point.dtype).eps
+    rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
     found = _split(scaled, rounding)
     ends = [(min(scaled[each, 1]), max(scaled[each, 1])) for each in found]
     return len(found) > 1 and all(low <= rounding and high >= 1 - rounding for low, high in ends)
@@ -260,7 +260,7 @@ def _apart(
         raise ValueError(f"points must be finite, got {broken.size} that are not, {first}")
     # As the plane itself computes them, in its precision.
     scaled = np.asarray(_scaled(chart, point, point), np.float64)
-    rounding = _ROUNDING * np.finfo(point.dtype).eps
+    rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
     distance, pair = scipy.spatial.KDTree(scaled).query(scaled, k=2)
     i, j = sorted(np.asarray(pair)[np.argmin(distance[:, 1])])
     if distance[:, 1].min() <= rounding:

@@ -215,7 +215,10 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
 
 @jit
 def weights(
-    factor: Float[Array, "m f h"], weight: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
+    factor: Float[Array, "m *n f h"],
+    weight: Float[Array, " m"],
+    diffuse: Float[Array, " c"],
+    specular: Float[Array, " d"],
 ) -> Float[Array, "p e"]:
     """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
 
