@@ -107,6 +107,7 @@ class DynamicBrdf(eqx.Module):
         return Mixed(terms, lobe, jax.tree.map(lambda x: between(x, weight), self.brdf))
 
 
+@jit
 def combined(factor: Float[Array, "m *_ c h"], weight: Float[Array, " m"]) -> Float[Array, "c h"]:
     """Factors of a BRDF between those of a set.
 
@@ -123,6 +124,7 @@ def combined(factor: Float[Array, "m *_ c h"], weight: Float[Array, " m"]) -> Fl
     return jnp.einsum("m,n,mnch->ch", weight, weight, factor) / jnp.where(whole == 0, 1, whole)
 
 
+@jit
 def between(parameter: Float[Array, "m *c"], weight: Float[Array, " m"]) -> Float[Array, "*c"]:
     """A parameter of a model between those of a set.
 
