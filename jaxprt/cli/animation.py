@@ -22,7 +22,7 @@ from jaxprt.systems.bounces import BouncesSystem
 from jaxprt.systems.dynamic import DynamicSystem, Material
 
 LOBES = 4
-# Of the set, beside those of the scene. With steps of a factor 2 lobes are twice as far off between as at these.
+# Of the set, beside those of the scene. Lobes between these are at most twice as far off as at them.
 ROUGHNESS = (0.05, 0.075, 0.11, 0.16, 0.23, 0.34, 0.5)
 _MIDDLE = 0.25  # Smoother materials get rougher in an animation, rougher ones smoother.
 _ORBIT = np.radians(40)  # what the camera goes around in an animation
@@ -65,7 +65,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int) -> Ready:
         raise ValueError("the dynamic system needs a part that can change: give --brdf cook-torrance or --material")
     start = timeit.default_timer()
     rough = sorted({*ROUGHNESS, *(float(each.roughness) for each in changing)})
-    # The model is linear in F0 and columns interpolate along it alone: between two values the error is that at these.
+    # The model is linear in F0, and columns interpolate along F0 alone, so that two values of it are enough.
     family = navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), rough))))
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=LOBES))
     fixed = {
