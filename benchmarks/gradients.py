@@ -186,7 +186,7 @@ def transfer(vertices: int) -> Case:
     """The same with one bounce and two."""
     family, members = changing()
     transport = _region(vertices)
-    tensor = _bounces(vertices, bounces.factor(family.brdf).factor)
+    tensor = _bounces(vertices, bounces.factor(family.brdf, navigation=family.navigation).factor)
 
     def radiance(light, material, eye):
         made = [mixed(family, material)]
@@ -265,7 +265,7 @@ def _region(vertices: int) -> DynamicTransport:
 
 
 def _bounces(vertices: int, factor: jax.Array) -> TransferTensor:
-    clusters, functions, random = vertices // MEMBERS, factor.shape[2] + 1, np.random.default_rng(2)
+    clusters, functions, random = vertices // MEMBERS, factor.shape[-1] + 1, np.random.default_rng(2)
     weight, mode, again = (
         random.standard_normal(shape, dtype=np.float32)
         for shape in ((clusters, MEMBERS, 32), (clusters, 384, 64), (clusters, MEMBERS, 16))

@@ -92,7 +92,7 @@ def measure(quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | No
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
     start = time.perf_counter()
     sizes: dict = {"functions": 2, "terms": 4, "resolution": 8} if quick else {}
-    along = bounces.factor(family.brdf, **sizes)
+    along = bounces.factor(family.brdf, navigation=family.navigation, **sizes)
     functions, terms = along.factor.shape[-1], len(along.light_map)
     yield {
         **{"benchmark": "interreflection", "case": f"basis: Cook-Torrance, {functions} functions of {terms} terms"},

@@ -141,7 +141,13 @@ HOST = {
     "visibility.hits": "traces rays",
     "systems.bounces.tensor.precompute": "traces rays",
     "systems.bounces.jobs": "traces rays, and gives half precision and vectors of either sign",
-    "brdf.navigation.triangulate": "by SciPy, where data enters",
+    "brdf.places.identity": "gives its argument; tested through the places",
+    "brdf.places.triangulate": "by SciPy, where data enters",
+    "brdf.places.in_columns": "compares values",
+    "brdf.places.columns": "sorts on the host, where data enters",
+    "systems.bounces.between.pairs": "NumPy on the host",
+    "systems.bounces.between.middles": "looks at types",
+    "systems.bounces.between.quadratic": "takes indices; tested through bounces.factor",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
     "systems.dynamic.published.factor_tensor": "checks values",
@@ -626,6 +632,11 @@ EXAMPLES = {
     "systems.bounces.functions.weights": example(
         lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
     ),
+    "systems.bounces.between.Moved": example(
+        lambda draw: call(bounces.between.Moved(draw.lobes()), draw.upper(5), draw.upper(5)),
+    ),
+    "systems.dynamic.brdf_set.combined": example(lambda draw: call(draw.normal(3, 3, 1, 2), draw.uniform(3))),
+    "systems.dynamic.brdf_set.between": example(lambda draw: call(draw.uniform(3), draw.uniform(3))),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
     "systems.lobe.remainder.Remainder": example(
         lambda draw: call(

@@ -22,7 +22,9 @@ from jaxprt.systems.bounces import BouncesSystem
 from jaxprt.systems.dynamic import DynamicSystem, Material
 
 LOBES = 4
-ROUGHNESS = (0.05, 0.12, 0.25, 0.5)  # of the set, beside those of the scene
+# Of the set, beside those of the scene. Lobes between these are at most twice as far off as at them.
+ROUGHNESS = (0.05, 0.075, 0.11, 0.16, 0.23, 0.34, 0.5)
+_MIDDLE = 0.25  # Smoother materials get rougher in an animation, rougher ones smoother.
 _ORBIT = np.radians(40)  # what the camera goes around in an animation
 
 
@@ -63,7 +65,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int) -> Ready:
         raise ValueError("the dynamic system needs a part that can change: give --brdf cook-torrance or --material")
     start = timeit.default_timer()
     rough = sorted({*ROUGHNESS, *(float(each.roughness) for each in changing)})
-    # The model is linear in F0, so that two values of it are enough.
+    # The model is linear in F0, and columns interpolate along F0 alone, so that two values of it are enough.
     family = navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), rough))))
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=LOBES))
     fixed = {
@@ -80,7 +82,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int) -> Ready:
     reflected = None
     if reflections:
         start = timeit.default_timer()
-        bases = bounces.factor(family.brdf)
+        bases = bounces.factor(family.brdf, navigation=family.navigation)
         paths = [fixed.get(number, bases) for number in range(len(materials))]
         tensor = bounces.precompute(mesh, paths, bounces=reflections, path=store / f"bounces_{reflections}")
         cost |= {"bounces_seconds": timeit.default_timer() - start, "bounces_bytes": tensor.nbytes}
@@ -99,7 +101,7 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
             continue
         away = np.sin(np.pi * turn) ** 2
         m, f0 = float(model.roughness), jnp.mean(model.f0)
-        rough = m ** (1 - away) * ROUGHNESS[-1 if m < ROUGHNESS[2] else 0] ** away
+        rough = m ** (1 - away) * ROUGHNESS[-1 if m < _MIDDLE else 0] ** away
         weight = ready.family.navigation.weight(jnp.stack([f0, jnp.asarray(rough, f0.dtype)]))
         hue = 1 + away * np.cos(2 * np.pi * (number / 3 + np.arange(3) / 3))
         tint = jnp.asarray(hue / hue.max(), f0.dtype)

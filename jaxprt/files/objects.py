@@ -32,7 +32,9 @@ _FUNCTIONS = {
     "jaxprt.sphere.hemisphere:parabolic_coordinates",
     "jaxprt.sphere.hemisphere:polar_coordinates",
     "jaxprt.brdf.navigation:_identity",
+    "jaxprt.brdf.navigation:_log",
     "jaxprt.brdf.navigation:_log_roughness",
+    "jaxprt.brdf.places:identity",
 }
 
 

@@ -1,4 +1,5 @@
 import csv
+import itertools
 
 import equinox as eqx
 import jax
@@ -7,8 +8,10 @@ import numpy as np
 import pytest
 from scipy import interpolate, spatial
 
-from jaxprt.brdf import BlinnPhong, CookTorrance, load_npf, navigation
-from jaxprt.brdf.navigation import Line, Plane, blinn_phong, cook_torrance, triangulate
+from jaxprt.brdf import BlinnPhong, CookTorrance, load_npf, navigation, places
+from jaxprt.brdf.navigation import blinn_phong, cook_torrance
+from jaxprt.brdf.places import Columns, Line, Plane, columns, in_columns, triangulate
+from jaxprt.systems.dynamic import brdf_set
 
 STEP = 1e-6  # Of central differences in float64.
 GRADIENT = 1e-7  # What they leave.
@@ -117,7 +120,7 @@ def special(plane):
     spots = [point]
     for along in (0.5, np.random.default_rng(2).uniform(0, 1, (len(corner), 3, 1))):
         spot = corner + along * (other - corner)
-        if plane.chart is not navigation._identity:
+        if plane.chart is not places.identity:
             spot[..., 1] = (corner ** (1 - along) * other**along)[..., 1]
         spots.append(spot.reshape(-1, 2))
     return np.concatenate(spots)
@@ -382,6 +385,99 @@ def test_near_points_are_apart_in_double_precision(x64):
     assert len(triangulate(np.array([[0, 0], [1, 0], [0, 1], [1, 1e-9]])).point) == 4
 
 
+# Columns.
+
+
+def staggered():
+    """F0 and m: three columns, of which the middle one has knots of its own; in any order."""
+    knot, other = [0.02, 0.1, 0.3, 1.0], [0.02, 0.05, 0.2, 0.6, 1.0]
+    point = [(f0, m) for f0, column in ((0.0, knot), (0.3, other), (1.0, knot)) for m in column]
+    return np.random.default_rng(7).permutation(np.array(point))
+
+
+@jax.jit
+def _column_look(columns, spot):
+    def each(spot):
+        by_point = jax.jacrev(lambda point: eqx.tree_at(lambda c: c.point, columns, point).weight(spot))(columns.point)
+        return columns.weight(spot), columns.inside(spot), jax.jacfwd(columns.weight)(spot), by_point
+
+    return jax.vmap(each)(spot)
+
+
+def by_numpy(point, spot):
+    """Weights by columns: linear in log m along each, then in F0."""
+    value = np.zeros((len(spot), len(point)))
+    f0 = np.unique(point[:, 0])
+    part = np.stack([np.interp(spot[:, 0], f0, unit) for unit in np.eye(len(f0))], -1)
+    for number, each in enumerate(f0):
+        own = np.flatnonzero(point[:, 0] == each)
+        own = own[np.argsort(point[own, 1])]
+        for index, unit in zip(own, np.eye(len(own)), strict=True):
+            along = np.interp(np.log(spot[:, 1]), np.log(point[own, 1]), unit)
+            value[:, index] = part[:, number] * along
+    return value
+
+
+def test_columns_interpolate_along_each_and_then_between_two(x64, close):
+    """Everywhere, at points, on the borders of cells and outside; weights sum to one and derivatives are finite."""
+    point = staggered()
+    plane = columns(point, chart=LOG)
+    random = np.random.default_rng(1)
+    inner = np.stack([random.uniform(-0.2, 1.2, 200), np.exp(random.uniform(np.log(0.01), np.log(2), 200))], -1)
+    border = np.stack([random.permutation(point[:, 0]), random.permutation(point[:, 1])], -1)
+    spot = np.concatenate([inner, point, border, far() * [1, 0] + [0, 0.1]])
+    weight, within, ahead, by_point = _column_look(plane, spot)
+    close(weight, by_numpy(point, spot))
+    close(weight[200 : 200 + len(point)], np.eye(len(point)))
+    assert np.all(np.asarray(weight) >= 0)
+    assert np.max(np.sum(np.asarray(weight) > 0, -1)) == 4
+    close(np.sum(weight, -1), np.ones(len(spot)))
+    between = (spot[:, 0] >= 0) & (spot[:, 0] <= 1) & (spot[:, 1] >= 0.02) & (spot[:, 1] <= 1)
+    np.testing.assert_array_equal(within, between)
+    assert np.all(np.isfinite(ahead))
+    assert np.all(np.isfinite(by_point))
+    for axis, unit in enumerate(STEP * np.eye(2)):
+        up, down = (_column_look(plane, spot + step)[0][:200] for step in (unit, -unit))
+        close(ahead[:200, :, axis], (up - down) / (2 * STEP), tolerance=1e-6)
+    # At the border of cells the derivative is that of the side above, at the last column and row that of the inside.
+    above = 1e-7 * np.where(border >= 1, -1, 1)
+    rows = slice(200 + len(point), 200 + 2 * len(point))
+    close(
+        ahead[rows],
+        _column_look(plane, np.concatenate([spot[: -len(border)], border + above]))[2][-len(border) :],
+        tolerance=1e-4,
+    )
+    joined = {pair for each in np.asarray(weight) for pair in itertools.combinations(np.flatnonzero(each).tolist(), 2)}
+    assert joined == {tuple(each) for each in plane.pairs.tolist()}
+
+
+def test_a_place_in_a_row_between_two_columns_has_weight_from_its_two_ends_alone(close):
+    """Triangles gave most of (0.3, 0.354) to a roughness of 0.25."""
+    point = np.array([(f0, m) for f0 in (0.0, 1.0) for m in (0.05, 0.12, 0.25, 0.5)])
+    plane = cook_torrance(point=point).navigation
+    assert isinstance(plane, Columns)
+    close(plane.weight(jnp.array([0.3, 0.25])), np.array([0, 0, 0.7, 0, 0, 0, 0.3, 0]))
+    half = np.array([0, 0, 0.35, 0.35, 0, 0, 0.15, 0.15])
+    close(plane.weight(jnp.array([0.3, np.sqrt(0.25 * 0.5)])), half)
+    pairs = {(0, 1), (0, 4), (0, 5), (1, 2), (1, 4), (1, 5), (1, 6), (2, 3), (2, 5), (2, 6), (2, 7), (3, 6), (3, 7)}
+    assert {tuple(each) for each in plane.pairs.tolist()} == pairs | {(4, 5), (5, 6), (6, 7)}
+
+
+def test_scattered_points_keep_their_triangles(unchecked):
+    ragged = lattice()[:-1]
+    assert not in_columns(ragged, chart=LOG)
+    assert not in_columns(scattered())
+    assert isinstance(cook_torrance(point=ragged).navigation, Plane)
+    assert isinstance(cook_torrance(point=lattice()).navigation, Columns)
+    triangle = make("one triangle")
+    np.testing.assert_array_equal(triangle.pairs, [[0, 1], [0, 2], [1, 2]])
+    np.testing.assert_array_equal(Line(jnp.arange(3.0)).pairs, [[0, 1], [1, 2]])
+    with pytest.raises(ValueError, match=r"at least two columns.*, got 19 points with 4 first coordinates"):
+        columns(ragged)
+    with pytest.raises(ValueError, match="at least three pairs of coordinates"):
+        columns(np.zeros((2, 2)))
+
+
 # Families.
 
 
@@ -407,13 +503,26 @@ def test_blinn_phong_is_that_model_at_integers_and_the_mean_of_two_between(close
     model = jax.jit(lambda n: BlinnPhong(diffuse=0.0, specular=1.0, exponent=n)(wi, wo)[:, 0])
     for coordinate, expected in (
         (37.0, model(37.0)),
-        (37.5, (model(37.0) + model(38.0)) / 2),
+        (np.sqrt(37.0 * 38.0), (model(37.0) + model(38.0)) / 2),
         (0.2, model(1.0)),
         (1e6, model(200.0)),
     ):
-        close(line(family.navigation.knot, jnp.array([coordinate]))[0] @ value, expected)
+        close(family.navigation.weight(coordinate) @ value, expected)
     np.testing.assert_array_equal(family.diffuse, np.zeros((200, 3)))
     np.testing.assert_array_equal(family.specular, np.ones((200, 3)))
+
+
+def test_between_exponents_the_model_is_that_of_the_exponent_asked_for(close):
+    """The parameter that weights make is the one that they were made from: its mean is in the same coordinate."""
+    for exponents, asked in (((1.0, 8.0, 64.0), (1.5, 30.0, 64.0)), ((0.0, 8.0, 64.0), (0.5, 30.0))):
+        family = blinn_phong(exponents=exponents)
+        for each in asked:
+            close(brdf_set.between(jnp.array(exponents), family.navigation.weight(each)), np.float32(each))
+    family = cook_torrance()
+    for f0, m in ((0.2, 0.05), (0.7, 0.333)):
+        weight = family.navigation.weight(jnp.array([f0, m]))
+        found = [brdf_set.between(each, weight) for each in (jnp.asarray(family.navigation.point).T)]
+        close(jnp.stack(found), np.array([f0, m]))
 
 
 @pytest.mark.parametrize("exponents", [[], [5], [1, 1], [3, 2], [-1, 2], [1, np.nan], [1, np.inf], [[1, 2]]])
@@ -452,7 +561,7 @@ def test_the_grid_is_as_near_to_the_model_as_it_says(x64):
     random = np.random.default_rng(9)
     spot = np.stack([random.uniform(0, 1, 200), np.exp(random.uniform(np.log(0.02), 0, 200))], -1)
     (value, weight), (expected, _) = lobes(*point.T), lobes(*spot.T)
-    found, within, *_ = look(family.navigation, spot)
+    found, within, *_ = _column_look(family.navigation, spot)
     error = rms(found @ value, expected, weight)
     assert np.all(within)
     assert np.mean(error) < 0.02
@@ -465,10 +574,11 @@ def test_brdfs_between_differentiate_in_their_coordinate(x64, close):
     family = cook_torrance()
     value = np.asarray(values(family, jnp.array([0.3, 0.1, 0.9]), jnp.array([-0.25, 0.0, 0.95])))
     spot = np.array([[0.4, 0.1], [0.03, 0.5], [1.5, 0.3], [0.5, 0.01], [-0.2, 2.0]])
-    _, within, ahead, *_ = look(family.navigation, spot)
+    _, within, ahead, _ = _column_look(family.navigation, spot)
     assert list(within) == [True, True, False, False, False]
     step = STEP * np.eye(2)[:, None]
-    slope = np.stack([weights(family.navigation, spot + s) - weights(family.navigation, spot - s) for s in step], -1)
+    up, down = ([_column_look(family.navigation, spot + sign * s)[0] for s in step] for sign in (1, -1))
+    slope = np.stack(up, -1) - np.stack(down, -1)
     close(np.einsum("sma,m->sa", ahead, value), np.einsum("sma,m->sa", slope, value) / (2 * STEP), tolerance=1e-6)
 
 

@@ -17,54 +17,115 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.brdf.places import Columns, Line, Plane
 from jaxprt.compile import jit
 from jaxprt.decompose import tucker
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic
+from jaxprt.systems.bounces import between
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.dynamic.reflected import Reflected
+from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
 
 _RINGS, _SECTORS = 32, 64  # of a quadrature of what is bilinear on a map times a few harmonics
 _SMOOTH = 5  # degree of harmonics of what is sent; with 4 more is lost of light from the horizon, with 6 of all
 _FUNCTIONS = 4  # that stand for a set if it has as many BRDFs
+_TOGETHER = 64  # BRDFs and middles of pairs for which functions are chosen, and that are integrated at once
+_RANK = 1e-3  # of the largest singular value, below which float32 has no more
 _NOTHING = 1e-3  # of the largest singular value: a color that is a multiple of another
 
 
 def factor(
-    brdfs: Sequence[Callable], *, functions: int | None = None, terms: int = 32, resolution: int = 32
+    brdfs: Sequence[Callable],
+    *,
+    lobe: LobeBrdf | None = None,
+    navigation: Line | Plane | Columns | None = None,
+    functions: int | None = None,
+    terms: int = 32,
+    resolution: int = 32,
 ) -> DynamicBrdf:
     """A set of BRDFs for light paths, decomposed whole: principal components of the set, and factors of the light.
 
     Least squares of what the BRDFs reflect of light of natural spectrum into directions, smoothed over these to degree
-    5. Views are not compressed, since transport holds none of them.
+    5. Views are not compressed, since transport holds none of them. Between BRDFs of the set, the functions have the
+    weights that are the best for the BRDF that is really there, see `jaxprt.bounces.between`: a model whose parameters
+    are between, or moved lobes.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
-        functions: How many stand for the set. If None, four, or as many as the set has BRDFs times colors.
+        lobe: Their lobes, from `jaxprt.dynamic.separate`, by which BRDFs that are of no one model move. Without these,
+            such BRDFs are mixed linearly.
+        navigation: The way through the set, which tells what can be mixed with what. If None, all pairs count, or for
+            more than 64 BRDFs none: these are then mixed linearly.
+        functions: How many stand for the set. If None, four, or as many as there are BRDFs and middles of pairs, times
+            colors.
         terms: Light factors that they share. Precomputed bounces cost in proportion.
         resolution: Edge of the square maps in texels.
 
     Returns:
-        The set, without lobes. Its error is that of what is reflected, smoothed.
+        The set, without lobes. Its error is that of what its BRDFs reflect, smoothed.
 
     Raises:
-        ValueError: As of `jaxprt.dynamic.factor`.
+        ValueError: As of `jaxprt.dynamic.factor`, functions or terms out of range, or a navigation of another number of
+            BRDFs.
 
     Reference: Sun et al. 2007, section 3.1, in the norm of natural light in place of Frobenius'.
     """
-    colors = dynamic.brdf_set.check(brdfs, None, resolution=resolution)
-    found = dynamic.reflected.reflect(brdfs, None, resolution=resolution)
-    count, _, views, harmonic = found.tensor.shape
-    kinds = (_SMOOTH + 1) ** 2
-    functions = min(_FUNCTIONS, count * colors) if functions is None else functions
-    dynamic.brdf_set.check_ranks((functions, 1, terms), (count * colors, kinds, harmonic))
+    colors = dynamic.brdf_set.check(brdfs, lobe, resolution=resolution)
+    pair = between.pairs(len(brdfs), navigation)
+    middle, moved = between.middles(brdfs, lobe, pair)
+    pair = jnp.asarray(pair[: len(middle)], jnp.int32)
+    # Few BRDFs leave gaps, so that functions are chosen for the middles too; many are dense enough.
+    dense = len(brdfs) + len(middle) > _TOGETHER
+    found, rest = _members(brdfs, [] if dense else middle, moved, pair, resolution)
+    members = len(found.tensor) * colors
+    functions = min(_FUNCTIONS, members) if functions is None else functions
+    _check_count("functions", functions, members)
+    _check_count("terms", terms, found.tensor.shape[3])
     smooth = _smoothed(found)
-    least = tucker.oriented(tucker.truncated(smooth, ranks=(functions, min(kinds, views), terms)))
-    view, light, error = _maps(found, smooth, least)
+    kinds = min(smooth.shape[1], len(found.area))
+    least = tucker.oriented(tucker.truncated(smooth, ranks=(functions, kinds, terms)))
+    view, light = _maps(found, least)
+    rows = [_projected(smooth, least)]
+    for first in range(0, len(middle) if dense else 0, _TOGETHER):
+        part = slice(first, first + _TOGETHER)
+        each = _middles(dynamic.reflected.reflect(middle[part], None, resolution=resolution), rest, pair[part])
+        rows.append(_projected(_smoothed(each), least))
+    along = jnp.concatenate(rows)
+    count = len(brdfs) * colors
+    error = _missed(smooth[:count], along[:count], least)
     pairs = np.eye(functions * terms, dtype=error.dtype).reshape(functions, terms, -1).swapaxes(1, 2)
-    along = least.factor[0].reshape(count, colors, functions)
+    along = between.quadratic(along.reshape(-1, colors, functions), pair, count=len(brdfs))
     return DynamicBrdf(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
+
+
+def _check_count(name: str, value: int, most: int) -> None:
+    """Refuses what is no whole number from 1 to the tensor's size."""
+    if not isinstance(value, int | np.integer) or not 1 <= value <= most:
+        raise ValueError(f"{name} must be a whole number from 1 to {most} for these BRDFs, got {value}")
+
+
+def _members(
+    brdfs: Sequence[Callable], middle: Sequence[Callable], moved: Sequence[Callable], pair: Array, resolution: int
+) -> tuple[Reflected, Array | None]:
+    """What BRDFs and some in the middle of pairs reflect, and what lobes leave of the BRDFs where lobes move."""
+    if not moved:
+        return dynamic.reflected.reflect([*brdfs, *middle], None, resolution=resolution), None
+    found = dynamic.reflected.reflect(brdfs, None, resolution=resolution)
+    lobes = dynamic.reflected.reflect([*moved, *middle], None, resolution=resolution)
+    rest = found.tensor - lobes.tensor[: len(brdfs)]
+    if not middle:
+        return found, rest
+    each = _middles(lobes._replace(tensor=lobes.tensor[len(brdfs) :]), rest, pair)
+    return found._replace(tensor=jnp.concatenate([found.tensor, each.tensor])), rest
+
+
+def _middles(found: Reflected, rest: Array | None, pair: Array) -> Reflected:
+    """What BRDFs in the middle of pairs reflect: moved lobes, and the mean of what these leave."""
+    if rest is None:
+        return found
+    return found._replace(tensor=found.tensor + jnp.mean(rest[pair], 1))
 
 
 @jit
@@ -75,22 +136,36 @@ def _smoothed(found: Reflected) -> Float[Array, "m s b"]:
 
 
 @jit
-def _maps(found: Reflected, smooth: Array, least: tucker.Tucker) -> tuple[Array, Array, Array]:
-    """View maps of each function and term, light maps, and the error of a decomposition."""
+def _maps(found: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
+    """View maps of each function and term, and light maps, of a decomposition."""
     along, _, across = least.factor
     flat = found.tensor.reshape(-1, *found.tensor.shape[2:])
     view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, k]
     # Light maps carry the size, so that view factors have a mean square of about one.
     square = jnp.einsum("hdk,d->k", view**2, found.area) / (jnp.sum(found.area) * len(flat))
     size = jnp.where(square > 0, jnp.sqrt(square), 1)
-    whole = jnp.vdot(smooth, smooth)
-    left = jnp.maximum(whole - jnp.vdot(least.core, least.core), 0)
     edge = math.isqrt(len(found.area))
     return (
         jnp.moveaxis(view / size, 1, 2).reshape(-1, edge, edge),
         (size[:, None] * (across.T @ found.to_map)).reshape(-1, edge, edge),
-        jnp.sqrt(left / jnp.where(whole > 0, whole, 1)),
     )
+
+
+@jit
+def _projected(smooth: Float[Array, "n s b"], least: tucker.Tucker) -> Float[Array, "n h"]:
+    """The weights of functions that make the least error of what BRDFs send."""
+    core = least.core.reshape(len(least.core), -1)
+    met = tucker.multiply(tucker.multiply(smooth, least.factor[2], mode=2), least.factor[1], mode=1)
+    square = jnp.linalg.pinv(core @ core.T, rtol=_RANK**2, hermitian=True)
+    return met.reshape(len(smooth), -1) @ core.T @ square
+
+
+@jit
+def _missed(smooth: Float[Array, "n s b"], along: Float[Array, "n h"], least: tucker.Tucker) -> Float[Array, ""]:
+    """Relative error of what functions with some weights send."""
+    sent = tucker.Tucker(least.core, (along, *least.factor[1:])).full()
+    whole = jnp.vdot(smooth, smooth)
+    return jnp.sqrt(jnp.vdot(sent - smooth, sent - smooth) / jnp.where(whole > 0, whole, 1))
 
 
 def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
@@ -140,9 +215,14 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
 
 @jit
 def weights(
-    factor: Float[Array, "m f h"], weight: Float[Array, " m"], diffuse: Float[Array, " c"], specular: Float[Array, " d"]
+    factor: Float[Array, "m *n f h"],
+    weight: Float[Array, " m"],
+    diffuse: Float[Array, " c"],
+    specular: Float[Array, " d"],
 ) -> Float[Array, "p e"]:
     """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
+
+    Between BRDFs of the set the weights are those of the BRDF that is really there, see `jaxprt.bounces.between`.
 
     Args:
         factor: The set's `jaxprt.dynamic.DynamicBrdf.factor`.
@@ -158,7 +238,7 @@ def weights(
     """
     if weight.shape != factor.shape[:1]:
         raise ValueError(f"weights must be one for each of {len(factor)} BRDFs, got {list(weight.shape)}")
-    sharp = jnp.einsum("m,mch->hc", weight, factor) * specular
+    sharp = dynamic.brdf_set.combined(factor, weight).T * specular
     colors = max(sharp.shape[1], len(diffuse))
     rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]
     return jnp.concatenate(rows)

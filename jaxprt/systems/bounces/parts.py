@@ -74,7 +74,7 @@ class PartBounces(protocol.System):
         if found != [2] * len(counts):
             raise ValueError(
                 f"the tensor must be of one factored BRDF for each of {len(counts)} parts, got {len(found)}, "
-                f"{sum(each == 3 for each in found)} of them sets"
+                f"{sum(each > 2 for each in found)} of them sets"
             )
         if len(self.tensor.place) != sum(counts):
             raise ValueError(f"the tensor must be of the parts' {sum(counts)} vertices, got {len(self.tensor.place)}")

@@ -158,8 +158,8 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
         raise ValueError(f"there must be a material for each of {len(tensor.factor)} regions, got {len(materials)}")
     rows = []
     for number, (factor, material) in enumerate(zip(tensor.factor, materials, strict=True)):
-        if (factor.ndim == 3) != (material is not None):
-            needs = "needs a material" if factor.ndim == 3 else "has one BRDF for good: give None"
+        if (factor.ndim > 2) != (material is not None):
+            needs = "needs a material" if factor.ndim > 2 else "has one BRDF for good: give None"
             raise ValueError(f"region {number} {needs}")
         if material is None:
             rows.append(factor)

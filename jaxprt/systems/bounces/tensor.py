@@ -349,8 +349,8 @@ def _twice(components: int) -> int:
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:
     """Weights of the functions of a region that is white if it can be, else as it is, brightest color."""
-    if factor.ndim == 3:
-        return np.append(np.zeros(factor.shape[2], np.float32), np.float32(1))
+    if factor.ndim > 2:
+        return np.append(np.zeros(factor.shape[-1], np.float32), np.float32(1))
     weight = np.asarray(factor) if channel is None else np.asarray(factor) @ np.asarray(channel)
     return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
 
@@ -360,7 +360,7 @@ def scales(factor: Sequence[Array]) -> Float[Array, " q"]:
     largest = []
     for each in factor:
         size = jnp.abs(each)
-        largest += [jnp.max(size, (0, 1)), jnp.ones(1)] if each.ndim == 3 else [jnp.max(size, 1)]
+        largest += [jnp.max(size, range(each.ndim - 1)), jnp.ones(1)] if each.ndim > 2 else [jnp.max(size, 1)]
     whole = jnp.concatenate(largest)
     return jnp.maximum(whole, _LEAST * jnp.max(whole, initial=0))
 

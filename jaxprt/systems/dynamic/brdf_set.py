@@ -55,7 +55,7 @@ class DynamicBrdf(eqx.Module):
 
     Attributes:
         core: D, with as many numbers along each axis as its rank: of the set, of the view, of the light.
-        factor: U^h of each BRDF and color, gray or per color.
+        factor: U^h of each BRDF and color, gray or per color; or of each pair of BRDFs, see `combined`.
         view_map: U^wo on the view direction.
         light_map: U^wi on the incident direction, in 1/sr; view factors of a BRDF have a mean square of about one.
         lobe: Lobes of each BRDF, along the one parameter of the table; none if None.
@@ -65,7 +65,7 @@ class DynamicBrdf(eqx.Module):
     """
 
     core: Float[Array, "h o i"]
-    factor: Float[Array, "m c h"]
+    factor: Float[Array, "m *_ c h"]
     view_map: Float[Array, "o n n"]
     light_map: Float[Array, "i n n"]
     lobe: LobeBrdf | None
@@ -92,22 +92,45 @@ class DynamicBrdf(eqx.Module):
     def at(self, weight: Float[Array, " m"]) -> Mixed:
         """The BRDF with a weight for each of the set, as `jaxprt.brdf.navigation` makes them from coordinates.
 
-        Weights sum to one. Terms are mixed; lobes move, from the place and width they have in one BRDF to those they
-        have in the next, unless they are where all have them, as the published ones. Differentiable in the weights.
+        Weights sum to one. Terms are mixed, as `combined` has it. Lobes move from the place and width that they have in
+        one BRDF to those that they have in the next; the published ones are the same in all. Differentiable in the
+        weights.
 
         Raises:
             ValueError: The weights are not one for each BRDF of the set.
         """
         if weight.shape != (self.size,):
             raise ValueError(f"weights must be one for each of {self.size} BRDFs, got {list(weight.shape)}")
-        view = jnp.einsum("m,mch,hoi,oyx->iyxc", weight, self.factor, self.core, self.view_map)
+        view = jnp.einsum("ch,hoi,oyx->iyxc", combined(self.factor, weight), self.core, self.view_map)
         terms = SeparableBrdf(self.light_map[..., None], view, self.error, self.coordinates)
         lobe = None if self.lobe is None else mean(self.lobe, weight)
-        return Mixed(terms, lobe, jax.tree.map(lambda x: _between(x, weight), self.brdf))
+        return Mixed(terms, lobe, jax.tree.map(lambda x: between(x, weight), self.brdf))
 
 
-def _between(parameter: Array, weight: Array) -> Array:
-    """Mean of a parameter: of a width or exponent, which have no colors, in its logarithm, as lobes have it."""
+@jit
+def combined(factor: Float[Array, "m *_ c h"], weight: Float[Array, " m"]) -> Float[Array, "c h"]:
+    """Factors of a BRDF between those of a set.
+
+    Factors of each BRDF are mixed linearly. Those of each pair are mixed by a quadratic form, divided by the sum of the
+    weights: what one pair makes half and half is then free, and can be that of the BRDF which is really there.
+
+    Args:
+        factor: Of each BRDF, or of each pair, with colors.
+        weight: The weight of each BRDF.
+    """
+    if factor.ndim == 3:
+        return jnp.tensordot(weight, factor, 1)
+    whole = jnp.sum(weight)
+    return jnp.einsum("m,n,mnch->ch", weight, weight, factor) / jnp.where(whole == 0, 1, whole)
+
+
+@jit
+def between(parameter: Float[Array, "m *c"], weight: Float[Array, " m"]) -> Float[Array, "*c"]:
+    """A parameter of a model between those of a set.
+
+    A width or exponent, which has no colors, has its mean in the logarithm if it is positive in the whole set, as lobes
+    have it; all others are mixed linearly.
+    """
     linear = jnp.tensordot(weight, parameter, 1)
     if parameter.ndim > 1:
         return linear

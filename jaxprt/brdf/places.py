@@ -1,0 +1,373 @@
+"""Places among BRDFs: a weight for each of a set from one coordinate or two, on lines, in triangles and in columns.
+
+Weights are not negative and sum to one. `jaxprt.brdf.navigation` makes sets of BRDFs with the way through them.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxprt.compile import jit
+
+_ROUNDING = 16  # Units of rounding up to which points coincide, and triangles are lines.
+_FAR = 1e30
+
+
+def identity(coordinate: Array) -> Array:
+    """The coordinates as they are."""
+    return coordinate
+
+
+class Line(eqx.Module):
+    """A set with one coordinate: linear between neighbors in the chart, the nearest end outside.
+
+    Attributes:
+        knot: Coordinate of each BRDF, at least two, increasing.
+        chart: Increasing map of the coordinate.
+    """
+
+    knot: Float[Array, " m"]
+    chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
+
+    def weight(self, coordinate: Float[ArrayLike, ""]) -> Float[Array, " m"]:
+        """Weight of each BRDF; not negative, their sum is one.
+
+        Differentiable in the coordinate and the knots: at a knot from above, at the last one from below.
+
+        Raises:
+            ValueError: The coordinate is no single number.
+        """
+        knot = self.chart(self.knot)
+        low, upper = _neighbors(knot, self.chart(_checked(coordinate, ())), len(knot))
+        return jnp.zeros(len(knot), upper.dtype).at[low].set(1 - upper).at[low + 1].set(upper)
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        return np.stack([np.arange(len(self.knot) - 1), np.arange(1, len(self.knot))], -1)
+
+    def inside(self, coordinate: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the coordinate is between the ends, or at one."""
+        return (self.knot[0] <= coordinate) & (coordinate <= self.knot[-1])
+
+
+class Plane(eqx.Module):
+    """A set with two coordinates: barycentric in a triangle inside, at the nearest point of the boundary outside.
+
+    Triangles are straight, and distances are measured, in the chart: the coordinates, each mapped and then divided by
+    the extent of the points, since they are of different units. Made by `triangulate`.
+
+    Attributes:
+        point: Coordinates of each BRDF.
+        triangle: Points of each triangle, counter-clockwise.
+        edge: Points of each edge of the boundary, the convex hull in the chart; the inside is on the left.
+        chart: Increasing map of each coordinate, as a function of both.
+    """
+
+    point: Float[Array, "m 2"]
+    triangle: Int[Array, "t 3"]
+    edge: Int[Array, "e 2"]
+    chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
+
+    def weight(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
+        """Weight of each BRDF; not negative, their sum is one, and three at most are not zero.
+
+        Continuous. Differentiable in the coordinate and the points, with the triangulation fixed: the derivative is
+        that of the triangle or edge which was picked, one-sided where several meet, and zero where the nearest point
+        of the boundary stays at one vertex.
+
+        Raises:
+            ValueError: There are not two coordinates.
+        """
+        return _weight(self, _checked(coordinate, (2,)))
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        return _pairs(np.asarray(self.triangle))
+
+    def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
+        """Whether the coordinate is inside the boundary or on it, up to rounding."""
+        point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, coordinate))
+        return _within(point[self.edge], spot)
+
+
+class Columns(eqx.Module):
+    """A set with two coordinates whose points are in columns: linear along each column, then between two columns.
+
+    Each column has one value of the first coordinate and at least two of the second, of which the least and the largest
+    are those of all columns. A place between two columns gets weight from its neighbors in these alone, so that one
+    coordinate is never traded for the other, and a place in the row of points that both columns have gets weight from
+    these two points alone. Outside, the nearest place inside counts. Made by `columns`.
+
+    Attributes:
+        point: Coordinates of each BRDF.
+        order: Points of each column by their second coordinate. Shorter columns repeat their last point.
+        count: Number of points in each column.
+        chart: Increasing map of each coordinate for itself, as a function of both; weights are linear in it.
+    """
+
+    point: Float[Array, "m 2"]
+    order: Int[Array, "k r"]
+    count: Int[Array, " k"]
+    chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
+
+    def weight(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
+        """Weight of each BRDF; not negative, their sum is one, and four at most are not zero.
+
+        Continuous. Differentiable in the coordinate and the points, with the columns fixed; at a point from above, at
+        the last one from below. Outside, the derivative across the border is zero.
+
+        Raises:
+            ValueError: There are not two coordinates.
+        """
+        return _column_weight(self, _checked(coordinate, (2,)))
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of BRDFs that some place has weights for, the lower number first."""
+        height = np.asarray(self.chart(self.point), np.float64)[:, 1]
+        column = [each[:count] for each, count in zip(np.asarray(self.order), np.asarray(self.count), strict=True)]
+        found = []
+        for sides in itertools.pairwise(column):
+            knot = np.unique(height[np.concatenate(sides)])
+            middle = (knot[1:] + knot[:-1]) / 2
+            low = [np.clip(np.searchsorted(height[each], middle) - 1, 0, len(each) - 2) for each in sides]
+            found.append(np.stack([each[n + up] for each, n in zip(sides, low, strict=True) for up in (0, 1)], -1))
+        return _pairs(np.concatenate(found))
+
+    def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
+        """Whether the coordinate is between the ends of both coordinates, or at one."""
+        point = self.point[self.order]
+        low, high = jnp.min(point, (0, 1)), jnp.max(point, (0, 1))
+        return jnp.all((low <= coordinate) & (coordinate <= high))
+
+
+def triangulate(
+    point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity, name: Sequence[str] = ()
+) -> Plane:
+    """Triangulates points by Delaunay's criterion in their chart; see `Plane`. Runs on the host.
+
+    Args:
+        point: Coordinates of each BRDF.
+        chart: Increasing map of each coordinate, as a function of both.
+        name: What to call the points in messages, instead of their numbers.
+
+    Returns:
+        The plane.
+
+    Raises:
+        ValueError: There are fewer than three points, a point is not finite, two coincide, or all lie on one line;
+            the latter two up to rounding, in the chart.
+    """
+    point, scaled, rounding = _apart(point, chart, name)
+    try:
+        triangle = scipy.spatial.Delaunay(scaled).simplices  # Counter-clockwise.
+    except scipy.spatial.QhullError:
+        triangle = np.zeros((0, 3), int)
+    # Slivers occur along the hull alone.
+    area, size = _area(scaled[triangle])
+    triangle = triangle[area > rounding * size]
+    if not len(triangle):
+        raise ValueError(f"points must not all lie on one line, got {len(point)} that do")
+    side = np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]])
+    outer = ~np.isin(side @ [len(point), 1], side @ [1, len(point)])
+    triangle, side = (jax.device_put(each.astype(np.int32)) for each in (triangle, side[outer]))
+    return Plane(jax.device_put(point), triangle, side, chart)
+
+
+def in_columns(point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity) -> bool:
+    """Whether points are in at least two columns as `Columns` has them, up to rounding. Runs on the host.
+
+    Args:
+        point: Coordinates of each BRDF.
+        chart: Increasing map of each coordinate for itself, as a function of both.
+    """
+    point = np.asarray(point).astype(jnp.result_type(float))
+    if point.ndim != 2 or point.shape[1] != 2 or len(point) < 4 or not np.isfinite(point).all():
+        return False
+    scaled = np.asarray(_scaled(chart, point, point), np.float64)
+    rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
+    found = _split(scaled, rounding)
+    ends = [(min(scaled[each, 1]), max(scaled[each, 1])) for each in found]
+    return len(found) > 1 and all(low <= rounding and high >= 1 - rounding for low, high in ends)
+
+
+def columns(
+    point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity, name: Sequence[str] = ()
+) -> Columns:
+    """Sorts points into columns; see `Columns`. Runs on the host.
+
+    Args:
+        point: Coordinates of each BRDF.
+        chart: Increasing map of each coordinate for itself, as a function of both.
+        name: What to call the points in messages, instead of their numbers.
+
+    Returns:
+        The columns.
+
+    Raises:
+        ValueError: There are fewer than four points, a point is not finite, two coincide up to rounding in the chart,
+            or the points are not in columns.
+    """
+    point, scaled, rounding = _apart(point, chart, name)
+    if not in_columns(point, chart=chart):
+        count = len(_split(scaled, rounding))
+        raise ValueError(
+            "points must be in at least two columns of one first coordinate each, whose second coordinates have the "
+            f"same least and largest value, got {len(point)} points with {count} first coordinates"
+        )
+    found = _split(scaled, rounding)
+    most = max(map(len, found))
+    order = np.stack([np.pad(each, (0, most - len(each)), mode="edge") for each in found])
+    order, count = (jax.device_put(np.asarray(each, np.int32)) for each in (order, [len(each) for each in found]))
+    return Columns(jax.device_put(point), order, count, chart)
+
+
+def _pairs(group: Int[np.ndarray, "g n"]) -> Int[np.ndarray, "p 2"]:
+    """All pairs within groups of numbers, each once."""
+    first, second = np.triu_indices(group.shape[1], 1)
+    each = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
+    return np.unique(each, axis=0)
+
+
+def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:
+    """Points of each column, by their second coordinate."""
+    along = np.argsort(scaled[:, 0], kind="stable")
+    parts = np.split(along, np.flatnonzero(np.diff(scaled[along, 0]) > rounding) + 1)
+    return [each[np.argsort(scaled[each, 1], kind="stable")] for each in parts]
+
+
+def _apart(
+    point: ArrayLike, chart: Callable[[Array], Array], name: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Points that are finite and do not coincide, the same in the scaled chart, and what rounding is there."""
+    point = np.asarray(point).astype(jnp.result_type(float))
+    if point.ndim != 2 or point.shape[1] != 2 or len(point) < 3:
+        raise ValueError(f"points must be at least three pairs of coordinates, got an array of shape {point.shape}")
+    name = name or [f"point {index}" for index in range(len(point))]
+    broken = np.flatnonzero(~np.isfinite(point).all(-1))
+    if broken.size:
+        first = f"the first is {name[broken[0]]} at {_text(point[broken[0]])}"
+        raise ValueError(f"points must be finite, got {broken.size} that are not, {first}")
+    # As the plane itself computes them, in its precision.
+    scaled = np.asarray(_scaled(chart, point, point), np.float64)
+    rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
+    distance, pair = scipy.spatial.KDTree(scaled).query(scaled, k=2)
+    i, j = sorted(np.asarray(pair)[np.argmin(distance[:, 1])])
+    if distance[:, 1].min() <= rounding:
+        raise ValueError(
+            f"points must not coincide, got {name[i]} at {_text(point[i])} and {name[j]} at {_text(point[j])}"
+        )
+    return point, scaled, rounding
+
+
+def _text(point: np.ndarray) -> str:
+    return f"({point[0]:g}, {point[1]:g})"
+
+
+@jit
+def _column_weight(columns: Columns, coordinate: Array) -> Array:
+    """`Columns.weight` of two numbers that are finite."""
+    point, spot = (columns.chart(each) for each in (columns.point, coordinate))
+    place = point[columns.order]
+    left, across = _neighbors(place[:, 0, 0], spot[0], len(place))
+    result = jnp.zeros(len(point), across.dtype)
+    for column, part in ((left, 1 - across), (left + 1, across)):
+        low, upper = _neighbors(place[column, :, 1], spot[1], columns.count[column])
+        index = columns.order[column]
+        result = result.at[index[low]].add(part * (1 - upper)).at[index[low + 1]].add(part * upper)
+    return result
+
+
+def _neighbors(knot: Array, spot: Array, count: ArrayLike) -> tuple[Array, Array]:
+    """The lower neighbor of a spot among increasing knots, the first `count`, and the weight of the upper one."""
+    spot = _clip(spot, knot[0], knot[-1])
+    low = jnp.clip(jnp.searchsorted(knot, spot, side="right") - 1, 0, count - 2)
+    return low, (spot - knot[low]) / (knot[low + 1] - knot[low])
+
+
+@jit
+def _weight(plane: Plane, coordinate: Array) -> Array:
+    """`Plane.weight` of two numbers that are finite: some sixty operations, as one program."""
+    point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
+    # What is picked is not differentiated.
+    still, fixed = jax.lax.stop_gradient((point, spot))
+    weight, flat = _barycentric(still[plane.triangle], fixed)
+    triangle = plane.triangle[jnp.argmax(jnp.where(flat, -jnp.inf, jnp.min(weight, -1)))]
+    _, nearest = _project(still[plane.edge], fixed)
+    # The squared distance less the square of the spot: far away that has no digits left for the difference.
+    edge = plane.edge[jnp.argmin(jnp.sum(nearest * (nearest - 2 * fixed), -1))]
+    along, _ = _project(point[edge], spot)
+    weight, _ = _barycentric(point[triangle], spot)
+    # Rounding puts spots on edges just outside all triangles: their values are clipped, their derivatives are not.
+    valid = jnp.maximum(weight, 0)
+    weight = weight + jax.lax.stop_gradient(valid / jnp.sum(valid) - weight)
+    within = _within(still[plane.edge], fixed)
+    weight = jnp.where(within, weight, jnp.stack([1 - along, along, jnp.zeros_like(along)]))
+    index = jnp.where(within, triangle, edge[jnp.array([0, 1, 0])])
+    return jnp.zeros(len(point), weight.dtype).at[index].add(weight)
+
+
+def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Coordinates as floating-point numbers; infinite ones are far away."""
+    value = jnp.asarray(coordinate, jnp.result_type(float))
+    if value.shape != shape:
+        kind = "two coordinates" if shape else "one coordinate, a number,"
+        raise ValueError(f"a point of this set has {kind} not an array of shape {list(value.shape)}")
+    return jnp.clip(value, -_FAR, _FAR)
+
+
+def _clip(value: Array, low: ArrayLike, high: ArrayLike) -> Array:
+    """As jnp.clip, but at the ends with the derivative of the inside."""
+    return jnp.where(value < low, low, jnp.where(value > high, high, value))
+
+
+@functools.partial(jit, static_argnums=0)
+def _scaled(chart: Callable[[Array], Array], point: Array, coordinate: Array) -> Array:
+    """Coordinates in the chart, those of the points from 0 to 1."""
+    low, high = jnp.min(chart(point), 0), jnp.max(chart(point), 0)
+    return (chart(coordinate) - low) / jnp.where(high > low, high - low, 1)
+
+
+def _cross(first, second):
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+
+def _area(corner):
+    """Twice the area of triangles, positive for counter-clockwise ones, and the sum of two sides squared."""
+    u, v = corner[..., 1, :] - corner[..., 0, :], corner[..., 2, :] - corner[..., 0, :]
+    return _cross(u, v), (u**2 + v**2).sum(-1)
+
+
+def _barycentric(corner: Array, spot: Array) -> tuple[Array, Array]:
+    """Barycentric coordinates in triangles, and whether these are too thin to have any; linear in the spot."""
+    area, size = _area(corner)
+    flat = area <= _ROUNDING / 4 * jnp.finfo(area.dtype).eps * size
+    start = corner[..., 0, :]
+    part = [_cross(spot - start, corner[..., 2, :] - start), _cross(corner[..., 1, :] - start, spot - start)]
+    second, third = jnp.stack(part) / jnp.where(flat, 1, area)
+    return jnp.stack([1 - second - third, second, third], -1), flat
+
+
+def _project(segment: Array, spot: Array) -> tuple[Array, Array]:
+    """The nearest points of segments: how far along they lie, from 0 to 1, and where they are."""
+    start, way = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
+    square = jnp.sum(way**2, -1)
+    along = _clip(jnp.sum((spot - start) * way, -1) / jnp.where(square > 0, square, 1), 0, 1)
+    return along, start + along[..., None] * way
+
+
+def _within(edge: Array, spot: Array) -> Array:
+    """Whether a spot is on the left of all edges: rounding leaves cracks between triangles, not in the hull."""
+    start, way = edge[:, 0], edge[:, 1] - edge[:, 0]
+    slack = 8 * jnp.finfo(spot.dtype).eps * jnp.sqrt(jnp.sum(way**2, -1))
+    return jnp.all(_cross(way, spot - start) >= -slack)
