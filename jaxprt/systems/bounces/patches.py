@@ -30,7 +30,7 @@ from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
 
 MOST = 0.9999  # albedo that a sum of all bounces counts, so that it ends in a closed room
-LEAST = 4  # vertices of a patch, on the average
+LEAST = 2  # vertices of a patch, on the average
 
 
 class Patches(eqx.Module):
@@ -87,7 +87,7 @@ class Patches(eqx.Module):
     def sent(
         self,
         mean: Float[Array, "j d"],
-        change: Float[Array, "j d"] | None,
+        change: Float[Array, "j _"] | None,
         lit: Float[Array, "j c"],
         once: Float[Array, "j e"],
         twice: Float[Array, "j e"] | None,
