@@ -49,7 +49,7 @@ class Ready(NamedTuple):
         return self.direct if self.reflected is None else protocol.total(self.direct, self.reflected)
 
 
-def prepare(view: View, output: Path, *, terms: int, reflections: int) -> Ready:
+def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> Ready:
     """Makes a scene ready: parts of Cook-Torrance's model can change, all others have their BRDF for good.
 
     Raises:

@@ -98,9 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--error", type=float, help="relative error that the planned system must meet (default 0.05)")
     parser.add_argument(
         "--bounces",
-        type=int,
-        choices=[0, 1, 2],
-        help="how often parts reflect light onto each other (default 2 for dynamic, 0 for others; planned decides)",
+        type=play.bounces,
+        metavar="N",
+        help='how often parts reflect light onto each other, or "all" (default: dynamic 2, others 0; planned decides)',
     )
     parser.add_argument(
         "--animate", type=int, metavar="N", help="write N pictures while light, view and materials change (dynamic)"

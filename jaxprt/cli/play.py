@@ -70,13 +70,22 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--system", choices=["lobe", "harmonic"], nargs="+", default=["lobe"], help="one, or both")
     parser.add_argument("--lobes", type=_counts, default=[6], help="of each BRDF: 6, or several as 3,6,12 (default 6)")
-    parser.add_argument("--bounces", type=int, choices=[0, 1, 2], default=0, help="of light between parts (default 0)")
+    parser.add_argument(
+        "--bounces", type=bounces, metavar="N", default=0, help='of light between parts, or "all" (default 0)'
+    )
     parser.add_argument("--ground", action="store_true", help="stand the scene on a diffuse ground plane")
     parser.add_argument("--output", type=Path, help="folder that keeps what was precomputed, for later runs")
     parser.add_argument("--export", type=Path, metavar="HTML", help="write a page that needs no Python, and end")
     parser.add_argument("--port", type=int, default=0, help="of this machine (default: a free one)")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     return parser
+
+
+def bounces(text: str) -> int | str:
+    """How many times light is reflected: a whole number, or "all"."""
+    if text != "all" and not text.isdecimal():
+        raise argparse.ArgumentTypeError(f'must be a whole number of at least 0, or "all", got {text!r}')
+    return text if text == "all" else int(text)
 
 
 def _counts(text: str) -> list[int]:

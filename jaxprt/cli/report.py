@@ -113,7 +113,9 @@ class Truth(NamedTuple):
     seconds: dict[str, float]
 
 
-def plan(view: View, output: Path, *, error: float, bounces: int | None, executor: Executor | None = None) -> Made:
+def plan(
+    view: View, output: Path, *, error: float, bounces: int | str | None, executor: Executor | None = None
+) -> Made:
     """Makes a scene ready by a plan, which is kept with all else: the same command goes on with the same one.
 
     Raises:
@@ -126,7 +128,9 @@ def plan(view: View, output: Path, *, error: float, bounces: int | None, executo
     return made
 
 
-def make(view: View, recipe: Recipe, output: Path, *, bounces: int | None, executor: Executor | None = None) -> Made:
+def make(
+    view: View, recipe: Recipe, output: Path, *, bounces: int | str | None, executor: Executor | None = None
+) -> Made:
     """Makes a scene ready by one recipe; what is finished is kept in a folder.
 
     Raises:

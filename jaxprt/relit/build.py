@@ -29,7 +29,7 @@ def precompute(
     error: float = 0.05,
     environments: Sequence[Environment] | None = None,
     rate: float = 30.0,
-    bounces: int | None = None,
+    bounces: int | str | None = None,
     roughness: tuple[float, float] | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
@@ -49,8 +49,9 @@ def precompute(
         error: Relative L2 error of the radiance of each part, for the plan.
         environments: Lights that the error must hold for, for the plan; see `jaxprt.plan`.
         rate: Frames per second with new light and new view, for the plan.
-        bounces: How many times parts reflect light onto each other and themselves, 0 to 2; if None as many as the plan
-            finds worth it, and none with `system`.
+        bounces: How many times parts reflect light onto each other and themselves: a number, or "all" for as many times
+            as it brings light; if None as many as the plan finds worth it, and none with `system`. Light that is
+            reflected more than twice is diffuse.
         roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` or a `BlinnPhong`
             may get later, beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and
             memory in tables.
@@ -66,18 +67,17 @@ def precompute(
     Raises:
         TypeError: No scene, a system of another kind, bounces that are no whole number, or a material that no system
             can have.
-        ValueError: There is no such system or part, the size is no power of two, bounces are not from 0 to 2,
-            roughness is not two numbers from 0 to 1, the smaller one first, or is given without a system, a part's
-            material is not one that its system can have, or the store at `path` was made from something else.
+        ValueError: There is no such system or part, the size is no power of two, bounces are less than 0 or a word
+            other than "all", roughness is not two numbers from 0 to 1, the smaller one first, or is given without a
+            system, a part's material is not one that its system can have, or the store at `path` was made from
+            something else.
         NotADirectoryError: There is a file at `path`.
         jaxprt.visibility.UnfinishedError: The executor's part is done, and other parts are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
         raise ValueError(f"size must be a power of two, got {size!r}")
-    if bounces is not None and not (type(bounces) is int or isinstance(bounces, np.integer)):
-        raise TypeError(f"bounces must be a whole number, got {bounces!r}")
-    require.between("bounces", bounces, 0, reflection.MOST)
+    reflection.check(bounces)
     if roughness is not None and not (len(roughness) == 2 and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
     if roughness is not None and system is None:
@@ -109,7 +109,7 @@ def precompute(
     lit = lamps.make(scene, shadings, systems, targets)
     reflected = None
     if bounces:
-        # One store for one bounce and two: the second goes on from the first.
+        # One store for any number of bounces: more go on from fewer.
         reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lit)
 

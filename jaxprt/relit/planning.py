@@ -74,9 +74,9 @@ class Plan(eqx.Module):
 
     Attributes:
         part: One plan for each part of the scene.
-        reflected: Fraction of each part's radiance that other surfaces reflected at least once (row 0) and at least
-            twice (row 1): relative L2, estimated for matte surfaces.
-        bounces: As many as leave no more than the error of any part's light out.
+        reflected: Fraction of each part's radiance that other surfaces reflected at least once (row 0), twice (row 1)
+            and three times (row 2): relative L2, estimated for matte surfaces.
+        bounces: As many as leave no more than the error of any part's light out: 0, 1, 2 or "all".
         asked: The error that was asked for.
         rate: Frames per second that were asked for.
         size: Edge of the lights' cubemap faces in texels.
@@ -85,7 +85,7 @@ class Plan(eqx.Module):
 
     part: tuple[PartPlan, ...]
     reflected: Float[np.ndarray, "b p"]
-    bounces: int
+    bounces: int | str
     asked: float
     rate: float
     size: int
@@ -119,8 +119,11 @@ class Plan(eqx.Module):
             rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
             advice = "; `jaxprt.refine` divides its triangles" if part.mesh_error > self.asked else ""
             rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
-        for part, (once, twice) in zip(self.part, self.reflected.T, strict=True):
-            rows.append(f"{part.name}: {100 * once:.1f} % of its light is reflected, {100 * twice:.1f} % twice or more")
+        for part, (once, twice, often) in zip(self.part, 100 * self.reflected.T, strict=True):
+            rows.append(
+                f"{part.name}: {once:.1f} % of its light is reflected, {twice:.1f} % twice or more, "
+                f"{often:.1f} % three times or more"
+            )
         rows.append(f"bounces: {self.bounces}")
         total = f"{100 * self.error:.1f} %, {1e3 * self.seconds:.1f} ms a frame, {self.nbytes / 1e6:.2f} MB"
         slow = "" if self.seconds * self.rate <= 1 else f"; slower than the {self.rate:g} frames per second asked for"
@@ -143,7 +146,8 @@ def plan(
     promises nothing for a sun. If no system reaches the rate, the fastest one is taken, and the table says so.
 
     Errors, times and bytes are those of direct light. Light that the parts reflect onto each other is left out if it is
-    less than `error` of every part's; else the plan asks for as many bounces as leave no more out, two at most.
+    less than `error` of every part's; else the plan asks for as many bounces as leave no more out, and for all if two
+    leave out more.
 
     Args:
         scene: The scene.

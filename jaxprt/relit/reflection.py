@@ -18,20 +18,39 @@ from jaxprt.systems.bounces import PartBounces, ReflectingPart
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.harmonic import TransferVector
 
-MOST = 2  # bounces
+ALL = bounces.build.ALL
+_EACH = 3  # bounces that are estimated one by one; those that follow fall as the last two do
 _EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
+_SLOWEST = 0.95  # share of a bounce that the next one has, at most
 _VIEWS = 16  # over whose angles albedo is averaged
 _RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
 
 
-def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces:
+def check(count: int | str | None) -> None:
+    """Refuses numbers of bounces that are none.
+
+    Raises:
+        TypeError: It is no whole number, nor "all" nor None.
+        ValueError: It is less than 0, or another word.
+    """
+    if count is None or (isinstance(count, str) and count == ALL):
+        return
+    if isinstance(count, str):
+        raise ValueError(f"bounces must be a whole number or {ALL!r}, got {count!r}")
+    if not (type(count) is int or isinstance(count, np.integer)):
+        raise TypeError(f"bounces must be a whole number or {ALL!r}, got {count!r}")
+    if count < 0:
+        raise ValueError(f"bounces must be at least 0, got {count}")
+
+
+def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartBounces:
     """Precomputes reflected light between all parts.
 
     Args:
         shadings: What the parts are to systems.
-        count: How many times light is reflected, 1 or 2.
+        count: How many times light is reflected, at least once; or "all".
         target: The light's size, and where that is done; the parts occlude each other, and all vertices are lit.
 
     Returns:
@@ -52,9 +71,9 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
-    """Fraction of each part's radiance that other surfaces reflected at least once, and at least twice.
+    """Fraction of each part's radiance that other surfaces reflected at least once, twice, and three times.
 
-    An estimate: surfaces count as matte, with the mean albedo of their parts, and three bounces or more as none.
+    An estimate: surfaces count as matte, with the mean albedo of their parts.
 
     Args:
         shadings: What the parts are to systems.
@@ -67,26 +86,29 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
     options = {"size": _REFLECTED, "progress": False}
     direct = harmonic.precompute_diffuse(mesh, degree=_DEGREE, size=_DIRECT, progress=False)
     each = [direct.vector]
-    for _ in range(MOST):
+    for _ in range(_EACH):
         last = TransferVector(each[-1], direct.position)
         both = harmonic.interreflect_diffuse(mesh, last, albedo, bounces=1, **options)
         each.append(both.vector - each[-1])
-    region, result = np.asarray(mesh.region), np.zeros((MOST, len(shadings)))
+    region, result = np.asarray(mesh.region), np.zeros((_EACH, len(shadings)))
     for light in environments:
         coefficient = harmonic.project(light, degree=_DEGREE)
         lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
         for part in range(len(shadings)):
             own = lit[:, region == part]
+            before, last = (float(np.linalg.norm(each)) for each in own[-2:])
+            ratio = min(last / before, _SLOWEST) if before > 0 else 0.0
+            own = np.concatenate([own[:-1], own[-1:] / (1 - ratio)])
             whole = max(float(np.linalg.norm(own.sum(0))), 1e-30)
-            left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, MOST + 1)]
+            left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
             result[:, part] = np.maximum(result[:, part], np.asarray(left))
     return result
 
 
-def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int:
-    """How many bounces leave no more than an error of any part's light out; all that there are if none does."""
+def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int | str:
+    """How many bounces leave no more than an error of any part's light out; all if two leave out more."""
     enough = np.flatnonzero(np.all(reflected <= error, 1))
-    return int(enough[0]) if enough.size else len(reflected)
+    return int(enough[0]) if enough.size else ALL
 
 
 def _joined(shadings: Sequence[Shading]) -> Mesh:

@@ -175,7 +175,7 @@ class Session:
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """The exact picture in direct light of the environment; and the error of the picture at rest, by some exact pixels of its size."""
+        """The exact picture in direct light of the environment; and how far a picture of its size is off, by pixels."""
         look, seq = self._parse(message)
         width, height, coarse = _size(message)
         between = self._between(message, seq)

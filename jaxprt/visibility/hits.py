@@ -26,7 +26,8 @@ def hits(
     point, texel = np.nonzero(normal @ area.T > 0)
     triangle, _, barycentric = occluder.hit(start[point], direction[texel])
     met = np.flatnonzero(triangle >= 0)
-    return point[met], texel[met], occluder.face[triangle[met]], barycentric[met], len(point)
+    corner = occluder.facing(triangle[met], direction[texel[met]])
+    return point[met], texel[met], corner, barycentric[met], len(point)
 
 
 def front(

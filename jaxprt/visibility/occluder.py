@@ -55,6 +55,42 @@ class Occluder:
 
         return packets.Packets(self.position, self.face) if packets.available() else None
 
+    @cached_property
+    def _twin(self) -> np.ndarray:
+        """Corners of the face that is in the same place in opposite orientation, in the same order; else a face's own.
+
+        What rays meet there is the one or the other by chance.
+        """
+        _, place = np.unique(self.position, axis=0, return_inverse=True)
+        at = place.reshape(-1)[self.face]
+        order = np.argsort(at, axis=1)
+        rows, inverse = np.unique(np.take_along_axis(at, order, 1), axis=0, return_inverse=True)
+        # Odd orders of the corners are the one orientation, even ones the other.
+        odd = (order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])
+        corner = np.take_along_axis(self.face, order, 1)
+        example = np.full((2, len(rows)), -1)
+        inverse = inverse.reshape(-1)
+        example[odd.astype(int), inverse] = np.arange(len(self.face))
+        other = example[1 - odd.astype(int), inverse]
+        found = np.where((other >= 0)[:, None], corner[other], corner)
+        result = np.empty_like(self.face)
+        np.put_along_axis(result, order, found, 1)
+        return result
+
+    def facing(
+        self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
+    ) -> Integer[np.ndarray, "n 3"]:
+        """Corners of triangles that rays meet: where a face is there in both orientations, of the one that they face.
+
+        Args:
+            triangle: Numbers of the triangles.
+            direction: Directions of the rays.
+        """
+        corner = self.face[triangle]
+        a, b, c = (self.position[corner[:, each]] for each in range(3))
+        back = np.sum(np.cross(b - a, c - a) * direction, -1) > 0
+        return np.where(back[:, None], self._twin[triangle], corner)
+
     def blocked(
         self,
         origin: Float32[np.ndarray, "m 3"],

@@ -1,20 +1,24 @@
 """Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
 
-from jaxprt.systems.bounces import between, functions, gather, jobs, parts, relight, system, tensor
+from jaxprt.systems.bounces import between, build, functions, gather, jobs, parts, patches, relight, system, tensor
+from jaxprt.systems.bounces.build import precompute
 from jaxprt.systems.bounces.functions import factor
 from jaxprt.systems.bounces.parts import PartBounces, ReflectingPart
+from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.relight import arriving, combine, light_side, radiance, view_side
 from jaxprt.systems.bounces.system import BouncesSystem
-from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, precompute
+from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor
 
 __all__ = [
     "BouncesSystem",
     "PartBounces",
+    "Patches",
     "ReflectingPart",
     "SecondBounce",
     "TransferTensor",
     "arriving",
     "between",
+    "build",
     "combine",
     "factor",
     "functions",
@@ -22,6 +26,7 @@ __all__ = [
     "jobs",
     "light_side",
     "parts",
+    "patches",
     "precompute",
     "radiance",
     "relight",

@@ -214,6 +214,16 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
 
 
 @jit
+def albedo(basis: SeparableBrdf) -> Float[Array, " p"]:
+    """Share of constant light that each function reflects, into all directions: its hemispherical albedo."""
+    up = jnp.zeros(3, basis.light_map.dtype).at[2].set(1)
+    direction, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
+    flux = direction[:, 2] * area
+    met = flux @ basis.light(direction)[..., 0]
+    return jnp.einsum("d,dkp,k->p", flux / np.pi, basis.view(direction), met)
+
+
+@jit
 def weights(
     factor: Float[Array, "m *n f h"],
     weight: Float[Array, " m"],

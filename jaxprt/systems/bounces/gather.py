@@ -23,6 +23,7 @@ from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.systems.bounces import functions
 from jaxprt.systems.separable import SeparableBrdf
 
+DEGREE = 3  # of the harmonics that arrive
 _HITS = 64  # in a group: their responses should stay in the cache
 _GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
 
@@ -168,6 +169,43 @@ def rays(
             whole[group, place % _HITS] = each
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
+
+
+def shares(normal: Float[np.ndarray, "b 3"], *, size: int) -> Float[np.ndarray, "b d"]:
+    """Share of each texel in the irradiance of points under constant light: the shares of a point sum to one."""
+    flux = np.maximum(normal @ np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3).T, 0)
+    return flux / flux.sum(1, keepdims=True)
+
+
+def cosines(normal: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "b s"]:
+    """What makes irradiance over pi of the harmonics that arrive at points."""
+    kernel = harmonics.evaluate(jnp.asarray(normal), degree=DEGREE).T
+    return np.asarray(harmonics.convolve(kernel, harmonics.cosine(degree=DEGREE) / np.pi).T, np.float32)
+
+
+def measures(
+    cosine: Float[np.ndarray, "*b s"],
+    texel: Int[np.ndarray, "*b"],
+    share: Float[np.ndarray, "*b"],
+    *,
+    size: int,
+) -> Float[np.ndarray, "*b s"]:
+    """What rays count in the harmonics that arrive: such that the irradiance of these is right.
+
+    The harmonics of a ray have an irradiance that is off where the cosine has bands that are left out: near the horizon
+    they have some where there is none. The least change that mends it is along the harmonics of the cosine.
+
+    Args:
+        cosine: From `cosines`, of the point at which each ray arrives.
+        texel: The texel of each ray.
+        share: Its share in the irradiance of the point.
+        size: Edge of the faces.
+    """
+    way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
+    area = np.asarray(cubemap.solid_angle(size=size), np.float32).reshape(-1, 1)
+    plain = (np.asarray(harmonics.evaluate(jnp.asarray(way), degree=DEGREE)) * area)[texel]
+    off = share - np.sum(plain * cosine, -1)
+    return plain + (off / np.sum(cosine**2, -1))[..., None] * cosine
 
 
 def _met(axes: Array, basis: SeparableBrdf, size: int) -> Array:

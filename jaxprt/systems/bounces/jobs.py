@@ -15,14 +15,14 @@ from jaxprt import visibility
 from jaxprt.compile import jit
 from jaxprt.decompose import eigen, tucker
 from jaxprt.files.arrays import Layout, sketch
-from jaxprt.sphere import cubemap, haar, harmonics
+from jaxprt.sphere import cubemap, haar
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
 from jaxprt.systems.separable import SeparableBrdf
 
 # Versions of what makes the results; a release that changes them raises one.
-ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 1}
-DEGREE = 3  # of the harmonics that arrive
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
+DEGREE = gather.DEGREE  # of the harmonics that arrive
 _AGAIN = 2  # edge of the light's faces for two bounces
 
 
@@ -100,12 +100,11 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         """Harmonics of what arrives at some vertices, before it is decomposed."""
         found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
-        area = np.asarray(cubemap.solid_angle(size=self.size), np.float32).reshape(-1, 1)
-        measure = np.asarray(harmonics.evaluate(jnp.asarray(way), degree=DEGREE)) * area
+        share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
         result = []
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             if number not in found:
-                shape = (len(part), measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[1])
                 result.append(np.zeros(shape, np.float32))
                 continue
             rays, own = found[number], np.flatnonzero(self.region == number)
@@ -114,21 +113,19 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
             # Padded to a power of two groups, so that few shapes are compiled; what is added weighs nothing.
             spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
             owner, corner, weight, texel = (np.concatenate([x, np.zeros((spare, *x.shape[1:]), x.dtype)]) for x in rays)
-            fixed = (owner, local[corner], weight, way[texel], measure[texel])
+            point = np.repeat(owner[:, None], texel.shape[1], 1)
+            measure = gather.measures(cosine[point], texel, share[point, texel], size=self.size)
+            fixed = (owner, local[corner], weight, way[texel], measure)
             arrived = gather.arrive(response, self.frame[own], basis, *map(jax.device_put, fixed), points=len(part))
             result.append(np.asarray(arrived))
         return np.concatenate(result, 2)
 
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
         """Irradiance over pi at each vertex of a part, by weights of functions, under constant light."""
-        cosine = harmonics.convolve(
-            harmonics.evaluate(jnp.asarray(self.frame[part, 2]), degree=DEGREE).T,
-            harmonics.cosine(degree=DEGREE) / np.pi,
-        )
         met = np.sum(tensor, 1)
         for _ in range(met.ndim - 2):
             met = met @ white
-        return np.einsum("bs,sb->b", met, cosine)
+        return np.sum(met * gather.cosines(self.frame[part, 2]), 1)
 
 
 @dataclass(frozen=True)

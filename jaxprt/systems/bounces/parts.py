@@ -54,7 +54,8 @@ class PartBounces(protocol.System):
     """Light that the parts of a scene reflect onto each other and themselves, without the direct light.
 
     Materials are a `Blend` for each part, or None for one whose BRDF is as it was tabulated. What a part sends to
-    others has its mean weights over its area; what its vertices make of light that arrives has their own.
+    others has its mean weights over its area, and patch by patch the difference in albedo, as diffuse light; what its
+    vertices make of light that arrives has their own.
 
     Attributes:
         tensor: From `jaxprt.bounces.precompute` with one factored BRDF for each part, of the same channels.
@@ -92,13 +93,13 @@ class PartBounces(protocol.System):
     ) -> tuple[Float[Array, "lm _ _"], ...]:
         """Harmonics of the light that arrives at the vertices of each part, in their frames, with all materials."""
         require.kind("the light", light, LitTransfer, source="PartBounces.light")
-        blends = zip(self.part, self._given(materials), strict=True)
+        blends = list(zip(self.part, self._given(materials), strict=True))
         means = [self._mean(number, *each) for number, each in enumerate(blends)]
         rows = [
             own if mean is None else jnp.matmul(own, mean, precision="highest")
             for own, mean in zip(self.tensor.factor, means, strict=True)
         ]
-        arriving = collect(self.tensor, light, gathered(self.tensor, rows))
+        arriving = collect(self.tensor, light, gathered(self.tensor, rows), self._changes(blends, means))
         each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
         return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))
 
@@ -141,6 +142,20 @@ class PartBounces(protocol.System):
         blend.check(len(part.position), self.tensor.factor[number].shape[1])
         first = sum(len(each.position) for each in self.part[:number])
         return area_mean(blend.weight, self.tensor.area[first : first + len(part.position)])
+
+    def _changes(self, blends: Sequence, means: Sequence[Array | None]) -> Float[Array, "v c"] | None:
+        """What the albedo of each vertex is more than that of its part; None without blends or patches."""
+        if self.tensor.patches is None or not any(mean is not None for mean in means):
+            return None
+        rows = []
+        for number, ((part, blend), mean) in enumerate(zip(blends, means, strict=True)):
+            if mean is None:
+                rows.append(jnp.zeros((len(part.position), 1), part.position.dtype))
+                continue
+            channel = jnp.matmul(self.tensor.patches.strength[number], self.tensor.factor[number], precision="highest")
+            rows.append(jnp.einsum("k,vkc->vc", channel, blend.weight - mean, precision="highest"))
+        colors = max(each.shape[1] for each in rows)
+        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
     def _given(self, materials: Any) -> Sequence[Blend | None]:
         if materials is None:

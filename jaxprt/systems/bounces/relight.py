@@ -37,10 +37,12 @@ class LitTransfer(eqx.Module):
     Attributes:
         first: Of each cluster and color: components, harmonics and functions.
         second: Components, harmonics, and functions of both bounces; None without a second bounce.
+        matte: Irradiance over pi that each patch has of the light itself; None without patches.
     """
 
     first: Float[Array, "g c n s q"]
     second: Float[Array, "g c o s q q"] | None
+    matte: Float[Array, "j c"] | None = None
 
 
 class Arriving(eqx.Module):
@@ -131,7 +133,7 @@ def arriving(
 
     Arguments and errors as of `radiance`.
     """
-    weight = weights(tensor, materials)
+    weight, change = weights(tensor, materials), changes(tensor, materials)
     if len(tensor.place) != len(transport.place):
         raise ValueError(
             f"the tensor must be of the transport's {len(transport.place)} vertices, got {len(tensor.place)}"
@@ -140,12 +142,14 @@ def arriving(
         raise ValueError(
             "the tensor must be of the transport's mesh and regions, got one of others with as many vertices"
         )
-    return _arriving(transport, tensor, light, weight)
+    return _arriving(transport, tensor, light, weight, change)
 
 
 @jit
-def _arriving(transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight) -> tuple[Arriving, ...]:
-    whole = collect(tensor, light, weight)
+def _arriving(
+    transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight, change
+) -> tuple[Arriving, ...]:
+    whole = collect(tensor, light, weight, change)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
 
 
@@ -173,6 +177,26 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
     return gathered(tensor, rows)
 
 
+def changes(tensor: TransferTensor, materials: Sequence[Material | None]) -> Float[Array, "v d"] | None:
+    """What the albedo of each vertex is more than the mean of its region; None without textures or patches.
+
+    The arguments are those of `weights`, which refuses wrong ones.
+    """
+    if tensor.patches is None:
+        return None
+    result = None
+    for number, (factor, material) in enumerate(zip(tensor.factor, materials, strict=True)):
+        if material is None or (material.diffuse.ndim == 1 and material.specular.ndim == 1):
+            continue
+        strength = tensor.patches.strength[number]
+        sharp = jnp.einsum("m,mch,h->c", material.weight, factor, strength[:-1], precision="highest")
+        own = tensor.region == number
+        albedo = strength[-1] * material.diffuse + sharp * material.specular
+        off = jnp.where(own[:, None], albedo - area_mean(albedo, jnp.where(own, tensor.area, 0)), 0)
+        result = off if result is None else result + off
+    return result
+
+
 def gathered(tensor: TransferTensor, rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "q c"]:
     """Weights of the functions that the tensor keeps, given those of all functions of each region."""
     return _gathered(tensor.function, rows)
@@ -192,23 +216,47 @@ def area_mean(value: Float[Array, "v *c"], area: Float[Array, " v"]) -> Float[Ar
 
 
 @isolated
-def collect(tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"]) -> Float[Array, "s c v"]:
+def collect(
+    tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"], change: Float[Array, "v e"] | None = None
+) -> Float[Array, "s _ v"]:
     """SH coefficients, in world directions, of the radiance that arrives at each vertex.
 
     Args:
         tensor: The bounces.
         light: From `light_side`.
         weight: From `weights`.
+        change: What the albedo of each vertex is more than the mean of its region; None for nothing.
     """
     # Products summed along the last axes: as einsums, XLA's CPU code would transpose the large operands first.
     met, row = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight
+    once, twice = met, None
     if light.second is not None and tensor.second is not None:
         both = weight.T[:, :, None] * weight.T[:, None]
         twice = jnp.sum(light.second * both[:, None, None], (-2, -1))
         met, row = jnp.concatenate([met, twice], 2), jnp.concatenate([row, tensor.second.weight], -1)
     clusters, colors, components, harmonic = met.shape
     rows = row @ jnp.moveaxis(met, 2, 1).reshape(clusters, components, colors * harmonic)
-    return rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
+    whole = rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
+    no_more = tensor.patches is None or twice is None or tensor.patches.bounces == 2
+    if light.matte is None or (change is None and no_more):
+        return whole
+    return whole + _exchanged(tensor, light.matte, once, twice, weight, change)
+
+
+def _exchanged(tensor: TransferTensor, matte: Array, once: Array, twice: Array | None, weight: Array, change) -> Array:
+    """What patches add to what arrives at each vertex."""
+    patches = tensor.patches
+    assert patches is not None
+
+    def irradiance(own: Array | None, met: Array | None) -> Array | None:
+        if own is None or met is None:
+            return None
+        return jnp.sum(own[:, None] * met[patches.cluster], (-2, -1))
+
+    first, second = irradiance(patches.first, once), irradiance(patches.second, twice)
+    assert first is not None
+    off = None if change is None else patches.means(change, tensor.area)
+    return patches.received(patches.sent(patches.albedo(tensor.function, weight), off, matte, first, second))
 
 
 def view_side(
@@ -299,10 +347,13 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
 def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
     light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
     first = _met(jnp.einsum("gle,lc->gce", tensor.mode, light), tensor.core)
+    matte = None
+    if tensor.patches is not None:
+        matte = tensor.patches.light @ coarse(radiance, edge=math.isqrt(tensor.patches.light.shape[1] // 6))
     if tensor.second is None:
-        return LitTransfer(first, None)
+        return LitTransfer(first, None, matte)
     again = coarse(radiance, edge=math.isqrt(tensor.second.core.shape[1] // 6)).T
-    return LitTransfer(first, _met(jnp.broadcast_to(again, (len(first), *again.shape)), tensor.second.core))
+    return LitTransfer(first, _met(jnp.broadcast_to(again, (len(first), *again.shape)), tensor.second.core), matte)
 
 
 def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Array, "g c *f"]:

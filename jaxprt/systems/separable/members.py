@@ -9,13 +9,22 @@ from jaxprt.decompose import clustering
 _CLUSTERS = 0.84  # for one vertex: 160 for 36,000
 
 
-def cluster(position: Float[Array, "v 3"], normal: Float[Array, "v 3"], *, clusters: int) -> Int[np.ndarray, "p m"]:
+def cluster(
+    position: Float[Array | np.ndarray, "v 3"], normal: Float[Array | np.ndarray, "v 3"], *, clusters: int
+) -> Int[np.ndarray, "p m"]:
     """Vertices of each cluster, alike in position and normal, by `jaxprt.decompose.clustering.bisect`."""
+    return clustering.bisect(coordinates(position, normal), clusters=clusters)
+
+
+def coordinates(
+    position: Float[Array | np.ndarray, "v 3"], normal: Float[Array | np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 6"]:
+    """Positions and normals in comparable units: each with a mean square of one."""
     coordinate = []
     for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
         offset = each - each.mean(0)
         coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
-    return clustering.bisect(np.concatenate(coordinate, 1), clusters=clusters)
+    return np.concatenate(coordinate, 1)
 
 
 def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:

@@ -158,13 +158,14 @@ def test_reflected_light_has_the_color_of_what_it_met(transport, tensor, brdfs):
     np.testing.assert_allclose(color[0][1], color[1][1], rtol=0.05)  # They differ by the other colors' rounding alone.
 
 
-def test_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, mesh):
+def test_without_patches_a_texture_sends_its_mean_over_the_surface_to_others(transport, tensor, mesh):
     """Bright poles, where the ball has many vertices and little surface; the mean is that of trimesh's triangles."""
     texture = np.asarray(mesh.position[:, 1:2] ** 2)
     face = np.asarray(mesh.face)[np.asarray(mesh.region)[mesh.face[:, 0]] == 0]
     area = trimesh.Trimesh(np.asarray(mesh.position), face, process=False).area_faces
     mean = np.atleast_1d(area @ texture[face].mean((1, 2)) / area.sum()).astype(np.float32)
     assert texture[np.asarray(mesh.region) == 0].mean() > 1.1 * mean
+    tensor = eqx.tree_at(lambda each: each.patches, tensor, None)
     lit = bounces.light_side(tensor, light())
     found, plain = (
         bounces.arriving(transport, tensor, lit, [material(each), None])[1].local for each in (texture, mean)

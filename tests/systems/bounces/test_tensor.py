@@ -317,8 +317,10 @@ def test_what_makes_no_tensor_is_refused(mesh, brdfs):
         bounces.precompute(mesh, brdfs, components=0, progress=False)
     with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
         bounces.precompute(mesh, brdfs, edge=6, progress=False)
-    with pytest.raises(ValueError, match="bounces must be 1 or 2, got 3"):
-        bounces.precompute(mesh, brdfs, bounces=3, progress=False)
+    with pytest.raises(ValueError, match="bounces must be a whole number of at least 1, or 'all', got 0"):
+        bounces.precompute(mesh, brdfs, bounces=0, progress=False)
+    with pytest.raises(ValueError, match="patches must be at least 1, got 0"):
+        bounces.precompute(mesh, brdfs, patches=0, progress=False)
 
 
 @pytest.mark.usefixtures("unchecked")

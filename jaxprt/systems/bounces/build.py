@@ -1,0 +1,310 @@
+"""Precomputes transfer tensors: responses to direct light, one bounce, two, and patches for all that follow."""
+
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tqdm
+from jaxtyping import Array, Float
+
+from jaxprt import require, visibility
+from jaxprt.scene.mesh import Mesh, areas
+from jaxprt.systems import separable
+from jaxprt.systems.bounces import functions, gather, jobs, patches
+from jaxprt.systems.bounces.patches import Patches
+from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
+from jaxprt.systems.dynamic import DynamicBrdf
+from jaxprt.systems.separable import SeparableBrdf
+
+ALL = "all"  # bounces that bring light
+_MEMBERS = 230  # vertices of a cluster
+_SEEN = 4  # visibility has faces so many times as large as the light's
+_SAMPLE = 8  # clusters that tell what a bounce is worth
+
+
+def precompute(
+    mesh: Mesh,
+    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    *,
+    weights: Sequence[Float[Array, "_ _"] | None] | None = None,
+    bounces: int | str = 2,
+    least: float = 0.0,
+    components: int = 32,
+    modes: int = 64,
+    edge: int = 8,
+    size: int = 16,
+    patches: int = 256,
+    path: str | os.PathLike | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> TransferTensor:
+    """Traces bounces from every vertex, and decomposes what arrives.
+
+    Args:
+        mesh: The whole scene, which lights itself.
+        brdfs: What light meets on its way, for each region in the order of their numbers: a set from
+            `jaxprt.bounces.factor`, or the one BRDF that it has for good, factored.
+        weights: Typical weights of the channels k of each region's BRDF in each color, by which `worth` is judged. None
+            for a set, and for a BRDF whose channels are colors.
+        bounces: How many times light is reflected, or "all" for as many times as it brings any. Those after the second
+            are diffuse, between patches.
+        least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
+            less than this share of what arrives.
+        components: Along the vertices of a cluster, or as many as it has; half of them for two bounces.
+        modes: Along the light, or as many as it has texels.
+        edge: Edge of the light's faces in texels, a power of two.
+        size: Edge of the faces through whose texels rays are sent.
+        patches: Parts of the surfaces that exchange diffuse light, about: by them textures have the colors that they
+            have at each place, and light is reflected more than twice.
+        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
+        executor: Where blocks are computed; this machine's cores if None.
+        progress: Whether to show progress bars, and to say what is left out.
+
+    Returns:
+        The tensor of all vertices. Meanwhile the responses of all of them are held: 24 edge^2 bytes for each vertex and
+        light factor of its region, and for two bounces 96 for each function too.
+
+    Raises:
+        TypeError: A mesh or BRDFs of another kind.
+        ValueError: Not one BRDF for each region, weights of other channels or not finite, a set without terms or with
+            lobes, bounces that are neither "all" nor a whole number of at least 1, numbers below 1, or an edge that is
+            no power of two.
+
+    Reference: Sun et al. 2007, sections 3.1 and 4.3.
+    """
+    numbers = _regions(mesh, brdfs)
+    weights = [None] * len(brdfs) if weights is None else weights
+    _check_weights(weights, brdfs)
+    _check_sizes(bounces, least, components, modes, edge, size, patches)
+    bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
+    factor = tuple(each.factor if isinstance(each, DynamicBrdf) else functions.fixed_weights(each) for each in brdfs)
+    if path is not None:
+        os.makedirs(path, exist_ok=True)
+    run = _Run(path, executor, progress)
+    region = np.asarray(mesh.region)
+    member = separable.members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
+    job = jobs.TransferJob.make(
+        mesh,
+        None,
+        None,
+        size,
+        bases=bases,
+        response=_responses(mesh, bases, numbers, edge, run),
+        white=np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
+        scale=np.asarray(scales(factor)),
+        region=np.searchsorted(numbers, region),
+        member=member,
+        components=min(components, member.shape[1]),
+        modes=min(modes, 6 * edge * edge),
+    )
+    found = run.compute(job, "clusters", "bounce")
+    contribution = _contributions(found["energy"], job.scale)
+    function = np.flatnonzero(contribution >= least)
+    worth = [_rms(found["white"])]
+    weight = found["weight"].reshape(*member.shape, -1)
+    core = found["core"][..., function]
+    second, brought_twice = None, np.zeros(0)
+    if bounces != 1 and function.size:
+        count = min(twice(components), member.shape[1])
+        again = job.again(weight, core, found["mode"], function, components=count)
+        second, brought_twice = _second(again, member, job.white[function], least, run)
+        worth.append(_rms(brought_twice))
+    again_weight = None if second is None else np.asarray(second.weight)
+    exchanged = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
+    made = exchanged.make(bases, function, weight, again_weight, edge)
+    if second is not None and bounces != 2:
+        worth += exchanged.worth(made, job.white[function], function, brought_twice)
+    if progress:
+        _tell(contribution, function, worth, second, bounces)
+    rows = (separable.members.places(member), job.region.astype(np.int32), areas(mesh).astype(weight.dtype))
+    arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
+    judged = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
+    key = visibility.blocks.scene_key(mesh)
+    return TransferTensor(*arrays, factor=factor, second=second, **judged, mesh=key, patches=made)
+
+
+class _Run(NamedTuple):
+    """Where blocks are computed and kept."""
+
+    path: str | os.PathLike | None
+    executor: Executor | None
+    progress: bool
+
+    def compute(self, job: visibility.blocks.Job, name: str, label: str) -> dict[str, np.ndarray]:
+        """The results of a job, kept in a folder of a name."""
+        store = None if self.path is None else os.path.join(self.path, name)
+        options = {"executor": self.executor, "progress": self.progress}
+        return visibility.blocks.compute(job, path=store, label=label, **options)
+
+
+class _Exchange(NamedTuple):
+    """What makes patches.
+
+    Attributes:
+        mesh: The whole scene.
+        job: The job of one bounce.
+        wanted: Number of patches, about.
+        bounces: How many in all; None for all.
+        run: Where that is done.
+    """
+
+    mesh: Mesh
+    job: jobs.TransferJob
+    wanted: int
+    bounces: int | None
+    run: "_Run"
+
+    def make(
+        self,
+        bases: Sequence[SeparableBrdf],
+        function: np.ndarray,
+        weight: np.ndarray,
+        again: np.ndarray | None,
+        edge: int,
+    ) -> Patches:
+        """The patches, given the weights of the components of one bounce and of two."""
+        position, normal = (np.asarray(each, np.float64) for each in (self.mesh.position, self.mesh.normal))
+        count = min(self.wanted, max(1, len(position) // patches.LEAST))
+        member, region = self.job.member, self.job.region
+        patch, of_region, of_cluster = patches.divide(position, normal, region, member, patches=count)
+        size = self.job.size
+        job = patches.PatchJob.make(self.mesh, None, None, size, patch=patch, edge=math.gcd(size, edge))
+        found = self.run.compute(job, "patches", "patches")
+        area = _areas(self.mesh)
+        mean = patches.Means(patch, area, len(of_region))
+        place = separable.members.places(member)
+        cosine = gather.cosines(self.job.frame[:, 2])
+
+        def of_components(weight: np.ndarray) -> np.ndarray:
+            return mean.product(weight.reshape(-1, weight.shape[-1])[place], cosine)
+
+        strength, first = [], 0
+        for basis in bases:
+            own = np.asarray(functions.albedo(basis))
+            kept = np.isin(np.arange(first, first + len(own)), function)
+            strength.append(jnp.asarray(np.where(kept, own, 0)))
+            first += len(own)
+        arrays = (found["factor"], found["spread"], patch, of_region, of_cluster)
+        ours = (mean.of(found["factor"]), mean.of(found["light"]), of_components(weight))
+        second = None if again is None else jnp.asarray(of_components(again))
+        factor, spread, *of_patch, between, light, once = (jnp.asarray(each) for each in (*arrays, *ours))
+        more = {"second": second, "strength": tuple(strength), "bounces": self.bounces}
+        return Patches(factor, spread, *of_patch, between=between, light=light, first=once, **more)
+
+    def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
+        """What bounces after the second bring, each of them or all together."""
+        place = separable.members.places(self.job.member)
+        mean = patches.Means(np.asarray(made.patch), _areas(self.mesh), len(made.region))
+        rho = np.asarray(made.albedo(jnp.asarray(function), jnp.asarray(white[:, None], made.light.dtype)))
+        start = rho * mean.of(twice[place][:, None]).astype(rho.dtype)
+        factor = np.asarray(made.factor, np.float32)
+        if self.bounces is None:
+            return [_rms(factor @ np.asarray(made.settled(jnp.minimum(rho, patches.MOST), jnp.asarray(start))))]
+        result = []
+        for _ in range(self.bounces - 2):
+            result.append(_rms(factor @ start))
+            start = rho * (np.asarray(made.between) @ start)
+        return result
+
+
+def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
+    """Numbers of the regions, if there is a BRDF for each."""
+    if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
+        raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
+    for number, each in enumerate(brdfs):
+        if not isinstance(each, DynamicBrdf | SeparableBrdf):
+            raise TypeError(
+                f"the BRDF of region {number} must be from jaxprt.bounces.factor or separable.factor, got "
+                f"{type(each).__name__}"
+            )
+    numbers = np.unique(np.asarray(mesh.region))
+    if len(brdfs) != len(numbers):
+        raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
+    return numbers
+
+
+def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[DynamicBrdf | SeparableBrdf]) -> None:
+    """Refuses weights of other regions or channels."""
+    if len(weights) != len(brdfs):
+        raise ValueError(f"weights must be one, or None, for each of {len(brdfs)} regions, got {len(weights)}")
+    for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
+        if each is None:
+            continue
+        if isinstance(brdf, DynamicBrdf):
+            raise ValueError(f"the weights of region {number}, which has a set of BRDFs, must be None")
+        shape, channels = np.shape(each), brdf.view_map.shape[-1]
+        if len(shape) != 2 or shape[0] != channels:
+            raise ValueError(f"the weights of region {number} must be [{channels} channels, c], got {list(shape)}")
+        require.finite(f"the weights of region {number}", each)
+
+
+def _check_sizes(
+    bounces: int | str, least: float, components: int, modes: int, edge: int, size: int, patches: int
+) -> None:
+    """Refuses numbers that are out of range."""
+    if bounces != ALL and not (isinstance(bounces, int | np.integer) and bounces >= 1):
+        raise ValueError(f"bounces must be a whole number of at least 1, or {ALL!r}, got {bounces!r}")
+    if patches < 1:
+        raise ValueError(f"patches must be at least 1, got {patches}")
+    if not 0 <= least < 1:
+        raise ValueError(f"least must be at least 0 and less than 1, got {least}")
+    if min(components, modes, edge, size) < 1 or edge & (edge - 1):
+        raise ValueError(
+            f"components, modes, edge and size must be at least 1, and edge a power of two, got {components}, {modes}, "
+            f"{edge} and {size}"
+        )
+
+
+def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run: _Run) -> tuple[np.ndarray, ...]:
+    """What the light factors of each region make of direct light."""
+    result = []
+    for number, basis in zip(numbers.tolist(), bases, strict=True):
+        vertex = np.flatnonzero(np.asarray(mesh.region) == number)
+        job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
+        result.append(run.compute(job, f"response_{number}", f"region {number}")["response"])
+    return tuple(result)
+
+
+def _second(
+    job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: _Run
+) -> tuple[SecondBounce | None, np.ndarray]:
+    """The second bounce, or None if some clusters show that it brings too little; and what it brings to vertices."""
+    sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
+    brought = np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample])
+    if _rms(brought) < least:
+        return None, brought
+    found = run.compute(job, "clusters_2", "bounce 2")
+    parts = (found["weight"].reshape(*member.shape, -1), found["core"], found["error"])
+    return SecondBounce(*map(jax.device_put, parts)), found["white"]
+
+
+def _white(factor: Array, channel: Array | None) -> np.ndarray:
+    """Weights of the functions of a region that is white if it can be, else as it is, brightest color."""
+    if factor.ndim > 2:
+        return np.append(np.zeros(factor.shape[-1], np.float32), np.float32(1))
+    weight = np.asarray(factor) if channel is None else np.asarray(factor) @ np.asarray(channel)
+    return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
+
+
+def _contributions(energy: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """What each function brings at its largest weight, as a share of what all bring."""
+    size = np.sqrt(energy.sum(0)) * scale
+    return size / max(np.linalg.norm(size), np.finfo(np.float32).tiny)
+
+
+def _rms(value: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(value, dtype=np.float64))))
+
+
+def _tell(contribution: np.ndarray, function: np.ndarray, worth: list[float], second, bounces: int | str) -> None:
+    gone = len(contribution) - len(function)
+    if gone:
+        left = np.linalg.norm(np.delete(contribution, function))
+        tqdm.tqdm.write(f"transfer: left out {gone} of {len(contribution)} functions, {left:.2g} of what arrives")
+    if bounces != 1 and second is None and len(worth) > 1:
+        tqdm.tqdm.write(f"transfer: left out the second bounce, {worth[1]:.2g} of the light of an open surface")
