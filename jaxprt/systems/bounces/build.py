@@ -175,7 +175,7 @@ class _Exchange(NamedTuple):
         size = self.job.size
         job = patches.PatchJob.make(self.mesh, None, None, size, patch=patch, edge=math.gcd(size, edge))
         found = self.run.compute(job, "patches", "patches")
-        area = _areas(self.mesh)
+        area = areas(self.mesh)
         mean = patches.Means(patch, area, len(of_region))
         place = separable.members.places(member)
         cosine = gather.cosines(self.job.frame[:, 2])
@@ -199,7 +199,7 @@ class _Exchange(NamedTuple):
     def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
         """What bounces after the second bring, each of them or all together."""
         place = separable.members.places(self.job.member)
-        mean = patches.Means(np.asarray(made.patch), _areas(self.mesh), len(made.region))
+        mean = patches.Means(np.asarray(made.patch), areas(self.mesh), len(made.region))
         rho = np.asarray(made.albedo(jnp.asarray(function), jnp.asarray(white[:, None], made.light.dtype)))
         start = rho * mean.of(twice[place][:, None]).astype(rho.dtype)
         factor = np.asarray(made.factor, np.float32)
