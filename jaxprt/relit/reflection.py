@@ -1,5 +1,6 @@
 """Light that the parts of a scene reflect onto each other: what it is worth, and how it is precomputed."""
 
+import pathlib
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -9,19 +10,23 @@ from jaxtyping import Float
 
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.recipes import Target, harmonic_table
+from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions
 from jaxprt.systems import bounces, harmonic, separable
-from jaxprt.systems.bounces import PartBounces, ReflectingPart
+from jaxprt.systems.bounces import PartBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
+from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import TransferVector
+from jaxprt.systems.lobe import LobeBrdf, LobeSystem
+from jaxprt.systems.protocol import System
 
 MOST = 2  # bounces
 _EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
+_LOBES = 8  # of parts whose systems have none, for the rays of sharp ones
 _VIEWS = 16  # over whose angles albedo is averaged
 _RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
 
@@ -49,6 +54,28 @@ def make(shadings: Sequence[Shading], count: int, target: Target) -> PartBounces
         for each, axes in zip(shadings, frame, strict=True)
     ]
     return PartBounces(tensor, tuple(parts))
+
+
+def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathlib.Path | None) -> list[LobeBrdf | None]:
+    """Lobes of the parts whose reflections are traced; None for those that harmonics are enough for.
+
+    Args:
+        shadings: What the parts are to systems.
+        systems: The systems of the parts, whose tables of lobes are taken where they have some.
+        folder: What keeps tables that are made here; None keeps nothing.
+    """
+    result: list[LobeBrdf | None] = []
+    for number, (shading, system) in enumerate(zip(shadings, systems, strict=True)):
+        if isinstance(shading.brdf, Lambert):
+            result.append(None)
+            continue
+        inner = system.system if isinstance(system, BrightTexels) else system
+        table = inner.brdf if isinstance(inner, LobeSystem) else None
+        if table is None:
+            path = None if folder is None else folder / f"{number}_sharp_{_LOBES}.prt"
+            table = lobe_table(shading, _LOBES, path)
+        result.append(table if traced.is_sharp(table) else None)
+    return result
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:

@@ -1,6 +1,7 @@
 """Scenes made ready: every part by a system, and the four verbs, radiance and pictures of the whole."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,15 +11,20 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
-from jaxprt.relit import interpolation, measuring, pictures
+from jaxprt.relit import interpolation, measuring, pictures, tracing
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
-from jaxprt.relit.pictures import PictureView, Surface
+from jaxprt.relit.pictures import PictureView
+from jaxprt.relit.surface import Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import PartBounces
+from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, Joined, System, Total
+
+RAYS = 8  # of each vertex or point of a sharp part
 
 
 class SceneView(eqx.Module):
@@ -27,10 +33,12 @@ class SceneView(eqx.Module):
     Attributes:
         part: The views of its parts, as their systems have them.
         emitted: Radiance that each vertex emits; None where none does.
+        reflected: What sharp parts show of others, by rays; None without.
     """
 
     part: tuple[PyTree, ...]
     emitted: Float[Array, "v 3"] | None
+    reflected: tracing.Reflections | None = None
 
 
 class RelitScene(System):
@@ -50,6 +58,8 @@ class RelitScene(System):
         curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
         points: Where on each part radiance is asked for; None for the vertices.
         mipmapped: Materials of the parts with mip maps of their textures; None for BRDFs.
+        lobes: The BRDFs, as lobes, of parts that are too sharp for the harmonics of reflected light; None for others.
+        rays: How many rays each vertex or point of these sends for what they reflect.
     """
 
     scene: Scene
@@ -61,8 +71,19 @@ class RelitScene(System):
     curvature: Float[Array, " n"]
     points: tuple[Points, ...] | None
     mipmapped: tuple[TexturedMaterial | None, ...]
+    lobes: tuple[LobeBrdf | None, ...]
+    rays: int = eqx.field(static=True)
 
-    def __init__(self, scene: Scene, direct: Joined, shading: Sequence[Shading], bounces: PartBounces | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        direct: Joined,
+        shading: Sequence[Shading],
+        bounces: PartBounces | None = None,
+        *,
+        lobes: Sequence[LobeBrdf | None] | None = None,
+        rays: int = RAYS,
+    ):
         """Joins the parts' meshes.
 
         Args:
@@ -70,7 +91,11 @@ class RelitScene(System):
             direct: The systems of its parts, in order.
             shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
             bounces: Light that the parts reflect onto each other; None without.
+            lobes: As `RelitScene.lobes` has them; None where no part is sharp.
+            rays: As `RelitScene.rays` has it; 0 for reflections by harmonics alone.
         """
+        if rays < 0:
+            raise ValueError(f"rays must be at least 0, got {rays}")
         # What is no array cannot be an argument of a jitted function.
         parts = [
             part
@@ -80,7 +105,8 @@ class RelitScene(System):
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
         self.direct, self.shading, self.bounces, self.mesh = direct, tuple(shading), bounces, scene.mesh
-        self.points = None
+        self.points, self.rays = None, rays
+        self.lobes = tuple(None for _ in scene.parts) if lobes is None else tuple(lobes)
         self.mipmapped = tuple(
             part.material.mipmapped() if isinstance(part.material, TexturedMaterial) else None for part in scene.parts
         )
@@ -112,24 +138,62 @@ class RelitScene(System):
         """
         every = self._all(materials)
         counts = [len(part.mesh.position) for part in self.scene.parts]
+        surfaces = self._surfaces(materials)
         if self.points is not None:
             counts = list(map(len, self.points))
             rows = zip(self.scene.parts, self.shading, every, self.points, strict=True)
             every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
-        view = self._placed.view(eye, [each.blend for each in every])
+        blends = [each.blend for each in every]
+        view, reflected = self._traced(self._placed.view(eye, blends), surfaces, eye, blends)
         if all(each.emitted is None for each in every):
-            return SceneView(view, None)
+            return SceneView(view, None, reflected)
         emitted = [
             jnp.zeros((count, 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
             for count, each in zip(counts, every, strict=True)
         ]
-        return SceneView(view, jnp.concatenate(emitted))
+        return SceneView(view, jnp.concatenate(emitted), reflected)
+
+    def _traced(
+        self, view: PyTree, surfaces: Sequence[Surface], eye: Array, blends: Sequence[Blend | None]
+    ) -> tuple[PyTree, tracing.Reflections | None]:
+        """A view without what rays carry, and the rays."""
+        sharp = [number for number, each in enumerate(surfaces) if isinstance(each.reflecting, SharpPart)]
+        if not sharp:
+            return view, None
+        rows, seen = list(view[1]), None
+        if self.points is None:
+            with tracing.now(self.mesh, eye):
+                seen = jnp.split(tracing.facing(self.mesh, eye), self._bounds)
+        asked = []
+        for number in sharp:
+            points, faces = self.points and self.points[number], seen and seen[number]
+            asked.append(tracing.Asked(number, blends[number], points, faces))
+            own = surfaces[number].reflecting
+            assert isinstance(own, SharpPart)
+            rows[number] = rows[number] - own.carried(eye, blends[number], points, faces)
+        return (view[0], tuple(rows)), tracing.trace(self.mesh, surfaces, asked, eye, keep=True)
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, with what they emit."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
         color = self._placed.combine(light, view.part)
+        if view.reflected is not None:
+            color = color + self._read(view.reflected, light)
         return color if view.emitted is None else color + view.emitted
+
+    def _read(self, reflected: tracing.Reflections, light: PyTree) -> Float[Array, "v c"]:
+        """What rays add to all vertices or points."""
+        surfaces = self._surfaces(None)
+        sharp = [number for number, each in enumerate(surfaces) if isinstance(each.reflecting, SharpPart)]
+        rows = reflected.radiance([tracing.flattened(each) for each in surfaces], light)
+        counts = (
+            [len(part.mesh.position) for part in self.scene.parts] if self.points is None else map(len, self.points)
+        )
+        own = dict(zip(sharp, rows, strict=True))
+        color = rows[0].shape[1]
+        return jnp.concatenate(
+            [own.get(number, jnp.zeros((count, color), rows[0].dtype)) for number, count in enumerate(counts)]
+        )
 
     def radiance(
         self, environment: Environment, *, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None
@@ -177,6 +241,11 @@ class RelitScene(System):
     def _picture_view(self, camera: Camera | None, materials, *, samples: int, keep: bool) -> PictureView:
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        surfaces = self._surfaces(materials)
+        return pictures.make(self.mesh, self.system, surfaces, camera, samples=samples, keep=keep)
+
+    def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
+        """The parts as pictures shade them."""
         given = self.appearances(materials)
         surfaces, first = [], 0
         for number, (part, shading, system) in enumerate(
@@ -186,9 +255,17 @@ class RelitScene(System):
             material = (materials or {}).get(part.name, self.mipmapped[number])
             material = own if isinstance(material, Blend) else material
             reflecting = None if self.bounces is None else self.bounces.part[number]
+            lobes = self.lobes[number]
+            if reflecting is not None and lobes is not None and self.rays:
+                reflecting = SharpPart(reflecting.position, reflecting.frame, reflecting.brdf, lobes, self.rays)
             surfaces.append(Surface(part, first, shading, system, reflecting, own, material, self.curvature[number]))
             first += len(part.mesh.position)
-        return pictures.make(self.mesh, self.system, surfaces, camera, samples=samples, keep=keep)
+        return surfaces
+
+    def with_rays(self, rays: int) -> "RelitScene":
+        """The scene with another number of rays for the reflections of its sharp parts; 0 for harmonics alone."""
+        made = RelitScene(self.scene, self.direct, self.shading, self.bounces, lobes=self.lobes, rays=rays)
+        return made if self.points is None else made.at(self.points)
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
@@ -261,6 +338,11 @@ class RelitScene(System):
     def vertices(self) -> int:
         """Number of vertices, or of points."""
         return self._placed.vertices
+
+    @property
+    def _bounds(self) -> list[int]:
+        """Numbers of the first vertices of all parts but the first."""
+        return list(itertools.accumulate(len(part.mesh.position) for part in self.scene.parts[:-1]))
 
     @property
     def _placed(self) -> System:

@@ -1,6 +1,6 @@
 """Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
 
-from jaxprt.systems.bounces import functions, gather, jobs, parts, relight, system, tensor
+from jaxprt.systems.bounces import functions, gather, jobs, parts, relight, system, tensor, traced
 from jaxprt.systems.bounces.functions import factor
 from jaxprt.systems.bounces.parts import PartBounces, ReflectingPart
 from jaxprt.systems.bounces.relight import arriving, combine, light_side, radiance, view_side
@@ -26,5 +26,6 @@ __all__ = [
     "relight",
     "system",
     "tensor",
+    "traced",
     "view_side",
 ]
