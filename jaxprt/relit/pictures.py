@@ -16,7 +16,7 @@ from jaxprt.image import raster, rasterize, resolve, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation, tracing
 from jaxprt.relit.channels import at_points
-from jaxprt.relit.surface import Surface, at_vertices, lit, look
+from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
 from jaxprt.scene import Camera, Environment, Mesh
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
