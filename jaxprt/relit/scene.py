@@ -94,8 +94,7 @@ class RelitScene(System):
             lobes: As `RelitScene.lobes` has them; None where no part is sharp.
             rays: As `RelitScene.rays` has it; 0 for reflections by harmonics alone.
         """
-        if rays < 0:
-            raise ValueError(f"rays must be at least 0, got {rays}")
+        _check_rays(rays)
         # What is no array cannot be an argument of a jitted function.
         parts = [
             part
@@ -160,17 +159,17 @@ class RelitScene(System):
         sharp = [number for number, each in enumerate(surfaces) if isinstance(each.reflecting, SharpPart)]
         if not sharp:
             return view, None
-        rows, seen = list(view[1]), None
+        none = [None] * len(surfaces)
+        places, faces = self.points or none, none
         if self.points is None:
             with tracing.now(self.mesh, eye):
-                seen = jnp.split(tracing.facing(self.mesh, eye), self._bounds)
-        asked = []
+                faces = jnp.split(tracing.facing(self.mesh, eye), self._bounds)
+        rows, asked = list(view[1]), []
         for number in sharp:
-            points, faces = self.points and self.points[number], seen and seen[number]
-            asked.append(tracing.Asked(number, blends[number], points, faces))
+            asked.append(tracing.Asked(number, blends[number], places[number], faces[number]))
             own = surfaces[number].reflecting
             assert isinstance(own, SharpPart)
-            rows[number] = rows[number] - own.carried(eye, blends[number], points, faces)
+            rows[number] = rows[number] - own.carried(eye, blends[number], places[number], faces[number])
         return (view[0], tuple(rows)), tracing.trace(self.mesh, surfaces, asked, eye, keep=True)
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
@@ -247,6 +246,8 @@ class RelitScene(System):
     def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
         """The parts as pictures shade them."""
         given = self.appearances(materials)
+        with tracing.now(self.curvature):
+            curvature = list(self.curvature)
         surfaces, first = [], 0
         for number, (part, shading, system) in enumerate(
             zip(self.scene.parts, self.shading, self.direct.part, strict=True)
@@ -258,14 +259,17 @@ class RelitScene(System):
             lobes = self.lobes[number]
             if reflecting is not None and lobes is not None and self.rays:
                 reflecting = SharpPart(reflecting.position, reflecting.frame, reflecting.brdf, lobes, self.rays)
-            surfaces.append(Surface(part, first, shading, system, reflecting, own, material, self.curvature[number]))
+            surfaces.append(Surface(part, first, shading, system, reflecting, own, material, curvature[number]))
             first += len(part.mesh.position)
         return surfaces
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of rays for the reflections of its sharp parts; 0 for harmonics alone."""
-        made = RelitScene(self.scene, self.direct, self.shading, self.bounces, lobes=self.lobes, rays=rays)
-        return made if self.points is None else made.at(self.points)
+        _check_rays(rays)
+        made = object.__new__(RelitScene)  # Inside of jax.jit too, where nothing can be measured again.
+        for field in dataclasses.fields(self):
+            object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
+        return made
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
@@ -358,3 +362,8 @@ class RelitScene(System):
         given = self.appearances(materials)
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]
+
+
+def _check_rays(rays: int) -> None:
+    if type(rays) is not int or rays < 0:
+        raise ValueError(f"rays must be a whole number of at least 0, got {rays!r}")

@@ -29,7 +29,8 @@ from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 
 WIDE, NARROW = 8.0, 32.0  # concentrations up to which harmonics carry a lobe, and from which rays carry all of it
-_FEW = 0.02  # of what a BRDF reflects; harmonics keep less than this
+_FEW = 0.55  # of what the lobes of a BRDF reflect: where less than this would be traced, harmonics keep it all
+_LITTLE = 0.01  # of all that is reflected
 _GOLDEN = (5**0.5 - 1) / 2  # of a turn, from one ray to the next
 _TINY = 1e-12
 
@@ -62,7 +63,7 @@ class SharpPart(ReflectingPart):
     def __check_init__(self):
         """Refuses tables of another kind."""
         require.kind("the lobes", self.lobe, LobeBrdf, source="jaxprt.lobe.tabulate")
-        require.at_least("the number of rays", np.asarray(self.count), 1)
+        require.at_least("the number of rays", np.asarray(self.count), 1.0)
 
     def view(
         self,
@@ -140,11 +141,26 @@ def share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 @jit
 def narrow(table: LobeBrdf) -> Float[Array, ""]:
-    """Largest part of what a table reflects that would be traced, over its views and parameters."""
+    """Part of what the lobes of a table reflect that would be traced, over views by projected solid angle.
+
+    The largest over the table's parameters; 0 where next to all of the light is reflected by the diffuse part.
+    """
+    views = table.scale.shape[len(table.knot) + 1 :]
+    if table.isotropic:
+        radius = jnp.linspace(0, 1, views[0])
+        area = radius
+    else:
+        place = (jnp.arange(views[0]) + 0.5) / views[0] * 2 - 1
+        radius = jnp.minimum(jnp.hypot(place[:, None], place), 1)
+        area = jnp.ones_like(radius)
+    # Of the parabolic map with the tangent of half the angle as its radius.
+    area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
+    axes = tuple(range(-len(views), 0))
     lobe = jnp.sum(table.weight, 0)
-    traced = jnp.sum(lobe * share(jnp.exp(table.scale)), 0)
-    whole = jnp.sum(lobe, 0) + jnp.sum(table.diffuse, 0)
-    return jnp.max(traced / jnp.maximum(whole, _TINY))
+    traced = jnp.sum(jnp.sum(lobe * share(jnp.exp(table.scale)), 0) * area, axes)
+    glossy, diffuse = jnp.sum(jnp.sum(lobe, 0) * area, axes), jnp.sum(jnp.sum(table.diffuse, 0) * area, axes)
+    part = jnp.where(traced > _LITTLE * (glossy + diffuse), traced / jnp.maximum(glossy, _TINY), 0)
+    return jnp.max(part)
 
 
 def is_sharp(table: LobeBrdf) -> bool:
