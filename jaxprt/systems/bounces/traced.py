@@ -90,7 +90,7 @@ class SharpPart(ReflectingPart):
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
         """Harmonics of what rays carry. Arguments are those of `view`."""
-        return carried(self._lobes(eye, blend, points), blend, seen)
+        return _carried(self._lobes(eye, blend, points), blend, seen)
 
     @property
     def plain(self) -> ReflectingPart:
@@ -140,7 +140,7 @@ def share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 @jit
-def narrow(table: LobeBrdf) -> Float[Array, ""]:
+def _narrow(table: LobeBrdf) -> Float[Array, ""]:
     """Part of what the lobes of a table reflect that would be traced, over views by projected solid angle.
 
     The largest over the table's parameters; 0 where next to all of the light is reflected by the diffuse part.
@@ -165,11 +165,11 @@ def narrow(table: LobeBrdf) -> Float[Array, ""]:
 
 def is_sharp(table: LobeBrdf) -> bool:
     """Whether enough of what a table reflects would be traced."""
-    return bool(narrow(table) > _FEW)
+    return bool(_narrow(table) > _FEW)
 
 
 @jit
-def carried(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
+def _carried(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
     """Harmonics, in the local frames, of what rays carry."""
     strong = _strength(lobes, blend, seen)
     band = mixture.bands(lobes.concentration, degree=DEGREE)
@@ -203,7 +203,7 @@ def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, 
     total = jnp.sum(mass if seen is None else mass * seen, 0)
     chance = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
     above = jnp.cumsum(chance, 0)
-    shift, turn = scattered(position)
+    shift, turn = _scattered(position)
     place = (jnp.arange(count, dtype=shift.dtype)[:, None] + shift) / count
     number = jnp.minimum(jnp.sum(above[:, None] <= place, 0), len(above) - 1)
 
@@ -244,7 +244,7 @@ def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:
 
 
 @jit
-def scattered(position: Float[Array, "v 3"]) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
+def _scattered(position: Float[Array, "v 3"]) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
     """Two numbers from 0 to 1 for each position, the same ones for the same position and unlike ones for neighbors."""
     bits = position.astype(jnp.float32).view(jnp.uint32)
     state = (

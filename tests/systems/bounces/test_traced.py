@@ -108,9 +108,9 @@ def test_an_eye_for_each_point_is_the_eye_of_all(close):
 
 def test_points_scatter_evenly_and_places_alike(close):
     place = jnp.asarray(np.random.default_rng(3).normal(size=(4000, 3)), jnp.float32)
-    for each in traced.scattered(place):
+    for each in traced._scattered(place):
         histogram = np.histogram(np.asarray(each), 8, (0, 1))[0]
         assert np.all(np.abs(histogram - 500) < 120)
-    one, other = jax.jit(traced.scattered)(place), traced.scattered(place)
+    one, other = jax.jit(traced._scattered)(place), traced._scattered(place)
     np.testing.assert_array_equal(one[0], other[0])
     assert abs(np.corrcoef(one[0], one[1])[0, 1]) < 0.06
