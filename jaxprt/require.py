@@ -51,17 +51,18 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
         _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
 
 
-def position(name: str, value: Any) -> None:
+def position(name: str, value: Any, *, each: int | None = None) -> None:
     """Refuses what is not one finite position. Shapes are known inside `jax.jit` too.
 
     Args:
         name: What the value is, for the message: "the eye".
         value: An array or a list.
+        each: A number of points for each of which there may be a position of its own.
 
     Raises:
-        ValueError: It has not three values in one row, or some are not finite.
+        ValueError: It has not three values in one row, or in one row for each point, or some are not finite.
     """
-    if np.shape(value) != (3,):
+    if np.shape(value) not in ((3,), (each, 3)):
         raise ValueError(f"{name} must be one position, [3], got an array of shape {list(np.shape(value))}")
     finite(name, value)
 

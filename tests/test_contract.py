@@ -81,6 +81,7 @@ HOST = {
     "systems.lobe.relight.scales": "NumPy tables",
     "systems.lamps.transport": "traces rays",
     "systems.lobe.relight.view_lobes": "gives indices beside weights, compiled in steps; lobe.radiance has them all",
+    "systems.bounces.traced.is_sharp": "decides on the host",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
     "require.length": "checks a shape",
@@ -786,6 +787,7 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
+    "systems.bounces.traced.share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.met": example(

@@ -16,7 +16,7 @@ from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.planning import Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
-from jaxprt.relit.scene import RelitScene
+from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.systems.protocol import Joined
 from jaxprt.visibility import UnfinishedError
@@ -30,6 +30,7 @@ def precompute(
     environments: Sequence[Environment] | None = None,
     rate: float = 30.0,
     bounces: int | str | None = None,
+    rays: int = RAYS,
     roughness: tuple[float, float] | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
@@ -52,6 +53,8 @@ def precompute(
         bounces: How many times parts reflect light onto each other and themselves: a number, or "all" for as many times
             as it brings light; if None as many as the plan finds worth it, and none with `system`. Light that is
             reflected more than twice is diffuse.
+        rays: With bounces, how many rays each vertex or point of a part sends for its reflections, if these are too
+            sharp for the harmonics of reflected light; 0 for harmonics alone. See `RelitScene.with_rays`.
         roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` or a `BlinnPhong`
             may get later, beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and
             memory in tables.
@@ -111,7 +114,8 @@ def precompute(
     if bounces:
         # One store for any number of bounces: more go on from fewer.
         reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
-    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lit)
+    lobes = reflection.sharp(shadings, systems, folder) if bounces and rays else None
+    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:

@@ -1,8 +1,6 @@
 """Pictures of scenes: radiance at pixels where it pays, at vertices where it does not, and textures at pixels."""
 
 from collections.abc import Sequence
-from functools import partial, reduce
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,43 +14,15 @@ from jaxprt.brdf import Lambert
 from jaxprt.compile import Between, finished, jit
 from jaxprt.image import rasterize, shading_points
 from jaxprt.image.pixels import Pixels
-from jaxprt.relit import interpolation
+from jaxprt.relit import interpolation, tracing
 from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
-from jaxprt.relit.channels import Appearance, Shading, at_points
-from jaxprt.scene import Camera, Environment, Mesh, Part
-from jaxprt.scene.points import Points
-from jaxprt.systems.bounces import ReflectingPart
-from jaxprt.systems.lamps import LitByLamps
-from jaxprt.systems.protocol import Blend, System
+from jaxprt.relit.channels import at_points
+from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
+from jaxprt.scene import Camera, Environment, Mesh
+from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.protocol import System
 
 _ERROR = 0.01  # of radiance interpolated between vertices, from where it is made at the pixels
-
-
-class Surface(eqx.Module):
-    """A part of a scene as pictures shade it.
-
-    Attributes:
-        part: The part.
-        first: Number of its first vertex in the mesh of all parts.
-        shading: What it is to systems.
-        system: The system of its direct light.
-        reflecting: What it makes of light that arrives from other surfaces; None without.
-        lit: What it makes of the light of lamps; None without.
-        appearance: Its material at the vertices.
-        material: What has its material at points: a `TexturedMaterial`, an `Appearance` at the vertices, or None for
-            the part's own.
-        curvature: How sharp its radiance is, from `interpolation.curvature`.
-    """
-
-    part: Part
-    first: int = eqx.field(static=True)
-    shading: Shading
-    system: System
-    reflecting: ReflectingPart | None
-    lit: LitByLamps | None
-    appearance: Appearance
-    material: Any
-    curvature: Float[Array, ""]
 
 
 class PartPixels(eqx.Module):
@@ -62,7 +32,7 @@ class PartPixels(eqx.Module):
         number: Of the part.
         at_pixels: Whether radiance is made at the points; else it is made at the vertices and interpolated.
         index: Numbers of the points among all of the picture, in rows that are shaded at once; -1 in padding.
-        kept: Of each row what `_viewed` makes; None where that is made anew for each light.
+        kept: Of each row what `look` makes; None where that is made anew for each light.
     """
 
     number: int = eqx.field(static=True)
@@ -82,6 +52,7 @@ class PictureView(eqx.Module):
         canvas: What is shaded, and where it goes.
         part: What is shaded, by parts.
         lamp: Radiance of each lamp; None without.
+        reflected: What sharp parts show of others, by rays, row after row; None without.
     """
 
     mesh: Mesh
@@ -91,6 +62,7 @@ class PictureView(eqx.Module):
     canvas: Canvas
     part: tuple[PartPixels, ...]
     lamp: Float[Array, "n 3"] | None
+    reflected: tracing.Reflections | None = None
 
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
         """The picture in a light, in linear radiance. `between` is that of `RelitScene.picture`.
@@ -109,6 +81,14 @@ class PictureView(eqx.Module):
         direct, reflected = arriving
         arrived = ((own, (direct[own.number], reflected[own.number], self.lamp)) for own in self.part)
         rows = [self._rows(*each, between) for each in arrived]
+        if self.reflected is not None:
+            plain = [tracing.flattened(each) for each in self.surface]
+            more = iter(self.reflected.radiance(plain, (direct, reflected), self.lamp))
+            sharp = [isinstance(self.surface[own.number].reflecting, SharpPart) for own in self.part]
+            rows = [
+                each + jnp.stack([next(more) for _ in each]) if traced else each
+                for each, traced in zip(rows, sharp, strict=True)
+            ]
         return drawn(self.canvas, rows, environment)
 
     def _rows(
@@ -116,21 +96,21 @@ class PictureView(eqx.Module):
     ) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
         surface, eye = self.surface[own.number], self.camera.eye
-        vertices = None if own.at_pixels else finished(_at_vertices(surface, arriving, eye), between)
+        vertices = None if own.at_pixels else finished(at_vertices(surface, arriving, eye), between)
         if own.kept is not None:
-            return jnp.stack([finished(_lit(surface, arriving, vertices, view), between) for view in own.kept])
+            return jnp.stack([finished(lit(surface, arriving, vertices, view), between) for view in own.kept])
 
-        def shaded(index):
+        def row(index):
             points = points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
-            return finished(_shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels), between)
+            return finished(shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels), between)
 
         if not isinstance(own.index, Tracer):
-            return jnp.stack([shaded(index) for index in own.index])
-        shape = jax.eval_shape(shaded, own.index[0])
+            return jnp.stack([row(index) for index in own.index])
+        shape = jax.eval_shape(row, own.index[0])
 
         def some(index):
             none = jnp.zeros(shape.shape, shape.dtype)
-            return jax.lax.cond(jnp.any(index >= 0), lambda: shaded(index), lambda: none)
+            return jax.lax.cond(jnp.any(index >= 0), lambda: row(index), lambda: none)
 
         return jax.lax.map(some, own.index)
 
@@ -158,24 +138,42 @@ def make(
         keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
         between: As in `RelitScene.picture`.
     """
+    if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):
+        pixels, rows = _placed(mesh, surfaces, camera, samples, between)
+    else:
+        with tracing.now(mesh, camera, [each.curvature for each in surfaces]):
+            pixels, rows = _placed(mesh, surfaces, camera, samples, between)
+    parts, asked = [], []
+    for number, at_pixels, index in rows:
+        surface, kept = surfaces[number], None
+        with tracing.now(pixels, mesh.face, index):
+            points = [points_of(pixels, mesh.face, surface.first, each) for each in index]
+        if keep and not isinstance(index, Tracer):
+            kept = tuple(look(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
+        parts.append(PartPixels(number, at_pixels, index, kept))
+        if isinstance(surface.reflecting, SharpPart):
+            looks = (at_points(surface.part, surface.shading, surface.material, each) for each in points)
+            asked += [tracing.Asked(number, *each) for each in zip((look.blend for look in looks), points, strict=True)]
+    canvas = lay_out(pixels, [each.index for each in parts], camera)
+    reflected = tracing.trace(mesh, surfaces, asked, camera.eye, keep=keep) if asked else None
+    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp, reflected)
+
+
+def _placed(
+    mesh: Mesh, surfaces: Sequence[Surface], camera: Camera, samples: int, between: Between
+) -> tuple[Pixels, list[tuple[int, bool, Array]]]:
+    """The points of a picture; and of each part that it shows whether radiance is made at them, and their numbers."""
     bend = _bends([each.curvature for each in surfaces], mesh.region)
     fragments = finished(rasterize(mesh, camera, samples=samples), between)
     pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
     finished(pixels, between)
     owner, wrong = _judged(mesh, bend, pixels, camera)
-    parts = []
+    rows = []
     for number, surface in enumerate(surfaces):
         index = rows_of(owner == number)
-        if not index.size:
-            continue
-        at_pixels = _pays(surface, wrong, index)
-        kept = None
-        if keep and not isinstance(index, Tracer):
-            points = (points_of(pixels, mesh.face, surface.first, each) for each in index)
-            kept = tuple(_viewed(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
-        parts.append(PartPixels(number, at_pixels, index, kept))
-    canvas = lay_out(pixels, [each.index for each in parts], camera)
-    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp)
+        if index.size:
+            rows.append((number, _pays(surface, wrong, index), index))
+    return pixels, rows
 
 
 @jit
@@ -206,76 +204,3 @@ def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
     used = np.asarray(index)
     used = used[used >= 0]
     return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
-
-
-@partial(jit, static_argnames="at_pixels")
-def _viewed(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
-    """Some points of a part, the material there, and what systems make of the view of them."""
-    appearance = at_points(surface.part, surface.shading, surface.material, points)
-    return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
-
-
-@jit
-def _lit(
-    surface: Surface,
-    arriving: tuple[PyTree, PyTree, PyTree],
-    vertices: Float[Array, "k v c"] | None,
-    viewed: tuple[Points, Appearance, PyTree],
-) -> Float[Array, "p c"]:
-    """Colors of some points of a part: of the light that arrives, or of radiance at the vertices."""
-    points, appearance, view = viewed
-    if vertices is None:
-        color = _combine(surface, arriving, view, points)
-    elif appearance.blend is None:
-        color = points.carry(vertices[0])
-    else:
-        weight = jnp.moveaxis(appearance.blend.weight, 1, 0)
-        color = reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True)))
-    return color if appearance.emitted is None else color + appearance.emitted
-
-
-@partial(jit, static_argnames="at_pixels")
-def _shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
-    """Colors of some points of a part. For derivatives what is between is made again, not kept."""
-
-    def both(surface, arriving, vertices, eye):
-        viewed = _viewed(surface, points, eye, at_pixels=at_pixels)
-        return _lit(surface, arriving, vertices, viewed)
-
-    return jax.checkpoint(both)(surface, arriving, vertices, eye)
-
-
-@jit
-def _at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
-    """Radiance of the vertices of a part, of each channel of its BRDF by itself."""
-    blend = surface.appearance.blend
-    if blend is None:
-        return _combine(surface, arriving, _view(surface, eye, None, None), None)[None]
-    rows = []
-    for channel in range(blend.weight.shape[1]):
-        one = jnp.zeros_like(blend.weight[..., :1]).at[:, channel].set(1)
-        rows.append(_combine(surface, arriving, _view(surface, eye, None, Blend(one, blend.parameter)), None))
-    return jnp.stack(rows)
-
-
-def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
-    """What the systems of a part make of a view, at points or at the vertices."""
-    system = surface.system if points is None else surface.system.at(points)
-    reflected, lit = (
-        None if each is None else each.view(eye, blend, points) for each in (surface.reflecting, surface.lit)
-    )
-    return system.view(eye, blend), reflected, lit
-
-
-def _combine(
-    surface: Surface,
-    arriving: tuple[PyTree, PyTree, PyTree],
-    view: tuple[PyTree, PyTree, PyTree],
-    points: Points | None,
-) -> Array:
-    """Radiance of the systems of a part."""
-    system = surface.system if points is None else surface.system.at(points)
-    color = system.combine(arriving[0], view[0])
-    if surface.reflecting is not None:
-        color = color + surface.reflecting.combine(arriving[1], view[1], points)
-    return color if surface.lit is None else color + surface.lit.combine(arriving[2], view[2])

@@ -117,11 +117,8 @@ class Lobes(eqx.Module):
             vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
             matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
-        table = kept(
-            None if target.path is None else pathlib.Path(f"{target.path}_table_{self.lobes}.prt"),
-            (shading.brdf, shading.knot, self.lobes),
-            lambda: lobe.tabulate(shading.brdf, lobes=self.lobes, knot=shading.knot),
-        )
+        path = None if target.path is None else pathlib.Path(f"{target.path}_table_{self.lobes}.prt")
+        table = lobe_table(shading, self.lobes, path)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
@@ -251,6 +248,12 @@ def _bright(system: System, visible, shading: Shading, texels: int, size: int) -
     sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     samples = bright_texels.samples_for(sharpest, size=size)
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
+
+
+def lobe_table(shading: Shading, lobes: int, path: pathlib.Path | None) -> lobe.LobeBrdf:
+    """The BRDF of a part in lobes, over its roughness if that varies; kept in a folder if one is given."""
+    key = shading.brdf, shading.knot, lobes
+    return kept(path, key, lambda: lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot))
 
 
 def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:

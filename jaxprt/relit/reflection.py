@@ -1,5 +1,7 @@
 """Light that the parts of a scene reflect onto each other: what it is worth, and how it is precomputed."""
 
+import math
+import pathlib
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -7,16 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import Lambert
-from jaxprt.relit.channels import Shading
-from jaxprt.relit.recipes import Target, harmonic_table
+from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf.varying import PerVertex
+from jaxprt.relit.channels import RoughnessFamily, Shading
+from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions
 from jaxprt.systems import bounces, harmonic, separable
-from jaxprt.systems.bounces import PartBounces, ReflectingPart
+from jaxprt.systems.bounces import PartBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
+from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import TransferVector
+from jaxprt.systems.lobe import LobeBrdf, LobeSystem
+from jaxprt.systems.protocol import System
 
 ALL = bounces.build.ALL
 _EACH = 3  # bounces that are estimated one by one; those that follow fall as the last two do
@@ -24,6 +30,8 @@ _EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
 _SLOWEST = 0.95  # share of a bounce that the next one has, at most
+_LOBES = 8  # of parts whose systems have none, for the rays of sharp ones
+_LEAST = 0.3  # roughness, the square root of GGX's alpha, of what is sent: 3 % off in albedo
 _VIEWS = 16  # over whose angles albedo is averaged
 _RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
 
@@ -68,6 +76,28 @@ def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartB
         for each, axes in zip(shadings, frame, strict=True)
     ]
     return PartBounces(tensor, tuple(parts))
+
+
+def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathlib.Path | None) -> list[LobeBrdf | None]:
+    """Lobes of the parts whose reflections are traced; None for those that harmonics are enough for.
+
+    Args:
+        shadings: What the parts are to systems.
+        systems: The systems of the parts, whose tables of lobes are taken where they have some.
+        folder: What keeps tables that are made here; None keeps nothing.
+    """
+    result: list[LobeBrdf | None] = []
+    for number, (shading, system) in enumerate(zip(shadings, systems, strict=True)):
+        if isinstance(shading.brdf, Lambert):
+            result.append(None)
+            continue
+        inner = system.system if isinstance(system, BrightTexels) else system
+        table = inner.brdf if isinstance(inner, LobeSystem) else None
+        if table is None:
+            path = None if folder is None else folder / f"{number}_sharp_{_LOBES}.prt"
+            table = lobe_table(shading, _LOBES, path)
+        result.append(table if traced.is_sharp(table) else None)
+    return result
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
@@ -118,10 +148,34 @@ def _joined(shadings: Sequence[Shading]) -> Mesh:
 
 
 def _factored(shading: Shading) -> separable.SeparableBrdf:
-    """What a part reflects light with on its way to others."""
-    brdf = _still(shading)
+    """What a part reflects light with on its way to others: nothing sharper than so few texels and terms can hold.
+
+    Factored as it is, a metal of roughness .1 would send twelve times its light to others. The light that is sent has
+    6 x 8 x 8 texels and arrives as 16 harmonics, so that a wider lobe of the same energy sends the same.
+    """
+    brdf = _blunt(shading)
     terms = 1 if isinstance(brdf, Lambert) else _TERMS
     return separable.factor(brdf, terms=terms, resolution=_RESOLUTION)
+
+
+def _blunt(shading: Shading) -> Callable:
+    """The BRDF of a part at the mean roughness, or at the least that is sent."""
+    if shading.knot:
+        assert shading.blend is not None
+        least = math.log(_LEAST if isinstance(shading.brdf, RoughnessFamily) else _LEAST**2)
+        return shading.brdf(jnp.asarray(max(float(np.mean(shading.blend.parameter[0])), least)))
+    if isinstance(shading.exact, PerVertex) and not isinstance(shading.brdf, Lambert):
+        model = shading.exact.model
+        assert isinstance(model, MetallicRoughness)
+        assert shading.scale is not None
+        family = RoughnessFamily(shading.term, shading.scale, model.anisotropy[0])
+        return family(math.log(max(float(jnp.mean(model.roughness)), _LEAST)))
+    brdf = shading.brdf
+    if isinstance(brdf, CookTorrance):
+        return eqx.tree_at(lambda each: each.roughness, brdf, jnp.maximum(brdf.roughness, _LEAST**2))
+    if isinstance(brdf, BlinnPhong):
+        return eqx.tree_at(lambda each: each.exponent, brdf, jnp.minimum(brdf.exponent, 2 / _LEAST**4 - 2))
+    return brdf
 
 
 def _albedo(shading: Shading) -> Float[np.ndarray, "3"]:

@@ -12,17 +12,22 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between
-from jaxprt.relit import interpolation, measuring, pictures
+from jaxprt.relit import interpolation, measuring, pictures, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
 from jaxprt.relit.lamps import SceneLamps
-from jaxprt.relit.pictures import PictureView, Surface
+from jaxprt.relit.pictures import PictureView
+from jaxprt.relit.surface import Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import PartBounces
+from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, Joined, System, Total
+
+RAYS = 8  # of each vertex or point of a sharp part
 
 
 class SceneView(eqx.Module):
@@ -32,11 +37,13 @@ class SceneView(eqx.Module):
         part: The views of its parts, as their systems have them.
         emitted: Radiance that each vertex emits; None where none does.
         lit: Radiance of the vertices of each part in the light of each lamp of radiance 1; None without lamps.
+        reflected: What sharp parts show of others, by rays; None without.
     """
 
     part: tuple[PyTree, ...]
     emitted: Float[Array, "v 3"] | None
     lit: tuple[Float[Array, "n _ _"], ...] | None = None
+    reflected: tracing.Reflections | None = None
 
 
 class SceneLight(eqx.Module):
@@ -70,6 +77,8 @@ class RelitScene(System):
         curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
         points: Where on each part radiance is asked for; None for the vertices.
         mipmapped: Materials of the parts with mip maps of their textures; None for BRDFs.
+        lobes: The BRDFs, as lobes, of parts that are too sharp for the harmonics of reflected light; None for others.
+        rays: How many rays each vertex or point of these sends for what they reflect.
     """
 
     scene: Scene
@@ -82,6 +91,8 @@ class RelitScene(System):
     curvature: Float[Array, " n"]
     points: tuple[Points, ...] | None
     mipmapped: tuple[TexturedMaterial | None, ...]
+    lobes: tuple[LobeBrdf | None, ...]
+    rays: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -89,7 +100,10 @@ class RelitScene(System):
         direct: Joined,
         shading: Sequence[Shading],
         bounces: PartBounces | None = None,
+        *,
         lamps: SceneLamps | None = None,
+        lobes: Sequence[LobeBrdf | None] | None = None,
+        rays: int = RAYS,
     ):
         """Joins the parts' meshes.
 
@@ -99,7 +113,10 @@ class RelitScene(System):
             shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
             bounces: Light that the parts reflect onto each other; None without.
             lamps: What the scene's lamps are to its parts; None without.
+            lobes: As `RelitScene.lobes` has them; None where no part is sharp.
+            rays: As `RelitScene.rays` has it; 0 for reflections by harmonics alone.
         """
+        _check_rays(rays)
         # What is no array cannot be an argument of a jitted function.
         parts = [
             part
@@ -109,8 +126,8 @@ class RelitScene(System):
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
         self.direct, self.shading, self.bounces, self.lamps = direct, tuple(shading), bounces, lamps
-        self.mesh = scene.mesh
-        self.points = None
+        self.mesh, self.points, self.rays = scene.mesh, None, rays
+        self.lobes = tuple(None for _ in scene.parts) if lobes is None else tuple(lobes)
         self.mipmapped = tuple(
             part.material.mipmapped() if isinstance(part.material, TexturedMaterial) else None for part in scene.parts
         )
@@ -143,33 +160,39 @@ class RelitScene(System):
             ValueError: There is no such part, or a material has what was not precomputed; see
                 `jaxprt.relit.channels.appearance`.
         """
-        every = self._all(scene_lamps.split(self.lamps, materials)[0])
+        materials = scene_lamps.split(self.lamps, materials)[0]
+        every = self._all(materials)
         counts = [len(part.mesh.position) for part in self.scene.parts]
+        surfaces = self._surfaces(materials)
         if self.points is not None:
             counts = list(map(len, self.points))
             rows = zip(self.scene.parts, self.shading, every, self.points, strict=True)
             every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
-        view, lit = self._placed.view(eye, [each.blend for each in every]), None
+        blends, lit = [each.blend for each in every], None
         if self.lamps is not None:
-            places = [None] * len(every) if self.points is None else self.points
-            rows = zip(self.lamps.part, every, places, strict=True)
-            lit = tuple(part.view(eye, own.blend, points) for part, own, points in rows)
+            rows = zip(self.lamps.part, blends, self.points or [None] * len(every), strict=True)
+            lit = tuple(part.view(eye, own, points) for part, own, points in rows)
+        view, reflected = tracing.split(self.mesh, surfaces, self._placed.view(eye, blends), eye, blends, self.points)
         if all(each.emitted is None for each in every):
-            return SceneView(view, None, lit)
+            return SceneView(view, None, lit, reflected)
         emitted = [
             jnp.zeros((count, 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
             for count, each in zip(counts, every, strict=True)
         ]
-        return SceneView(view, jnp.concatenate(emitted), lit)
+        return SceneView(view, jnp.concatenate(emitted), lit, reflected)
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, with what they emit."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
-        if self.lamps is None or view.lit is None:
-            color = self._placed.combine(light, view.part)
-        else:
+        lamp = None
+        if self.lamps is not None and view.lit is not None:
             require.kind("the light", light, SceneLight, source="RelitScene.shade")
-            color = self._placed.combine(light.arriving, view.part) + self.lamps.combine(light.lamp, view.lit)
+            light, lamp = light.arriving, light.lamp
+        color = self._placed.combine(light, view.part)
+        if self.lamps is not None and lamp is not None and view.lit is not None:
+            color = color + self.lamps.combine(lamp, view.lit)
+        if view.reflected is not None:
+            color = color + tracing.read(view.reflected, self._surfaces(None), light, lamp, self.points)
         return color if view.emitted is None else color + view.emitted
 
     def radiance(
@@ -224,8 +247,15 @@ class RelitScene(System):
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         materials, changed = scene_lamps.split(self.lamps, materials)
+        surfaces = self._surfaces(materials)
+        lamp = None if self.lamps is None else self.lamps.radiance([each.appearance for each in surfaces], changed)
+        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
+
+    def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
+        """The parts as pictures shade them."""
         given = self.appearances(materials)
-        lamp = None if self.lamps is None else self.lamps.radiance(self._all(given), changed)
+        with tracing.now(self.curvature):
+            curvature = list(self.curvature)
         surfaces, first = [], 0
         for number, (part, shading, system) in enumerate(
             zip(self.scene.parts, self.shading, self.direct.part, strict=True)
@@ -235,10 +265,20 @@ class RelitScene(System):
             material = own if isinstance(material, Blend) else material
             reflecting = None if self.bounces is None else self.bounces.part[number]
             lit = None if self.lamps is None else self.lamps.part[number]
-            curvature = self.curvature[number]
-            surfaces.append(Surface(part, first, shading, system, reflecting, lit, own, material, curvature))
+            lobes = self.lobes[number]
+            if reflecting is not None and lobes is not None and self.rays:
+                reflecting = SharpPart(reflecting.position, reflecting.frame, reflecting.brdf, lobes, self.rays)
+            surfaces.append(Surface(part, first, shading, system, reflecting, lit, own, material, curvature[number]))
             first += len(part.mesh.position)
-        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
+        return surfaces
+
+    def with_rays(self, rays: int) -> "RelitScene":
+        """The scene with another number of rays for the reflections of its sharp parts; 0 for harmonics alone."""
+        _check_rays(rays)
+        made = object.__new__(RelitScene)  # Inside of jax.jit too, where nothing can be measured again.
+        for field in dataclasses.fields(self):
+            object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
+        return made
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
@@ -331,3 +371,8 @@ class RelitScene(System):
         given = self.appearances(materials)
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]
+
+
+def _check_rays(rays: int) -> None:
+    if type(rays) is not int or rays < 0:
+        raise ValueError(f"rays must be a whole number of at least 0, got {rays!r}")

@@ -99,7 +99,9 @@ def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> F
 
 
 @jit
-def view(frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Float[Array, "3"]) -> Float[Array, "*v 3"]:
+def view(
+    frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Float[Array, "3"] | Float[Array, "*v 3"]
+) -> Float[Array, "*v 3"]:
     """Local unit directions to the eye, raised to 0.6 degrees above the horizon where they are lower.
 
     A vertex can look away from the eye while a triangle around it is visible: at every silhouette. Interpolation over
@@ -108,12 +110,12 @@ def view(frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Flo
     Args:
         frame: Rows are tangent, bitangent, normal.
         position: Points in world units.
-        eye: Position of the viewer.
+        eye: Position of the viewer, one for all points or one for each.
 
     Returns:
         Unit directions. Where the eye is straight behind a point, the direction lies along its tangent.
     """
-    offset = [eye[i] - position[..., i] for i in range(3)]
+    offset = [eye[..., i] - position[..., i] for i in range(3)]
     local = normalize(jnp.stack([sum(frame[..., i, j] * offset[j] for j in range(3)) for i in range(3)], -1))
     low = local[..., 2] < _GRAZING
     square = local[..., 0] ** 2 + local[..., 1] ** 2

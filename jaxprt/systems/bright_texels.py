@@ -118,7 +118,7 @@ class BrightTexels(VertexSystem):
         rest = self.system.shade(light.rest, materials)
         return BrightLight(rest, light.texel, light.excess, _seen(self.visibility, light.texel))
 
-    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> BrightView:
+    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
         """The view, as the system has it, and the frames and directions in which the texels are summed."""
         position, frame = self.place(self.visibility)
         return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)

@@ -1,7 +1,7 @@
 """Where rays from points on surfaces meet other surfaces, and whether they meet these from the front."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from jaxprt.sphere import cubemap
 from jaxprt.visibility.occluder import Occluder
@@ -44,3 +44,24 @@ def front(
     across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
     side = np.sum(across * np.sum(normal[corner], 1), -1)
     return side * np.sum(across * direction, -1) < 0
+
+
+def first_fronts(
+    occluder: Occluder,
+    normal: Float[np.ndarray, "v 3"],
+    start: Float32[np.ndarray, "b 3"],
+    direction: Float32[np.ndarray, "b 3"],
+) -> tuple[Int[np.ndarray, " b"], Float[np.ndarray, "b 3"]]:
+    """The first triangle on each ray and the weights of its corners; -1 where rays meet nothing, or a back.
+
+    Args:
+        occluder: The scene.
+        normal: Normals of its vertices.
+        start: Where rays start.
+        direction: Unit directions.
+    """
+    triangle, _, barycentric = occluder.hit(start, direction)
+    met = np.flatnonzero(triangle >= 0)
+    triangle[met[~front(occluder, normal, occluder.face[triangle[met]], direction[met])]] = -1
+    weight = np.clip(barycentric, 0, 1)
+    return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

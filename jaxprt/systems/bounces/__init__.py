@@ -1,6 +1,18 @@
 """Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
 
-from jaxprt.systems.bounces import between, build, functions, gather, jobs, parts, patches, relight, system, tensor
+from jaxprt.systems.bounces import (
+    between,
+    build,
+    functions,
+    gather,
+    jobs,
+    parts,
+    patches,
+    relight,
+    system,
+    tensor,
+    traced,
+)
 from jaxprt.systems.bounces.build import precompute
 from jaxprt.systems.bounces.functions import factor
 from jaxprt.systems.bounces.parts import PartBounces, ReflectingPart
@@ -32,5 +44,6 @@ __all__ = [
     "relight",
     "system",
     "tensor",
+    "traced",
     "view_side",
 ]

@@ -39,7 +39,9 @@ class ReflectingPart(eqx.Module):
         if self.brdf.degree != DEGREE:
             raise ValueError(f"the BRDF must have degree {DEGREE}, that of reflected light, got {self.brdf.degree}")
 
-    def view(self, eye: Float[Array, "3"], blend: Blend | None, points: Points | None = None) -> Float[Array, "lm _ _"]:
+    def view(
+        self, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points | None = None
+    ) -> Float[Array, "lm _ _"]:
         """Harmonics of the BRDF of each vertex or point for its view; the blend is of these."""
         return harmonic.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
 

@@ -54,6 +54,11 @@ def _eye(value: Any) -> None:
     require.finite("the eye", value)
 
 
+def _eyes(value: Any) -> None:
+    require.array("the eye", value, "3", "v 3")
+    require.finite("the eye", value)
+
+
 def _probe(value: Any) -> None:
     require.array("probes", value, "p 3")
     require.finite("probes", value)
@@ -232,16 +237,16 @@ def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"])
     return jnp.einsum("vcoi,ic->ocv", transport.matrix, jnp.broadcast_to(light, (terms, colors)))
 
 
-@require.arguments(brdf=_brdf, eye=_eye)
+@require.arguments(brdf=_brdf, eye=_eyes)
 @jit
 def view_coefficients(
     brdf: HarmonicBrdf,
     position: Float[Array, "v 3"],
     frame: Float[Array, "v 3 3"],
     *parameter: Float[Array, " v"],
-    eye: Float[Array, "3"],
+    eye: Float[Array, "3"] | Float[Array, "v 3"],
 ) -> Float[Array, "lm c v"]:
-    """The BRDF's coefficients for every vertex's view, in its frame: the view side."""
+    """The BRDF's coefficients for every vertex's view, in its frame: the view side. The eye may be one for each."""
     return brdf.coefficients(directions.view(right_handed(frame), position, eye), *parameter)
 
 

@@ -49,7 +49,7 @@ class HarmonicSystem(protocol.VertexSystem):
         window = harmonics.least_laplacian(coefficient, self.laplacian)
         return transferred_light(self.transport, harmonics.convolve(coefficient, window))
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
         """The BRDF's harmonics for each vertex's view: `jaxprt.harmonic.view_coefficients`."""
         return blended_view(self.brdf, *self.place(self.transport), materials, eye=eye)
 
@@ -89,10 +89,10 @@ class DiffuseSystem(protocol.VertexSystem):
         """Harmonics of the light: `jaxprt.harmonic.project`."""
         return _projected(environment, harmonics.degree_of(self.transport.vector.shape[0]))
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
         """The albedo, of all or of each; the eye changes nothing."""
         protocol.check_blend(materials)
-        require.position("the eye", eye)
+        require.position("the eye", eye, each=self.vertices)
         if materials is None:
             return self.albedo[None]
         materials.check(self.vertices, 1)
@@ -129,7 +129,7 @@ def blended_view(
     frame: Float[Array, "v 3 3"],
     materials: Blend | None,
     *,
-    eye: Float[Array, "3"],
+    eye: Float[Array, "*p 3"],
 ) -> Float[Array, "lm c v"]:
     """`jaxprt.harmonic.view_coefficients` of a table whose channels and parameters a blend has for each vertex.
 

@@ -140,7 +140,7 @@ def view_lobes(
     transport: LobeTransport,
     brdf: LobeBrdf,
     *parameter: Float[Array, " v"],
-    eye: Float[Array, "3"],
+    eye: Float[Array, "*p 3"],
     points: Points | None = None,
 ) -> LobeView:
     """Where each vertex, or point, reads the light for a view, and what it sees there.
@@ -149,14 +149,15 @@ def view_lobes(
         transport: Visibility pyramids.
         brdf: A table of lobes.
         parameter: Those of each vertex or point, for a table over some.
-        eye: Position of the viewer in world units.
+        eye: Position of the viewer in world units, or one for each vertex or point.
         points: Where; None for the vertices.
 
     Raises:
         TypeError: The BRDF is no table of lobes.
-        ValueError: The number of parameters is not that of the table, or the eye is not one finite position.
+        ValueError: The number of parameters is not that of the table, or the eye is not one finite position, nor
+            one for each.
     """
-    require.position("the eye", eye)
+    require.position("the eye", eye, each=len(transport.position if points is None else points))
     return _view_lobes(transport, brdf, parameter, eye, points)
 
 

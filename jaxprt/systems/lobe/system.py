@@ -40,7 +40,7 @@ class LobeSystem(protocol.VertexSystem):
             )
         return lit
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> LobeView:
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> LobeView:
         """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.view_lobes`."""
         protocol.check_blend(materials)
         if materials is None:

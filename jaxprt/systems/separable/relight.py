@@ -234,14 +234,14 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
 
 
 def view_factors(
-    brdf: SeparableBrdf, position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], eye: Float[Array, "3"]
+    brdf: SeparableBrdf, position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], eye: Float[Array, "*p 3"]
 ) -> Float[Array, "v r c"]:
     """View maps looked up for any positions and frames: `view_tuple` without a transport.
 
     Raises:
-        ValueError: The eye is not one position, or not finite.
+        ValueError: The eye is neither one position nor one for each, or not finite.
     """
-    require.position("the eye", eye)
+    require.position("the eye", eye, each=len(position))
     return _view_factors(brdf, position, frame, eye)
 
 

@@ -38,7 +38,7 @@ class SeparableSystem(protocol.VertexSystem):
         """The light-modulated tuple of every vertex: `jaxprt.separable.light_tuple`."""
         return light_tuple(self.transport, environment)
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> Float[Array, "v r d"]:
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "v r d"]:
         """The view-modulated tuple of every vertex: `jaxprt.separable.view_tuple`."""
         protocol.check_blend(materials)
         factor = view_factors(self.brdf, *self.place(self.transport), eye)

@@ -1,0 +1,119 @@
+"""Parts of scenes as pictures shade them: views and radiance at points and vertices, of all light that a part gets."""
+
+from functools import partial, reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jaxprt.compile import jit
+from jaxprt.relit.channels import Appearance, Shading, at_points
+from jaxprt.scene import Part
+from jaxprt.scene.points import Points
+from jaxprt.systems.bounces import ReflectingPart
+from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.protocol import Blend, System
+
+
+class Surface(eqx.Module):
+    """A part of a scene as pictures shade it.
+
+    Attributes:
+        part: The part.
+        first: Number of its first vertex in the mesh of all parts.
+        shading: What it is to systems.
+        system: The system of its direct light.
+        reflecting: What it makes of light that arrives from other surfaces; None without.
+        lit: What it makes of the light of lamps; None without.
+        appearance: Its material at the vertices.
+        material: What has its material at points: a `TexturedMaterial`, an `Appearance` at the vertices, or None for
+            the part's own.
+        curvature: How sharp its radiance is, from `interpolation.curvature`.
+        glows: Whether what it emits is seen. Rays of reflections leave it out: lamps have highlights of their own.
+    """
+
+    part: Part
+    first: int = eqx.field(static=True)
+    shading: Shading
+    system: System
+    reflecting: ReflectingPart | None
+    lit: LitByLamps | None
+    appearance: Appearance
+    material: Any
+    curvature: Float[Array, ""]
+    glows: bool = eqx.field(static=True, default=True)
+
+
+@partial(jit, static_argnames="at_pixels")
+def look(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
+    """Some points of a part, the material there, and what systems make of the view of them."""
+    appearance = at_points(surface.part, surface.shading, surface.material, points)
+    return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
+
+
+@jit
+def lit(
+    surface: Surface,
+    arriving: tuple[PyTree, PyTree, PyTree],
+    vertices: Float[Array, "k v c"] | None,
+    viewed: tuple[Points, Appearance, PyTree],
+) -> Float[Array, "p c"]:
+    """Colors of some points of a part: of the light that arrives, or of radiance at the vertices."""
+    points, appearance, view = viewed
+    if vertices is None:
+        color = _combine(surface, arriving, view, points)
+    elif appearance.blend is None:
+        color = points.carry(vertices[0])
+    else:
+        weight = jnp.moveaxis(appearance.blend.weight, 1, 0)
+        color = reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True)))
+    return color if appearance.emitted is None or not surface.glows else color + appearance.emitted
+
+
+@partial(jit, static_argnames="at_pixels")
+def shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
+    """Colors of some points of a part. For derivatives what is between is made again, not kept."""
+
+    def both(surface, arriving, vertices, eye):
+        viewed = look(surface, points, eye, at_pixels=at_pixels)
+        return lit(surface, arriving, vertices, viewed)
+
+    return jax.checkpoint(both)(surface, arriving, vertices, eye)
+
+
+@jit
+def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
+    """Radiance of the vertices of a part, of each channel of its BRDF by itself."""
+    blend = surface.appearance.blend
+    if blend is None:
+        return _combine(surface, arriving, _view(surface, eye, None, None), None)[None]
+    rows = []
+    for channel in range(blend.weight.shape[1]):
+        one = jnp.zeros_like(blend.weight[..., :1]).at[:, channel].set(1)
+        rows.append(_combine(surface, arriving, _view(surface, eye, None, Blend(one, blend.parameter)), None))
+    return jnp.stack(rows)
+
+
+def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
+    """What the systems of a part make of a view, at points or at the vertices."""
+    system = surface.system if points is None else surface.system.at(points)
+    reflected, lamps = (
+        None if each is None else each.view(eye, blend, points) for each in (surface.reflecting, surface.lit)
+    )
+    return system.view(eye, blend), reflected, lamps
+
+
+def _combine(
+    surface: Surface,
+    arriving: tuple[PyTree, PyTree, PyTree],
+    view: tuple[PyTree, PyTree, PyTree],
+    points: Points | None,
+) -> Array:
+    """Radiance of the systems of a part."""
+    system = surface.system if points is None else surface.system.at(points)
+    color = system.combine(arriving[0], view[0])
+    if surface.reflecting is not None:
+        color = color + surface.reflecting.combine(arriving[1], view[1], points)
+    return color if surface.lit is None else color + surface.lit.combine(arriving[2], view[2])

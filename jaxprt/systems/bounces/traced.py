@@ -1,0 +1,260 @@
+"""Reflections that sixteen harmonics are too few for: which lobes rays carry in their place, and where the rays go.
+
+A von Mises-Fisher lobe of concentration k leaves A_l(k) of band l of the light that it is averaged over. What the lobe
+would read above the bands of the arriving light is lost to the harmonics, so narrow lobes are traced: `share` tells how
+much of each, a smooth function of its concentration. The same share is taken out of the harmonics of the BRDF, where a
+lobe has the coefficients weight * A_l(k) * Y(center), so that nothing counts twice.
+
+The rays of a point are quantiles of the mixture of its narrow lobes. Where they go depends on the view and on the
+widths of the lobes, not on colors; how much each of them counts depends on colors too, and is differentiable in them.
+"""
+
+import math
+from functools import partial, reduce
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxprt import require
+from jaxprt.compile import jit
+from jaxprt.decompose import mixture
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import directions, harmonics
+from jaxprt.systems.bounces.jobs import DEGREE
+from jaxprt.systems.bounces.parts import ReflectingPart
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.protocol import Blend
+
+WIDE, NARROW = 8.0, 32.0  # concentrations up to which harmonics carry a lobe, and from which rays carry all of it
+_FEW = 0.55  # of what the lobes of a BRDF reflect: where less than this would be traced, harmonics keep it all
+_LITTLE = 0.01  # of all that is reflected
+_GOLDEN = (5**0.5 - 1) / 2  # of a turn, from one ray to the next
+_TINY = 1e-12
+
+
+class Rays(eqx.Module):
+    """The rays of some vertices or points.
+
+    Attributes:
+        direction: Unit directions in the world.
+        lobe: Number of the lobe that each samples.
+        chance: How likely that one was; 0 where nothing is traced.
+    """
+
+    direction: Float[Array, "j v 3"]
+    lobe: Int[Array, "j v"]
+    chance: Float[Array, "j v"]
+
+
+class SharpPart(ReflectingPart):
+    """A part some of whose lobes are traced. `view` leaves these out; `rays` tells where they go.
+
+    Attributes:
+        lobe: The BRDF as lobes, from `jaxprt.lobe.tabulate`, with the channels and parameters of `brdf`.
+        count: Rays of each vertex or point.
+    """
+
+    lobe: LobeBrdf
+    count: int = eqx.field(static=True, default=8)
+
+    def __check_init__(self):
+        """Refuses tables of another kind."""
+        require.kind("the lobes", self.lobe, LobeBrdf, source="jaxprt.lobe.tabulate")
+        require.at_least("the number of rays", np.asarray(self.count), 1.0)
+
+    def view(
+        self,
+        eye: Float[Array, "*p 3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Float[Array, "lm _ _"]:
+        """Harmonics of the BRDF for the view of each vertex or point, without what rays carry.
+
+        Args:
+            eye: Position of the viewer.
+            blend: What the vertices or points are made of.
+            points: Where; None for the vertices.
+            seen: What rays carry is multiplied by this at each vertex or point; None for 1.
+        """
+        return self.plain.view(eye, blend, points) - self.carried(eye, blend, points, seen)
+
+    def carried(
+        self,
+        eye: Float[Array, "*p 3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Float[Array, "lm _ _"]:
+        """Harmonics of what rays carry. Arguments are those of `view`."""
+        return _carried(self._lobes(eye, blend, points), blend, seen)
+
+    @property
+    def plain(self) -> ReflectingPart:
+        """The same part, of which nothing is traced."""
+        return ReflectingPart(self.position, self.frame, self.brdf)
+
+    def rays(
+        self,
+        eye: Float[Array, "3"],
+        parameter: tuple[Float[Array, " _"], ...],
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Rays:
+        """The rays of each vertex or point, which colors do not move.
+
+        Args:
+            eye: Position of the viewer.
+            parameter: That of `Blend`, for a table over some.
+            points: Where; None for the vertices.
+            seen: As in `view`.
+        """
+        position, frame = placed(self.position, self.frame, points)
+        lobes = _looked_up(self.lobe, position, frame, eye, parameter)
+        return _chosen(lobes, seen, position, frame, count=self.count)
+
+    def weights(
+        self,
+        rays: Rays,
+        eye: Float[Array, "3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Float[Array, "j _ c"]:
+        """What the radiance along each ray is multiplied by: the sum over the rays is the albedo of what is traced."""
+        return _weighed(self._lobes(eye, blend, points), rays, blend, seen)
+
+    def _lobes(self, eye: Array, blend: Blend | None, points: Points | None) -> Lobes:
+        position, frame = placed(self.position, self.frame, points)
+        return _looked_up(self.lobe, position, frame, eye, () if blend is None else blend.parameter)
+
+
+@jit
+def share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """How much of a lobe is traced: nothing of a wide one, all of a narrow one, with a smooth step between."""
+    place = jnp.clip(jnp.log(concentration / WIDE) / math.log(NARROW / WIDE), 0, 1)
+    return place**2 * (3 - 2 * place)
+
+
+@jit
+def _narrow(table: LobeBrdf) -> Float[Array, ""]:
+    """Part of what the lobes of a table reflect that would be traced, over views by projected solid angle.
+
+    The largest over the table's parameters; 0 where next to all of the light is reflected by the diffuse part.
+    """
+    views = table.scale.shape[len(table.knot) + 1 :]
+    if table.isotropic:
+        radius = jnp.linspace(0, 1, views[0])
+        area = radius
+    else:
+        place = (jnp.arange(views[0]) + 0.5) / views[0] * 2 - 1
+        radius = jnp.minimum(jnp.hypot(place[:, None], place), 1)
+        area = jnp.ones_like(radius)
+    # Of the parabolic map with the tangent of half the angle as its radius.
+    area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
+    axes = tuple(range(-len(views), 0))
+    lobe = jnp.sum(table.weight, 0)
+    traced = jnp.sum(jnp.sum(lobe * share(jnp.exp(table.scale)), 0) * area, axes)
+    glossy, diffuse = jnp.sum(jnp.sum(lobe, 0) * area, axes), jnp.sum(jnp.sum(table.diffuse, 0) * area, axes)
+    part = jnp.where(traced > _LITTLE * (glossy + diffuse), traced / jnp.maximum(glossy, _TINY), 0)
+    return jnp.max(part)
+
+
+def is_sharp(table: LobeBrdf) -> bool:
+    """Whether enough of what a table reflects would be traced."""
+    return bool(_narrow(table) > _FEW)
+
+
+@jit
+def _carried(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
+    """Harmonics, in the local frames, of what rays carry."""
+    strong = _strength(lobes, blend, seen)
+    band = mixture.bands(lobes.concentration, degree=DEGREE)
+    basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(lobes.mean, 0, -1), degree=DEGREE), -1, 0)
+    each = range(lobes.mean.shape[1])
+    rows = [
+        reduce(jnp.add, (strong[:, i] * (band[math.isqrt(s), i] * basis[s, i]) for i in each))
+        for s in range(len(basis))
+    ]
+    return jnp.stack(rows)
+
+
+@jit
+def _looked_up(table: LobeBrdf, position: Array, frame: Array, eye: Array, parameter: tuple[Array, ...]) -> Lobes:
+    return table.lookup(directions.view(frame, position, eye), *parameter)
+
+
+def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
+    """What each lobe counts in each color, as far as it is traced."""
+    traced = share(lobes.concentration)
+    weight = lobes.weight * (traced if seen is None else traced * seen)
+    if blend is None:
+        return weight
+    return jnp.einsum("klv,vkc->clv", weight, blend.weight, precision="highest")
+
+
+@partial(jit, static_argnames="count")
+def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, count: int) -> Rays:
+    """Quantiles of the mixture of the narrow lobes, turned at each point by angles of its own."""
+    mass = jnp.maximum(jnp.sum(lobes.weight, 0), 0) * share(lobes.concentration)
+    total = jnp.sum(mass if seen is None else mass * seen, 0)
+    chance = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
+    above = jnp.cumsum(chance, 0)
+    shift, turn = _scattered(position)
+    place = (jnp.arange(count, dtype=shift.dtype)[:, None] + shift) / count
+    number = jnp.minimum(jnp.sum(above[:, None] <= place, 0), len(above) - 1)
+
+    def each(value: Float[Array, "l v"]) -> Float[Array, "j v"]:
+        return jnp.take_along_axis(value, number, 0)
+
+    own, concentration = each(chance), each(lobes.concentration)
+    within = jnp.clip((place - each(above) + own) / jnp.where(own > 0, own, 1), 0, 1 - 1e-6)
+    drop = -jnp.log1p(within * jnp.expm1(-2 * concentration)) / concentration
+    angle = 2 * np.pi * (turn + _GOLDEN * jnp.arange(count, dtype=turn.dtype)[:, None])
+    local = _around([each(axis) for axis in lobes.mean], drop, angle)
+    world = [reduce(jnp.add, (local[i] * frame[:, i, j] for i in range(3))) for j in range(3)]
+    return Rays(jnp.stack(world, -1), number.astype(jnp.int32), own)
+
+
+@jit
+def _weighed(lobes: Lobes, rays: Rays, blend: Blend | None, seen: Array | None) -> Float[Array, "j v c"]:
+    strong = _strength(lobes, blend, seen)
+    taken = jnp.stack([jnp.take_along_axis(each, rays.lobe, 0) for each in strong], -1)
+    weight = jnp.where(rays.chance > 0, 1 / jnp.where(rays.chance > 0, rays.chance, 1), 0)[..., None] * taken
+    # The rays hold the energy of the lobes exactly, in every color.
+    whole, found = jnp.sum(strong, 1).T, jnp.sum(weight, 0)
+    return weight * (whole / jnp.where(found > _TINY, found, 1))
+
+
+def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:
+    """Directions at angles around means, their cosine less than 1 by a drop; those below the horizon turned up."""
+    x, y, z = mean
+    # An orthonormal basis without branches: Duff et al. 2017.
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first, second = (1 + sign * x**2 * a, sign * b, -sign * x), (b, sign + y**2 * a, -y)
+    radius = jnp.sqrt(jnp.maximum(drop * (2 - drop), 0))
+    right, up = radius * jnp.cos(angle), radius * jnp.sin(angle)
+    way = [p * right + q * up + m * (1 - drop) for p, q, m in zip(first, second, mean, strict=True)]
+    return [way[0], way[1], jnp.abs(way[2])]
+
+
+@jit
+def _scattered(position: Float[Array, "v 3"]) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
+    """Two numbers from 0 to 1 for each position, the same ones for the same position and unlike ones for neighbors."""
+    bits = position.astype(jnp.float32).view(jnp.uint32)
+    state = (
+        bits[:, 0] * np.uint32(0x9E3779B1) ^ (bits[:, 1] * np.uint32(0x85EBCA77)) ^ (bits[:, 2] * np.uint32(0xC2B2AE3D))
+    )
+    result = []
+    for salt in (0x27D4EB2F, 0x165667B1):
+        word = state + np.uint32(salt)
+        for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+            word = (word ^ (word >> shift)) * np.uint32(factor)
+        word = word ^ (word >> 16)
+        result.append((word >> 8).astype(position.dtype) / np.asarray(1 << 24, position.dtype))
+    return result[0], result[1]

@@ -1,0 +1,193 @@
+"""Reflections by rays: a mirror beside a wall that glows, whose picture is known in closed form, and hard cases.
+
+The wall stands behind a floor that is a smooth metal: a ray from the eye, mirrored by the floor, hits the wall or not.
+"""
+
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt import bounces, lobe
+from jaxprt.relit import Lobes, RelitScene, tracing
+from jaxprt.relit.tracing import facing
+from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene.mesh import make_mesh
+from jaxprt.scene.points import on_triangles
+from jaxprt.systems.bounces import traced
+
+SIZE = 8
+EYE = jnp.array([0.3, 1.5, 3.0])
+GLOW = np.array([2.0, 1.0, 0.5], np.float32)
+DARK = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
+CAMERA = Camera(EYE, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.9, 24, 18)
+ALBEDO = 0.9  # of the mirror, and a little more at grazing angles
+COARSE = 0.06  # by which the albedo of a small table is off
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small(coarse, bound):
+    """Small maps, and bounces of few directions."""
+    with pytest.MonkeyPatch.context() as patch:
+        bound(patch, lobe.tabulate, resolution=12)
+        bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
+        yield
+
+
+@functools.cache
+def mesh(name: str) -> Mesh:
+    plane = builtin.plane(cells=6)
+    place = np.asarray(plane.position)
+    if name == "floor":
+        return make_mesh(1.5 * place + [0, 0, 0.5], plane.face)
+    return make_mesh(place[:, [0, 2, 1]] * [1, -1, 1] + [0, 1, -1], plane.face)
+
+
+def mirror(**more) -> TexturedMaterial:
+    return TexturedMaterial(**{"base_color": jnp.ones(3), "roughness": 0.03, **more})
+
+
+def wall(color: float | jax.Array = 0.5, **more) -> TexturedMaterial:
+    return TexturedMaterial(base_color=color, metallic=0.0, specular=0.0, **more)
+
+
+@functools.cache
+def relit() -> RelitScene:
+    parts = [
+        Part("floor", mesh("floor"), mirror(base_color=0.9 * jnp.ones(3))),
+        Part("wall", mesh("wall"), wall(emissive=GLOW)),
+    ]
+    return prt.precompute(Scene(parts), system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
+
+
+def light(seed: int = 1) -> Environment:
+    radiance = np.random.default_rng(seed).uniform(0.2, 1.0, (6, SIZE, SIZE, 3))
+    return Environment(jnp.asarray(radiance, jnp.float32))
+
+
+def mirrored(place: np.ndarray) -> np.ndarray:
+    """How far inside of the wall the mirrored ray from the eye through a point of the floor hits; outside below 0."""
+    way = place - np.asarray(EYE)
+    way[:, 1] *= -1
+    hit = place + way * ((-1 - place[:, 2]) / way[:, 2])[:, None]
+    return np.minimum.reduce([1 - np.abs(hit[:, 0]), hit[:, 1], 2 - hit[:, 1]])
+
+
+def test_a_mirror_shows_a_wall_that_glows_where_the_closed_form_has_it():
+    ready = relit()
+    assert [each is not None for each in ready.lobes] == [True, False]
+    color = np.asarray(ready.radiance(DARK, eye=EYE))[:49]
+    inside = mirrored(np.array(mesh("floor").position))
+    shown, bare = inside > 0.1, inside < -0.1
+    assert shown.sum() > 8
+    assert bare.sum() > 8
+    np.testing.assert_allclose(color[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE)
+    np.testing.assert_allclose(color[bare], 0, atol=1e-5)
+    harmonics = np.asarray(ready.with_rays(0).radiance(DARK, eye=EYE))[:49]
+    np.testing.assert_allclose(harmonics, 0, atol=1e-5)  # Emitted light is none of theirs.
+
+
+def test_points_pictures_and_programs_agree_with_the_vertices(close):
+    ready = relit()
+    color = ready.radiance(light(), eye=EYE)
+    face = np.asarray(mesh("floor").face)
+    corners = on_triangles(face, np.arange(len(face)), np.eye(3, dtype=np.float32)[np.arange(len(face)) % 3])
+    whole = ready.at([corners, corners]).radiance(light(), eye=EYE)
+    vertex = face[np.arange(len(face)), np.arange(len(face)) % 3]
+    # Rays of vertices start a nudge off all of their triangles, those of points off their own.
+    apart = (
+        np.asarray(mesh("floor").position)[vertex, 2] > -0.9
+    )  # Where the wall stands on it, vertices start in front.
+    close(whole[: len(face)][apart], np.asarray(color)[vertex[apart]], tolerance=0.02)
+    # The eye is known inside of programs too, unless it is an argument.
+    close(jax.jit(lambda each: ready.radiance(Environment(each), eye=EYE))(light().radiance), color, tolerance=1e-4)
+    with pytest.raises(ValueError, match=re.escape("but JAX traces the eye: make the view outside of jax.jit")):
+        jax.jit(lambda eye: ready.radiance(light(), eye=eye))(EYE)
+    with pytest.raises(ValueError, match="but JAX traces the eye"):
+        jax.grad(lambda eye: jnp.sum(ready.radiance(light(), eye=eye)))(EYE)
+    assert np.isfinite(jax.jit(lambda eye: ready.with_rays(0).radiance(light(), eye=eye))(EYE)).all()
+
+
+def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(close):
+    ready = relit()
+    view = ready.picture_view(CAMERA)
+    for seed in (1, 2):
+        close(view.picture(light(seed)), ready.picture(light(seed), CAMERA), tolerance=1e-5)
+    close(
+        jax.jit(lambda each: ready.picture(Environment(each), CAMERA))(light().radiance),
+        view.picture(light()),
+        tolerance=1e-4,
+    )
+    dark = np.asarray(ready.picture(DARK, CAMERA))
+    rays = np.asarray(prt.image.raster.ray_direction(CAMERA)).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        place = np.asarray(EYE) + rays * (-EYE[1] / rays[:, 1])[:, None]
+    on_floor = (rays[:, 1] < -0.1) & (np.abs(place[:, 0]) < 1.4) & (np.abs(place[:, 2] - 0.5) < 1.4)
+    inside = np.where(on_floor, mirrored(np.where(on_floor[:, None], place, 1.0)), 0)
+    shown = inside > 0.15
+    assert shown.sum() > 10
+    np.testing.assert_allclose(
+        dark.reshape(-1, 3)[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE
+    )
+    np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=1e-5)
+
+
+def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):
+    ready, weight = relit(), np.random.default_rng(2).normal(size=(98, 3)).astype(np.float32)
+    view = ready.view(EYE)
+
+    def lit(radiance):
+        return jnp.vdot(weight, ready.combine(ready.shade(ready.light(Environment(radiance))), view))
+
+    slope, none = jax.grad(lit)(light().radiance), lit(DARK.radiance)
+    close(jnp.vdot(slope, light(2).radiance), lit(light(2).radiance) - none, tolerance=1e-4)
+
+    def colored(value):
+        materials = {
+            "wall": wall(jnp.array([value, 0.4, 0.5])),
+            "floor": mirror(base_color=value * jnp.ones(3)),
+        }
+        return jnp.vdot(weight, ready.radiance(light(), eye=EYE, materials=materials))
+
+    step = 0.02
+    finite = (colored(0.6 + step) - colored(0.6 - step)) / (2 * step)
+    close(jax.grad(colored)(0.6), finite, tolerance=0.01)
+    close(jax.jit(jax.grad(colored))(0.6), finite, tolerance=0.01)
+
+
+def test_what_reflects_nothing_but_the_sky_shows_no_rays(close):
+    ball = builtin.sphere(rings=7, sectors=10)
+    alone = Scene([Part("ball", ball, mirror())])
+    ready = prt.precompute(alone, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
+    view = ready.view(EYE)
+    assert view.reflected is not None
+    assert view.reflected.hit == ()
+    direct = RelitScene(ready.scene, ready.direct, ready.shading).radiance(light(), eye=EYE)
+    seen = np.asarray(facing(ready.mesh, EYE)) > 0
+    assert 0.3 < seen.mean() < 0.8
+    # Beside it harmonics ring.
+    close(np.asarray(ready.radiance(light(), eye=EYE))[seen], np.asarray(direct)[seen], tolerance=0.01)
+    assert np.isfinite(ready.picture(light(), CAMERA)).all()
+
+
+def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
+    rough = lobe.tabulate(prt.brdf.CookTorrance(diffuse=0.2, specular=0.7, roughness=0.6), lobes=4)
+    assert not traced.is_sharp(rough)
+    assert not traced.is_sharp(lobe.tabulate(prt.brdf.Lambert(0.5), lobes=2))
+    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, got -1"):
+        relit().with_rays(-1)
+    assert relit().with_rays(0).view(EYE).reflected is None
+    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, got -2"):
+        prt.precompute(relit().scene, system="lobe", bounces=1, rays=-2)
+
+
+def test_embree_holds_the_triangles_of_the_last_scenes():
+    one = tracing.caster(relit().mesh)
+    assert tracing.caster(relit().mesh) is one
+    others = [make_mesh(np.asarray(mesh("wall").position) + k, mesh("wall").face) for k in range(5)]
+    assert len({id(tracing.caster(each)) for each in others}) == 5
+    assert tracing.caster(relit().mesh) is not one
