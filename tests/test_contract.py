@@ -787,9 +787,12 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
-    "systems.bounces.traced.share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
+    "systems.lobe.narrow.share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
+    "systems.lamps.relight.beside": example(
+        lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
+    ),
     "systems.lamps.relight.met": example(
         lambda draw: call(
             jnp.moveaxis(jnp.stack([draw.unit(4), draw.unit(4)]), -1, 0),

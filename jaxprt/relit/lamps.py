@@ -16,9 +16,10 @@ from jaxprt.relit.kept import kept
 from jaxprt.relit.recipes import Target
 from jaxprt.scene import PointLight, Scene
 from jaxprt.scene.mesh import areas
+from jaxprt.scene.points import Points
 from jaxprt.systems import bright_texels, lamps, lobe
 from jaxprt.systems.lamps import LitByLamps
-from jaxprt.systems.protocol import System
+from jaxprt.systems.protocol import Blend, System
 
 _LOBES = 12  # of BRDFs whose system has none
 
@@ -50,6 +51,21 @@ class SceneLamps(eqx.Module):
         ]
         rows += [changed.get(each.name, each).intensity for each in self.point_lights]
         return jnp.stack(rows)
+
+    def number(self, part: int) -> int | None:
+        """Number of the lamp that a part is; None for none."""
+        return self.emitting.index(part) if part in self.emitting else None
+
+    def view(
+        self,
+        eye: Float[Array, "3"],
+        blends: Sequence[Blend | None],
+        points: Sequence[Points] | None,
+        traced: Sequence[Float[Array, " _"] | None],
+    ) -> tuple[Float[Array, "n _ _"], ...]:
+        """`LitByLamps.view` of each part."""
+        rows = zip(self.part, blends, points or [None] * len(self.part), traced, strict=True)
+        return tuple(part.view(eye, blend, place, narrow) for part, blend, place, narrow in rows)
 
     def combine(self, radiance: Float[Array, "n 3"], view: Sequence[Float[Array, "n _ _"]]) -> Float[Array, "v 3"]:
         """Radiance of the vertices or points of all parts in the light of all lamps.

@@ -170,8 +170,7 @@ class RelitScene(System):
             every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
         blends, lit = [each.blend for each in every], None
         if self.lamps is not None:
-            rows = zip(self.lamps.part, blends, self.points or [None] * len(every), strict=True)
-            lit = tuple(part.view(eye, own, points) for part, own, points in rows)
+            lit = self.lamps.view(eye, blends, self.points, tracing.traced(self.mesh, surfaces, eye, self.points))
         view, reflected = tracing.split(self.mesh, surfaces, self._placed.view(eye, blends), eye, blends, self.points)
         if all(each.emitted is None for each in every):
             return SceneView(view, None, lit, reflected)
@@ -265,10 +264,13 @@ class RelitScene(System):
             material = own if isinstance(material, Blend) else material
             reflecting = None if self.bounces is None else self.bounces.part[number]
             lit = None if self.lamps is None else self.lamps.part[number]
+            lamp = None if self.lamps is None else self.lamps.number(number)
             lobes = self.lobes[number]
             if reflecting is not None and lobes is not None and self.rays:
                 reflecting = SharpPart(reflecting.position, reflecting.frame, reflecting.brdf, lobes, self.rays)
-            surfaces.append(Surface(part, first, shading, system, reflecting, lit, own, material, curvature[number]))
+            surfaces.append(
+                Surface(part, first, shading, system, reflecting, lit, own, material, curvature[number], lamp)
+            )
             first += len(part.mesh.position)
         return surfaces
 

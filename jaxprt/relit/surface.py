@@ -13,6 +13,7 @@ from jaxprt.relit.channels import Appearance, Shading, at_points
 from jaxprt.scene import Part
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
+from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
@@ -31,7 +32,8 @@ class Surface(eqx.Module):
         material: What has its material at points: a `TexturedMaterial`, an `Appearance` at the vertices, or None for
             the part's own.
         curvature: How sharp its radiance is, from `interpolation.curvature`.
-        glows: Whether what it emits is seen. Rays of reflections leave it out: lamps have highlights of their own.
+        lamp: Number of the lamp that the part is; None for none.
+        glows: Whether what it emits is seen. Rays of reflections count it by lamps.
     """
 
     part: Part
@@ -43,6 +45,7 @@ class Surface(eqx.Module):
     appearance: Appearance
     material: Any
     curvature: Float[Array, ""]
+    lamp: int | None = eqx.field(static=True, default=None)
     glows: bool = eqx.field(static=True, default=True)
 
 
@@ -99,10 +102,10 @@ def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: 
 def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
     """What the systems of a part make of a view, at points or at the vertices."""
     system = surface.system if points is None else surface.system.at(points)
-    reflected, lamps = (
-        None if each is None else each.view(eye, blend, points) for each in (surface.reflecting, surface.lit)
-    )
-    return system.view(eye, blend), reflected, lamps
+    reflecting, lit = surface.reflecting, surface.lit
+    traced = jnp.ones(len(points)) if isinstance(reflecting, SharpPart) and points is not None else None
+    reflected = None if reflecting is None else reflecting.view(eye, blend, points)
+    return system.view(eye, blend), reflected, None if lit is None else lit.view(eye, blend, points, traced)
 
 
 def _combine(

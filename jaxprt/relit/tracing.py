@@ -2,21 +2,17 @@
 
 Rays go from vertices or points along the narrow lobes of `jaxprt.systems.bounces.traced`, and read the radiance of the
 fronts that they meet: direct light, and what is reflected as far as 16 harmonics tell it. Rays that meet nothing, or a
-back, bring nothing, since the light of the sky is direct light. They leave out what lamps emit, whose highlights are
-those of `jaxprt.lamps`.
+back, bring nothing, since the light of the sky is direct light. Those that meet a lamp tell how much of it is seen.
 
 Embree casts the rays on the host, once for each eye and roughness. Where they hit is a constant: radiance is
 differentiable in the light and in the colors of all materials, and its derivative by the eye or by roughness is
 refused.
 """
 
-import collections
 import contextlib
 import dataclasses
-import threading
-import weakref
 from collections.abc import Sequence
-from functools import cached_property, reduce
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -28,17 +24,16 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt.brdf import Lambert
 from jaxprt.compile import jit
+from jaxprt.relit.casting import caster
 from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.systems.bounces.traced import Rays, SharpPart
+from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
-from jaxprt.visibility import Occluder, point_starts, start_points
-from jaxprt.visibility.hits import first_fronts
 
 CHUNK = 1 << 13  # hits that are shaded at once
 _FEWEST = 1 << 10
-_KEPT = 4  # scenes whose triangles Embree holds
 
 
 class Asked(eqx.Module):
@@ -63,10 +58,12 @@ class Carried(eqx.Module):
     Attributes:
         slot: Number of the hit of each ray among all; one more than there are for none.
         weight: What its radiance is multiplied by.
+        lamp: What the radiance of each lamp is multiplied by; None without lamps.
     """
 
     slot: Int[Array, "j v"]
     weight: Float[Array, "j v c"]
+    lamp: Float[Array, "n v c"] | None
 
 
 class HitRow(eqx.Module):
@@ -121,70 +118,7 @@ class Reflections(eqx.Module):
                 rows.append(shaded(surface, light, own, each.points, each.eye, at_pixels=not matte))
             else:
                 rows.append(lit(surface, light, own, each.kept))
-        return _read(self.own, rows)
-
-
-class Caster:
-    """The triangles of a scene, as rays meet them.
-
-    Args:
-        mesh: The mesh of all parts; its regions are their numbers.
-    """
-
-    def __init__(self, mesh: Mesh):
-        self.mesh, self.occluder = mesh, Occluder(mesh)
-        self.face, self.normal = np.asarray(mesh.face), np.asarray(mesh.normal)
-        self.part = np.asarray(mesh.region)[self.face[:, 0]]
-
-    @cached_property
-    def start(self) -> Float[np.ndarray, "v 3"]:
-        """Where the rays of vertices start."""
-        return start_points(self.mesh, self.occluder)
-
-    def cast(
-        self, rays: Rays, first: int, points: Points | None
-    ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
-        """The triangle that each ray meets, -1 for none, the weights of its corners, and where the rays start.
-
-        Args:
-            rays: Of vertices or points of a part.
-            first: Number of the part's first vertex.
-            points: The points; None for the vertices.
-        """
-        way, chance = np.asarray(rays.direction, np.float32), np.asarray(rays.chance)
-        if points is None:
-            corner = first + np.arange(way.shape[1])[:, None]
-            start = self.start[corner[:, 0]]
-        else:
-            corner = first + np.asarray(points.corner).T
-            start = point_starts(self.mesh, Points(jnp.asarray(corner.T), points.weight), self.occluder)
-        ray, own = np.nonzero(chance > 0)
-        triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
-        found, weight = first_fronts(self.occluder, self.normal, start[own], np.ascontiguousarray(way[ray, own]))
-        # A ray that starts below its own triangle, or below one around its own vertex, meets that.
-        met = self.face[found]
-        itself = np.all(met == corner[own], 1) if points is not None else np.any(met == corner[own], 1)
-        triangle[ray, own], barycentric[ray, own] = np.where(itself, -1, found), weight
-        return triangle, barycentric, start
-
-
-_CASTERS: collections.OrderedDict[int, tuple[Any, Caster]] = collections.OrderedDict()
-_LOCK = threading.Lock()
-
-
-def caster(mesh: Mesh) -> Caster:
-    """The triangles of a scene, in Embree's form, which is kept for the last few scenes."""
-    key = id(mesh.position)
-    with _LOCK:
-        alive, kept = _CASTERS.get(key, (lambda: None, None))
-        if kept is not None and alive() is mesh.position:
-            _CASTERS.move_to_end(key)
-            return kept
-        made = Caster(mesh)
-        _CASTERS[key] = weakref.ref(mesh.position), made
-        while len(_CASTERS) > _KEPT:
-            _CASTERS.popitem(last=False)
-        return made
+        return _read(self.own, rows, lamp)
 
 
 def known(*value: Any) -> bool:
@@ -224,11 +158,33 @@ def trace(
             found.append(caster(mesh).cast(rays[-1], surface.first, each.points))
     slots, hit = _rows(mesh, plain, found, keep=keep)
     own = []
-    for each, ray, slot in zip(asked, rays, slots, strict=True):
+    for each, ray, slot, triangle in zip(asked, rays, slots, found, strict=True):
         part = surfaces[each.number].reflecting
         assert isinstance(part, SharpPart)
-        own.append(Carried(jnp.asarray(slot), part.weights(ray, eye, each.blend, each.points, each.seen)))
+        weight = part.weights(ray, eye, each.blend, each.points, each.seen)
+        sharpness = part.concentrations(ray, eye, each.blend, each.points)
+        met = caster(mesh).part[triangle[0]] if (triangle[0] >= 0).any() else np.zeros_like(triangle[0])
+        lamp = _lamps(surfaces, each, np.where(triangle[0] >= 0, met, -1), weight, sharpness)
+        own.append(Carried(jnp.asarray(slot), weight, lamp))
     return Reflections(tuple(own), hit)
+
+
+def _lamps(
+    surfaces: Sequence[Surface], asked: Asked, met: Int[np.ndarray, "j v"], weight: Array, concentration: Array
+) -> Float[Array, "n v c"] | None:
+    """What rays read of each lamp of radiance 1, given the part that each meets, -1 for none."""
+    lit = surfaces[asked.number].lit
+    if lit is None:
+        return None
+    emitting = {each.lamp: number for number, each in enumerate(surfaces) if each.lamp is not None}
+    part = np.array([emitting.get(lamp, -2) for lamp in range(lit.transport.lamps)])
+    return _seen_lamps(lit.chord(asked.points), jnp.asarray(met == part[:, None, None]), weight, concentration)
+
+
+@jit
+def _seen_lamps(chord: Array, met: Array, weight: Array, concentration: Array) -> Float[Array, "n v c"]:
+    share = beside(concentration, chord[:, None]) * met
+    return jnp.einsum("njv,jvc->nvc", share, weight, precision="highest")
 
 
 def split(
@@ -252,11 +208,8 @@ def split(
     sharp = _sharp(surfaces)
     if not sharp:
         return view, None
-    none: list[Any] = [None] * len(surfaces)
-    places, faces = points or none, none
-    if points is None:
-        with now(mesh, eye):
-            faces = jnp.split(facing(mesh, eye), [each.first for each in surfaces[1:]])
+    places = points or [None] * len(surfaces)
+    faces = _faces(mesh, surfaces, eye, points)
     rows, asked = list(view[1]), []
     for number in sharp:
         asked.append(Asked(number, blends[number], places[number], faces[number]))
@@ -264,6 +217,28 @@ def split(
         assert isinstance(own, SharpPart)
         rows[number] = rows[number] - own.carried(eye, blends[number], places[number], faces[number])
     return (view[0], tuple(rows)), trace(mesh, surfaces, asked, eye, keep=True)
+
+
+def traced(
+    mesh: Mesh, surfaces: Sequence[Surface], eye: Float[Array, "3"], points: Sequence[Points] | None
+) -> list[Float[Array, " _"] | None]:
+    """How much of narrow lobes rays carry at the vertices or points of each part; None for nothing.
+
+    Arguments are those of `split`.
+    """
+    sharp = _sharp(surfaces)
+    if not sharp:
+        return [None] * len(surfaces)
+    faces = [jnp.ones(len(each)) for each in points] if points else _faces(mesh, surfaces, eye, points)
+    return [each if number in sharp else None for number, each in enumerate(faces)]
+
+
+def _faces(mesh: Mesh, surfaces: Sequence[Surface], eye: Array, points: Sequence[Points] | None) -> list[Any]:
+    """Whether the eye may see each vertex of each part; None where points tell."""
+    if points is not None:
+        return [None] * len(surfaces)
+    with now(mesh, eye):
+        return jnp.split(facing(mesh, eye), [each.first for each in surfaces[1:]])
 
 
 def read(
@@ -349,19 +324,17 @@ def _is_matte(surface: Surface) -> bool:
 
 
 @jit
-def _read(own: Sequence[Carried], rows: Sequence[Array]) -> list[Array]:
+def _read(own: Sequence[Carried], rows: Sequence[Array], lamp: Array | None) -> list[Array]:
     """The sums over rays of the radiance that they read."""
     colors = max([1, *(each.shape[1] for each in rows)])
     dtype = jnp.result_type(float) if not rows else rows[0].dtype
     flat = [jnp.broadcast_to(each, (len(each), colors)) for each in rows]
     color = jnp.concatenate([*flat, jnp.zeros((1, colors), dtype)])
-    return [
-        reduce(
-            jnp.add,
-            (
-                color.at[slot].get(mode="promise_in_bounds") * weight
-                for slot, weight in zip(each.slot, each.weight, strict=True)
-            ),
-        )
-        for each in own
-    ]
+    result = []
+    for each in own:
+        pairs = zip(each.slot, each.weight, strict=True)
+        read = reduce(jnp.add, (color.at[slot].get(mode="promise_in_bounds") * weight for slot, weight in pairs))
+        if lamp is not None and each.lamp is not None:
+            read = read + jnp.einsum("nc,nvc->vc", lamp, each.lamp, precision="highest")
+        result.append(read)
+    return result

@@ -13,7 +13,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import bounces, lobe
-from jaxprt.relit import Lobes, RelitScene, tracing
+from jaxprt.relit import Lobes, RelitScene, casting
 from jaxprt.relit.tracing import facing
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh
@@ -186,8 +186,8 @@ def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
 
 
 def test_embree_holds_the_triangles_of_the_last_scenes():
-    one = tracing.caster(relit().mesh)
-    assert tracing.caster(relit().mesh) is one
+    one = casting.caster(relit().mesh)
+    assert casting.caster(relit().mesh) is one
     others = [make_mesh(np.asarray(mesh("wall").position) + k, mesh("wall").face) for k in range(5)]
-    assert len({id(tracing.caster(each)) for each in others}) == 5
-    assert tracing.caster(relit().mesh) is not one
+    assert len({id(casting.caster(each)) for each in others}) == 5
+    assert casting.caster(relit().mesh) is not one

@@ -25,10 +25,10 @@ from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.parts import ReflectingPart
 from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.narrow import share
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 
-WIDE, NARROW = 8.0, 32.0  # concentrations up to which harmonics carry a lobe, and from which rays carry all of it
 _FEW = 0.55  # of what the lobes of a BRDF reflect: where less than this would be traced, harmonics keep it all
 _LITTLE = 0.01  # of all that is reflected
 _GOLDEN = (5**0.5 - 1) / 2  # of a turn, from one ray to the next
@@ -127,16 +127,15 @@ class SharpPart(ReflectingPart):
         """What the radiance along each ray is multiplied by: the sum over the rays is the albedo of what is traced."""
         return _weighed(self._lobes(eye, blend, points), rays, blend, seen)
 
+    def concentrations(
+        self, rays: Rays, eye: Float[Array, "3"], blend: Blend | None, points: Points | None = None
+    ) -> Float[Array, "j _"]:
+        """Concentration of the lobe that each ray samples."""
+        return jnp.take_along_axis(self._lobes(eye, blend, points).concentration, rays.lobe, 0)
+
     def _lobes(self, eye: Array, blend: Blend | None, points: Points | None) -> Lobes:
         position, frame = placed(self.position, self.frame, points)
         return _looked_up(self.lobe, position, frame, eye, () if blend is None else blend.parameter)
-
-
-@jit
-def share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """How much of a lobe is traced: nothing of a wide one, all of a narrow one, with a smooth step between."""
-    place = jnp.clip(jnp.log(concentration / WIDE) / math.log(NARROW / WIDE), 0, 1)
-    return place**2 * (3 - 2 * place)
 
 
 @jit

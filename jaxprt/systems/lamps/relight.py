@@ -10,6 +10,9 @@ with X noncentral chi-squared of two degrees of freedom and noncentrality k |m -
 
 For disks larger than the lobe P is by Sankaran's approximation; for smaller ones the disk is a lobe too, and variances
 add: r^2 / 4 + 1 / k.
+
+Where rays carry narrow lobes, for reflections of neighbors, they meet the lamps too, which then have their own shapes:
+rays take the share of a lobe that is narrow beside the lamp, and the rest stays here.
 """
 
 from collections.abc import Sequence
@@ -28,10 +31,12 @@ from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.narrow import share
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend, check_blend
 
 _SMALL, _LARGE = 0.5, 2.0  # squared chords in variances of a lobe between which a disk stops to be a lobe itself
+_RATHER = np.log(9.0)  # radii of a lamp from one to three standard deviations of a lobe
 _TINY = 1e-30
 
 
@@ -57,7 +62,11 @@ class LitByLamps(eqx.Module):
         require.at_least("the albedo", self.albedo, 0.0)
 
     def view(
-        self, eye: Float[Array, "3"], blend: Blend | None = None, points: Points | None = None
+        self,
+        eye: Float[Array, "*p 3"],
+        blend: Blend | None = None,
+        points: Points | None = None,
+        traced: Float[Array, " _"] | None = None,
     ) -> Float[Array, "n v c"]:
         """Radiance that each vertex or point sends to the eye, for each lamp of radiance 1.
 
@@ -65,6 +74,7 @@ class LitByLamps(eqx.Module):
             eye: Position of the viewer in world units.
             blend: What each vertex, or point, is made of, over the channels of the BRDF; the albedo if there is none.
             points: Where; None for the vertices.
+            traced: How much of the narrow lobes of each vertex or point rays carry; None for nothing.
 
         Returns:
             Radiance, to be multiplied by the radiance of each lamp. Differentiable in the eye, the blend and the table.
@@ -78,7 +88,11 @@ class LitByLamps(eqx.Module):
         if blend is not None:
             count = len(self.transport.position) if points is None else len(points)
             blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))
-        return _view(self, eye, blend, points)
+        return _view(self, eye, blend, points, traced)
+
+    def chord(self, points: Points | None = None) -> Float[Array, "n _"]:
+        """Squared chord of the disk that each lamp is to each vertex or point."""
+        return _chord(self.transport, points)
 
     def combine(self, radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
         """Radiance of all lamps together.
@@ -100,11 +114,11 @@ def _combine(radiance: Array, view: Array) -> Array:
 
 
 @jit
-def _view(lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | None) -> Float[Array, "n v c"]:
+def _view(
+    lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | None, traced: Array | None
+) -> Float[Array, "n v c"]:
     transport = lit.transport
-    solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
-    if points is not None:
-        solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
+    solid, cosine, way = _carried(transport, points)
     matte = cosine / np.pi
     if lit.brdf is None:
         each = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
@@ -112,7 +126,8 @@ def _view(lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | Non
         position, frame = placed(transport.position, transport.frame, points)
         parameter = () if blend is None else blend.parameter
         lobe = lit.brdf.lookup(directions.view(frame, position, eye), *parameter)
-        each = jax.lax.map(partial(_sent, lobe, frame), (solid, way, matte))
+        whole = _chord(transport, points)[np.asarray(transport.lamp)]
+        each = jax.lax.map(partial(_sent, lobe, frame, traced), (solid, way, matte, whole))
     numbers = np.asarray(transport.lamp)
     value = jax.ops.segment_sum(each, numbers, transport.lamps, indices_are_sorted=True)  # [n, k, v]
     if blend is None:
@@ -120,13 +135,45 @@ def _view(lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | Non
     return jnp.einsum("nkv,vkc->nvc", value, blend.weight, precision="highest")
 
 
-def _sent(lobe: Lobes, frame: Array, piece: tuple[Array, Array, Array]) -> Float[Array, "k v"]:
+def _carried(transport: LampTransport, points: Points | None) -> tuple[Array, Array, Array]:
+    """The integrals, at the vertices or at points."""
+    solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
+    if points is not None:
+        solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
+    return solid, cosine, way
+
+
+@jit
+def _chord(transport: LampTransport, points: Points | None) -> Float[Array, "n v"]:
+    solid, _, way = _carried(transport, points)
+    numbers = np.asarray(transport.lamp)
+    whole, moment = (
+        jax.ops.segment_sum(each, numbers, transport.lamps, indices_are_sorted=True) for each in (solid, way)
+    )
+    return 4 * jnp.clip(1 - jnp.sqrt(jnp.sum(moment**2, 1)) / jnp.maximum(whole, _TINY), 0, 1)
+
+
+@jit
+def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """How much of a lobe rays carry to a lamp: all of one that is narrow beside the lamp, nothing of one that is wider.
+
+    Args:
+        concentration: Of the lobe.
+        chord: Squared chord from the middle of the lamp to its rim.
+    """
+    place = jnp.clip(jnp.log(jnp.maximum(concentration * chord, _TINY)) / _RATHER, 0, 1)
+    return place**2 * (3 - 2 * place)
+
+
+def _sent(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
     """What each channel of the BRDF sends of the light of one piece of a lamp."""
-    solid, way, matte = piece
+    solid, way, matte, whole = piece
     length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
     toward = [sum(way[j] * frame[:, i, j] for j in range(3)) / length for i in range(3)]
     chord = 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
     density = met(lobe.mean, lobe.concentration, toward, chord)
+    if traced is not None:
+        density = density * (1 - traced * share(lobe.concentration) * beside(lobe.concentration, whole))
     return jnp.sum(lobe.weight * density, 1) * solid + lobe.diffuse * matte
 
 

@@ -13,6 +13,7 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lobe import narrow
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -74,9 +75,9 @@ def test_rays_read_smooth_light_as_the_harmonics_do(close):
 
 def test_what_is_traced_changes_smoothly_with_the_width():
     concentration = jnp.logspace(-1, 5, 4001)
-    share = np.asarray(traced.share(concentration))
-    assert np.all(share[concentration <= traced.WIDE] == 0)
-    assert np.all(share[concentration >= traced.NARROW] == 1)
+    share = np.asarray(narrow.share(concentration))
+    assert np.all(share[concentration <= narrow.WIDE] == 0)
+    assert np.all(share[concentration >= narrow.NARROW] == 1)
     assert np.all(np.diff(share) >= 0)
     assert np.max(np.diff(share)) < 0.01
     whole = np.stack([np.asarray(both(float(r))[2])[0, :, 0] for r in np.geomspace(0.06, 0.48, 25)])
