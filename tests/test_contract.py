@@ -85,6 +85,7 @@ HOST = {
     "require.length": "checks a shape",
     "systems.separable.members.cluster": "sorts on the host, where data enters",
     "systems.separable.members.clusters_for": "a count",
+    "systems.separable.members.coordinates": "NumPy on the host",
     "systems.separable.members.places": "a NumPy table of rows",
     "systems.separable.clustered.precompute": "runs workers and writes files",
     "systems.separable.clustered.compress": "gives half precision, and vectors of either sign: no one dtype or answer",
@@ -138,7 +139,12 @@ HOST = {
     "systems.bounces.functions.fixed_weights": "counts colors by values",
     "systems.bounces.gather.rays": "traces rays",
     "visibility.hits": "traces rays",
-    "systems.bounces.tensor.precompute": "traces rays",
+    "systems.bounces.build.precompute": "traces rays",
+    "systems.bounces.gather.shares": "NumPy on the host",
+    "systems.bounces.gather.cosines": "NumPy on the host",
+    "systems.bounces.gather.measures": "NumPy on the host",
+    "systems.bounces.patches.divide": "sorts on the host, where data enters",
+    "systems.bounces.tensor.twice": "a count",
     "systems.bounces.jobs": "traces rays, and gives half precision and vectors of either sign",
     "brdf.navigation.triangulate": "by SciPy, where data enters",
     "brdf.navigation.blinn_phong": "checks values",
@@ -160,6 +166,7 @@ HOST = {
     "systems.bounces.relight.weights": "takes half precision; the same",
     "systems.bounces.relight.combine": "takes indices; the same",
     "systems.bounces.relight.gathered": "takes half precision; the same",
+    "systems.bounces.relight.changes": "takes half precision; the same",
     "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
     "systems.separable.published": "checks values",
     "systems.lobe.published": "checks values",
@@ -625,6 +632,7 @@ EXAMPLES = {
     "systems.bounces.functions.weights": example(
         lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
     ),
+    "systems.bounces.functions.albedo": example(lambda draw: call(draw.separable())),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
     "systems.lobe.remainder.Remainder": example(
         lambda draw: call(
