@@ -21,7 +21,7 @@ from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.harmonic import TransferVector
 
 ALL = bounces.build.ALL
-_EACH = 3  # bounces that are estimated one by one; those that follow fall as the last two do
+_EACH = 3  # bounces that are estimated one by one; those that follow fall as these do
 _EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
@@ -100,8 +100,9 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
         lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
         for part in range(len(shadings)):
             own = lit[:, region == part]
-            before, last = (float(np.linalg.norm(each)) for each in own[-2:])
-            ratio = min(last / before, _SLOWEST) if before > 0 else 0.0
+            # Over two bounces: between two surfaces, odd ones and even ones are not alike.
+            before, _, last = (float(np.linalg.norm(bounce)) for bounce in own[-3:])
+            ratio = min((last / before) ** 0.5, _SLOWEST) if before > 0 else 0.0
             own = np.concatenate([own[:-1], own[-1:] / (1 - ratio)])
             whole = max(float(np.linalg.norm(own.sum(0))), 1e-30)
             left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
