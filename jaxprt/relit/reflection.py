@@ -1,17 +1,17 @@
 """Light that the parts of a scene reflect onto each other: what it is worth, and how it is precomputed."""
 
-import math
 import pathlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert, MetallicRoughness
-from jaxprt.brdf.varying import PerVertex
-from jaxprt.relit.channels import RoughnessFamily, Shading
+from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene.mesh import join
@@ -25,13 +25,14 @@ from jaxprt.systems.lobe import LobeBrdf, LobeSystem
 from jaxprt.systems.protocol import System
 
 ALL = bounces.build.ALL
-_EACH = 3  # bounces that are estimated one by one; those that follow fall as the last two do
+_EACH = 3  # bounces that are estimated one by one; those that follow fall as these do
 _EDGE = 8  # of the faces of light that is reflected, at most
 _TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
+_WIDTH = 0.09  # of lobes on the way of reflected light, at least: alpha of GGX, or m of Beckmann's distribution
+_DARK = 1e-6  # albedo of what reflects nothing
 _SLOWEST = 0.95  # share of a bounce that the next one has, at most
 _LOBES = 8  # of parts whose systems have none, for the rays of sharp ones
-_LEAST = 0.3  # roughness, the square root of GGX's alpha, of what is sent: 3 % off in albedo
 _VIEWS = 16  # over whose angles albedo is averaged
 _RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
 
@@ -126,8 +127,9 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
         lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
         for part in range(len(shadings)):
             own = lit[:, region == part]
-            before, last = (float(np.linalg.norm(each)) for each in own[-2:])
-            ratio = min(last / before, _SLOWEST) if before > 0 else 0.0
+            # Over two bounces: between two surfaces, odd ones and even ones are not alike.
+            before, _, last = (float(np.linalg.norm(bounce)) for bounce in own[-3:])
+            ratio = min((last / before) ** 0.5, _SLOWEST) if before > 0 else 0.0
             own = np.concatenate([own[:-1], own[-1:] / (1 - ratio)])
             whole = max(float(np.linalg.norm(own.sum(0))), 1e-30)
             left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
@@ -148,44 +150,52 @@ def _joined(shadings: Sequence[Shading]) -> Mesh:
 
 
 def _factored(shading: Shading) -> separable.SeparableBrdf:
-    """What a part reflects light with on its way to others: nothing sharper than so few texels and terms can hold.
+    """What a part reflects light with on its way to others.
 
-    Factored as it is, a metal of roughness .1 would send twelve times its light to others. The light that is sent has
-    6 x 8 x 8 texels and arrives as 16 harmonics, so that a wider lobe of the same energy sends the same.
+    Lobes that are too narrow for the maps are widened: a mirror of roughness .05 would send 235 times the light that it
+    gets. Each channel then has the albedo that it has in truth. What arrives elsewhere is a few harmonics, and wider.
     """
-    brdf = _blunt(shading)
-    terms = 1 if isinstance(brdf, Lambert) else _TERMS
-    return separable.factor(brdf, terms=terms, resolution=_RESOLUTION)
+    brdf = _still(shading)
+    wide = _widened(brdf)
+    made = separable.factor(wide, terms=1 if isinstance(brdf, Lambert) else _TERMS, resolution=_RESOLUTION)
+    kept = np.atleast_1d(bounces.functions.albedo(made))
+    scale = np.where(kept > _DARK, _channels(brdf) / np.maximum(kept, _DARK), 1)
+    return eqx.tree_at(lambda each: each.view_map, made, made.view_map * jnp.asarray(scale, made.view_map.dtype))
 
 
-def _blunt(shading: Shading) -> Callable:
-    """The BRDF of a part at the mean roughness, or at the least that is sent."""
-    if shading.knot:
-        assert shading.blend is not None
-        least = math.log(_LEAST if isinstance(shading.brdf, RoughnessFamily) else _LEAST**2)
-        return shading.brdf(jnp.asarray(max(float(np.mean(shading.blend.parameter[0])), least)))
-    if isinstance(shading.exact, PerVertex) and not isinstance(shading.brdf, Lambert):
-        model = shading.exact.model
-        assert isinstance(model, MetallicRoughness)
-        assert shading.scale is not None
-        family = RoughnessFamily(shading.term, shading.scale, model.anisotropy[0])
-        return family(math.log(max(float(jnp.mean(model.roughness)), _LEAST)))
-    brdf = shading.brdf
-    if isinstance(brdf, CookTorrance):
-        return eqx.tree_at(lambda each: each.roughness, brdf, jnp.maximum(brdf.roughness, _LEAST**2))
-    if isinstance(brdf, BlinnPhong):
-        return eqx.tree_at(lambda each: each.exponent, brdf, jnp.minimum(brdf.exponent, 2 / _LEAST**4 - 2))
-    return brdf
+def _widened(brdf: Callable) -> Callable:
+    """A BRDF whose roughness is enough for maps of light paths; one without a roughness stays as it is."""
+
+    def wider(path: tuple, leaf: Any) -> Any:
+        name = getattr(path[-1], "name", None) if path else None
+        if name == "roughness":
+            # Cook-Torrance's is the width itself, that of metallic-roughness materials its root.
+            return jnp.maximum(leaf, _WIDTH if isinstance(_owner(brdf, path), CookTorrance) else _WIDTH**0.5)
+        return jnp.minimum(leaf, 2 / _WIDTH**2 - 2) if name in ("nu", "nv", "exponent") else leaf
+
+    return jax.tree_util.tree_map_with_path(wider, brdf)
+
+
+def _owner(tree: Any, path: tuple) -> Any:
+    """What holds a leaf."""
+    for key in path[:-1]:
+        tree = getattr(tree, key.name) if hasattr(key, "name") else tree[key.idx if hasattr(key, "idx") else key.key]
+    return tree
 
 
 def _albedo(shading: Shading) -> Float[np.ndarray, "3"]:
     """Mean albedo of a part, over its vertices and over views from above."""
-    cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Evenly spread in projected solid angle.
-    wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
-    sent = harmonic.table.project(_still(shading), jnp.asarray(wo), degree=0, rings=_RINGS, sectors=_SECTORS)
-    channel = np.sqrt(4 * np.pi) * np.mean(sent[0], -1)
+    channel = _channels(_still(shading))
     color = channel if shading.blend is None else channel @ np.mean(shading.blend.weight, 0)
     return np.clip(np.broadcast_to(color, 3), 0, 1)
+
+
+def _channels(brdf: Callable) -> Float[np.ndarray, " k"]:
+    """Mean albedo of each channel of a BRDF, over views from above."""
+    cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Evenly spread in projected solid angle.
+    wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
+    sent = harmonic.table.project(brdf, jnp.asarray(wo), degree=0, rings=_RINGS, sectors=_SECTORS)
+    return np.asarray(np.sqrt(4 * np.pi) * np.mean(sent[0], -1))
 
 
 def _still(shading: Shading) -> Callable:

@@ -88,44 +88,38 @@ def precompute(
     run = _Run(path, executor, progress)
     region = np.asarray(mesh.region)
     member = separable.members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
-    job = jobs.TransferJob.make(
-        mesh,
-        None,
-        None,
-        size,
-        bases=bases,
-        response=_responses(mesh, bases, numbers, edge, run),
-        white=np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
-        scale=np.asarray(scales(factor)),
-        region=np.searchsorted(numbers, region),
-        member=member,
-        components=min(components, member.shape[1]),
-        modes=min(modes, 6 * edge * edge),
-    )
+    parts = {
+        "bases": bases,
+        "response": _responses(mesh, bases, numbers, edge, run),
+        "white": np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
+        "scale": np.asarray(scales(factor)),
+        "region": np.searchsorted(numbers, region),
+        "member": member,
+    }
+    sizes = {"components": min(components, member.shape[1]), "modes": min(modes, 6 * edge * edge)}
+    job = jobs.TransferJob.make(mesh, None, None, size, **parts, **sizes)
     found = run.compute(job, "clusters", "bounce")
     contribution = _contributions(found["energy"], job.scale)
     function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
-    weight = found["weight"].reshape(*member.shape, -1)
-    core = found["core"][..., function]
+    weight, core = found["weight"].reshape(*member.shape, -1), found["core"][..., function]
     second, brought_twice = None, np.zeros(0)
     if bounces != 1 and function.size:
         count = min(twice(components), member.shape[1])
         again = job.again(weight, core, found["mode"], function, components=count)
         second, brought_twice = _second(again, member, job.white[function], least, run)
         worth.append(_rms(brought_twice))
-    again_weight = None if second is None else np.asarray(second.weight)
-    exchanged = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
-    made = exchanged.make(bases, function, weight, again_weight, edge)
+    exchange = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
+    made = exchange.make(bases, function, weight, None if second is None else np.asarray(second.weight), edge)
     if second is not None and bounces != 2:
-        worth += exchanged.worth(made, job.white[function], function, brought_twice)
+        worth += exchange.worth(made, job.white[function], function, brought_twice)
     if progress:
         _tell(contribution, function, worth, second, bounces)
     rows = (separable.members.places(member), job.region.astype(np.int32), areas(mesh).astype(weight.dtype))
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
-    judged = {"error": jnp.asarray(found["error"]), "worth": jnp.asarray(worth, arrays[0].dtype)}
-    key = visibility.blocks.scene_key(mesh)
-    return TransferTensor(*arrays, factor=factor, second=second, **judged, mesh=key, patches=made)
+    judged = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
+    made_of = {"factor": factor, "second": second, "mesh": visibility.blocks.scene_key(mesh), "patches": made}
+    return TransferTensor(*arrays, **made_of, error=judged[0], worth=judged[1])
 
 
 class _Run(NamedTuple):

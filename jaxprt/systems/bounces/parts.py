@@ -101,7 +101,7 @@ class PartBounces(protocol.System):
             own if mean is None else jnp.matmul(own, mean, precision="highest")
             for own, mean in zip(self.tensor.factor, means, strict=True)
         ]
-        arriving = collect(self.tensor, light, gathered(self.tensor, rows), self._changes(blends, means))
+        arriving = collect(self.tensor, light, gathered(self.tensor, rows), change=self._changes(blends, means))
         each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
         return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))
 

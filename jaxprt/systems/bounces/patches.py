@@ -115,6 +115,29 @@ class Patches(eqx.Module):
             return result
         return result + self.series(rho, rho * arriving, terms=self.bounces - 2)
 
+    def arriving(
+        self,
+        mean: Float[Array, "j d"],
+        change: Float[Array, "j _"] | None,
+        lit: Float[Array, "j c"],
+        once: Float[Array, "g e n s"],
+        twice: Float[Array, "g e o s"] | None,
+    ) -> Float[Array, "s _ v"]:
+        """SH coefficients, in world directions, of what arrives at each vertex and the tensor does not have.
+
+        Args:
+            mean: As in `sent`, and so are `change` and `lit`.
+            change: The change of albedo.
+            lit: Irradiance over pi by the light itself.
+            once: Components and harmonics that each cluster of the tensor has of one bounce.
+            twice: The same of two.
+        """
+        first = jnp.sum(self.first[:, None] * once[self.cluster], (-2, -1))
+        second = None
+        if twice is not None and self.second is not None:
+            second = jnp.sum(self.second[:, None] * twice[self.cluster], (-2, -1))
+        return self.received(self.sent(mean, change, lit, first, second))
+
     def series(self, rho: Float[Array, "j d"], start: Float[Array, "j e"], *, terms: int) -> Float[Array, "j e"]:
         """The first terms of start + rho F start + (rho F)^2 start + ..."""
 

@@ -149,7 +149,7 @@ def arriving(
 def _arriving(
     transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight, change
 ) -> tuple[Arriving, ...]:
-    whole = collect(tensor, light, weight, change)
+    whole = collect(tensor, light, weight, change=change)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
 
 
@@ -217,7 +217,11 @@ def area_mean(value: Float[Array, "v *c"], area: Float[Array, " v"]) -> Float[Ar
 
 @isolated
 def collect(
-    tensor: TransferTensor, light: LitTransfer, weight: Float[Array, "q d"], change: Float[Array, "v e"] | None = None
+    tensor: TransferTensor,
+    light: LitTransfer,
+    weight: Float[Array, "q d"],
+    *,
+    change: Float[Array, "v e"] | None = None,
 ) -> Float[Array, "s _ v"]:
     """SH coefficients, in world directions, of the radiance that arrives at each vertex.
 
@@ -240,23 +244,10 @@ def collect(
     no_more = tensor.patches is None or twice is None or tensor.patches.bounces == 2
     if light.matte is None or (change is None and no_more):
         return whole
-    return whole + _exchanged(tensor, light.matte, once, twice, weight, change)
-
-
-def _exchanged(tensor: TransferTensor, matte: Array, once: Array, twice: Array | None, weight: Array, change) -> Array:
-    """What patches add to what arrives at each vertex."""
-    patches = tensor.patches
-    assert patches is not None
-
-    def irradiance(own: Array | None, met: Array | None) -> Array | None:
-        if own is None or met is None:
-            return None
-        return jnp.sum(own[:, None] * met[patches.cluster], (-2, -1))
-
-    first, second = irradiance(patches.first, once), irradiance(patches.second, twice)
-    assert first is not None
-    off = None if change is None else patches.means(change, tensor.area)
-    return patches.received(patches.sent(patches.albedo(tensor.function, weight), off, matte, first, second))
+    assert tensor.patches is not None
+    mean = tensor.patches.albedo(tensor.function, weight)
+    off = None if change is None else tensor.patches.means(change, tensor.area)
+    return whole + tensor.patches.arriving(mean, off, light.matte, once, twice)
 
 
 def view_side(

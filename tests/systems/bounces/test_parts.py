@@ -18,7 +18,7 @@ from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import of_part
-from jaxprt.scene import Environment, Mesh, builtin
+from jaxprt.scene import Environment, Mesh, TexturedMaterial, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import directions
 from jaxprt.systems.bounces import PartBounces, ReflectingPart
@@ -76,6 +76,19 @@ def test_what_bounces_bring_is_estimated_as_the_closed_form_has_it():
     once = ALBEDO / 2
     np.testing.assert_allclose(found[:, 0], [once, once**2, once**3], rtol=0.03)
     assert [reflection.needed(found, each) for each in (0.5, 0.2, 0.1, 0.01)] == [0, 1, 2, "all"]
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.2, 1.0])
+def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
+    """Narrow lobes too, which are narrower than the texels of the maps of light paths."""
+    metal = prt.Part("metal", corner(), TexturedMaterial(metallic=0.4, roughness=roughness))
+    shading = of_part(metal)
+    path = reflection._factored(shading)
+    np.testing.assert_allclose(
+        bounces.functions.albedo(path), reflection._channels(reflection._still(shading)), rtol=0.01, atol=1e-3
+    )
+    if roughness == 0.05:
+        assert 0.97 < np.sum(bounces.functions.albedo(path) @ np.asarray(shading.blend.weight[0, :, 0])) < 1.05
 
 
 def test_weighted_channels_reflect_as_the_brdf_that_they_add_up_to(close):
