@@ -1,5 +1,6 @@
 """Transfer tensors: what is decomposed is what arrives, after one bounce and two."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -197,7 +198,9 @@ def test_diffuse_surfaces_exchange_light_reciprocally():
 def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
     options = {"edge": EDGE, "size": SIZE, "progress": False}
     cut = bounces.precompute(mesh, brdfs, components=20, modes=24, bounces=1, **options)
-    assert cut.nbytes < whole.nbytes / 10
+    # Without patches, of which components are a small part.
+    short, long = (eqx.tree_at(lambda each: each.patches, each, None).nbytes for each in (cut, whole))
+    assert short < long / 10
     assert cut.second is None
     # A color for each wavelet and function.
     texels, functions = 6 * EDGE**2, 3
