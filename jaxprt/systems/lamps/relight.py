@@ -71,7 +71,7 @@ class LitByLamps(eqx.Module):
         """Radiance that each vertex or point sends to the eye, for each lamp of radiance 1.
 
         Args:
-            eye: Position of the viewer in world units.
+            eye: Position of the viewer in world units; one, or one for each vertex or point.
             blend: What each vertex, or point, is made of, over the channels of the BRDF; the albedo if there is none.
             points: Where; None for the vertices.
             traced: How much of the narrow lobes of each vertex or point rays carry; None for nothing.
@@ -83,10 +83,10 @@ class LitByLamps(eqx.Module):
             TypeError: The blend is no `Blend`.
             ValueError: It is of other vertices or channels, or the eye is not one finite position.
         """
-        require.position("the eye", eye)
+        count = len(self.transport.position if points is None else points)
+        require.position("the eye", eye, each=count)
         check_blend(blend)
         if blend is not None:
-            count = len(self.transport.position) if points is None else len(points)
             blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))
         return _view(self, eye, blend, points, traced)
 

@@ -142,6 +142,11 @@ def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
             return np.asarray(table(wi, jnp.broadcast_to(wo[number], wi.shape)))[:, 0]
 
         sent = lit.view(eye)
+        close(np.asarray(lit.view(jnp.broadcast_to(eye, (36, 3)))), np.asarray(sent))
+        # Rays take no more than there is.
+        left = np.asarray(lit.view(eye, traced=jnp.ones(36)))
+        assert np.all(left <= np.asarray(sent) * (1 + 1e-5))
+        assert np.all(left >= 0)
         expected = lamp_integral(value)
         got = np.asarray(lit.combine(jnp.array([[1.0], [0.0]]), sent))[:, 0]
         assert np.linalg.norm(got - expected) <= LAMP_SHAPED * np.linalg.norm(expected)
