@@ -150,7 +150,7 @@ def judged(whole: RelitScene, triples: list[Triple], quick: bool, folder: pathli
     rows = []
     for number, (light, camera, materials) in enumerate(triples):
         mine, alone = (np.asarray(each.picture(light, camera, materials=materials)) for each in (whole, direct))
-        if not path_tracing.available():
+        if not (quick or path_tracing.available()):
             continue
         parts = [dataclasses.replace(each, material=materials[each.name]) for each in whole.scene.parts]
         start = time.perf_counter()

@@ -34,6 +34,7 @@ MOST_ERROR = {
     "precompute_separable": 3e-3,
     "rasterize": 0.03,  # of the coverage at edges
     "refinement": 0.4,
+    "reflections": 0.15,
     "relight_dynamic": 0.08,
     "relight_harmonic": 0.7,
     "relight_separable": 5e-3,

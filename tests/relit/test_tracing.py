@@ -27,6 +27,7 @@ DARK = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
 CAMERA = Camera(EYE, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.9, 24, 18)
 ALBEDO = 0.9  # of the mirror, and a little more at grazing angles
 COARSE = 0.06  # by which the albedo of a small table is off
+FAINT = 1e-3  # of the light of the wall: what a small table has of a mirror in its diffuse part, which lamps light
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,9 +87,11 @@ def test_a_mirror_shows_a_wall_that_glows_where_the_closed_form_has_it():
     assert shown.sum() > 8
     assert bare.sum() > 8
     np.testing.assert_allclose(color[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE)
-    np.testing.assert_allclose(color[bare], 0, atol=1e-5)
-    harmonics = np.asarray(ready.with_rays(0).radiance(DARK, eye=EYE))[:49]
-    np.testing.assert_allclose(harmonics, 0, atol=1e-5)  # Emitted light is none of theirs.
+    np.testing.assert_allclose(color[bare], 0, atol=FAINT)
+    # Without rays the wall is four disks, which are bright in their middles and leave gaps.
+    disks = np.asarray(ready.with_rays(0).radiance(DARK, eye=EYE))[:49]
+    assert np.abs(disks - color)[shown].max() > 0.1
+    assert abs(disks[shown].mean() / color[shown].mean() - 1) < 0.5
 
 
 def test_points_pictures_and_programs_agree_with_the_vertices(close):
@@ -133,7 +136,7 @@ def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(clo
     np.testing.assert_allclose(
         dark.reshape(-1, 3)[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE
     )
-    np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=1e-5)
+    np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=FAINT)
 
 
 def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):

@@ -154,12 +154,12 @@ def _chord(transport: LampTransport, points: Points | None) -> Float[Array, "n v
 
 
 @jit
-def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> Float[Array, "..."]:
     """How much of a lobe rays carry to a lamp: all of one that is narrow beside the lamp, nothing of one that is wider.
 
     Args:
         concentration: Of the lobe.
-        chord: Squared chord from the middle of the lamp to its rim.
+        chord: Squared chord from the middle of the lamp to its rim; its axes are the last ones.
     """
     place = jnp.clip(jnp.log(jnp.maximum(concentration * chord, _TINY)) / _RATHER, 0, 1)
     return place**2 * (3 - 2 * place)
