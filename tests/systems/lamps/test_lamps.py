@@ -77,6 +77,19 @@ def test_the_irradiance_of_a_square_is_lamberts_formula(transport):
     assert np.linalg.norm(solid - expected) <= SAMPLED * np.linalg.norm(expected)
 
 
+def test_near_lamps_are_lamberts_formula_too():
+    """A thirtieth of the lamp's width above the middle of the ground, where 256 points are too few."""
+    close_by = square([0.0, 0.02, 0.0], SIDE, down=True)
+    near = lamps.precompute(floor(5), [close_by], occluder=join([floor(5), close_by]), progress=False)
+    middle = int(np.argmin(np.abs(np.asarray(near.position)).sum(1)))
+    corner = np.asarray(close_by.position, np.float64)
+    unit = corner / np.linalg.norm(corner, axis=1, keepdims=True)
+    across = np.cross(unit, np.roll(unit, -1, 0))
+    angle = np.arccos(np.sum(unit * np.roll(unit, -1, 0), 1))
+    expected = abs(np.sum(across[:, 1] / np.linalg.norm(across, axis=1) * angle)) / 2
+    np.testing.assert_allclose(np.sum(near.cosine[:, middle]), expected, rtol=0.08)
+
+
 def test_a_point_light_falls_with_the_square_of_the_distance(transport, close):
     way = np.asarray(BULB.position) - np.asarray(GROUND.position)
     square_ = np.sum(way**2, 1)
