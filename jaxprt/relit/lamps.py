@@ -133,8 +133,10 @@ def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, Point
     for name, each in changed.items():
         if name not in known:
             raise ValueError(f"point lights must be of those of the scene, {list(known)}, got one called {name!r}")
-        moved = not isinstance(each.position, Tracer) and np.any(np.asarray(each.position) != known[name].position)
-        if moved:
+        now, then = each.position, known[name].position
+        if isinstance(now, Tracer) or isinstance(then, Tracer):
+            continue
+        if not np.array_equal(np.asarray(now), np.asarray(then)):
             raise ValueError(
                 f"point light {name!r} was traced from {np.asarray(known[name].position).tolist()}, got one at "
                 f"{np.asarray(each.position).tolist()}: precompute the scene with it there"

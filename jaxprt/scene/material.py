@@ -132,6 +132,7 @@ class TexturedMaterial(eqx.Module):
         normal_texture: [h w 3]: (normal + 1) / 2 in the frame of tangent, bitangent and normal.
 
     Raises:
+        TypeError: A texture is an array, not a `Texture`.
         ValueError: A factor is not finite or out of its range.
 
     Reference: Khronos glTF 2.0 specification, section 3.9 and appendix B; its extensions KHR_materials_ior,
@@ -165,6 +166,9 @@ class TexturedMaterial(eqx.Module):
             require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0.0)
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
+        for name, value in vars(self).items():
+            if name.endswith("_texture") and isinstance(value, np.ndarray | jax.Array):
+                raise TypeError(f"{name} of TexturedMaterial must be a Texture: jaxprt.scene.Texture(image)")
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 

@@ -111,10 +111,13 @@ def export(
             continue
         error = max(_error(scene, reduced, each) for each in lights.values())
         page = _page(session, reduced, lights, kept, error=error, title=path.stem)
-        if len(page) <= most:
+        least = len(page)
+        if least <= most:
             path.write_bytes(page)
-            return Piece(path, len(page), size.edge, texels, size.degree, error)
-    raise ValueError(f"most must be at least the {least} bytes of the scene with its coarsest visibility, got {most}")
+            return Piece(path, least, size.edge, texels, size.degree, error)
+    raise ValueError(
+        f"most must be at least about the {least} bytes of the scene with its coarsest visibility, got {most}"
+    )
 
 
 class _Size(NamedTuple):

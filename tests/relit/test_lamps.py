@@ -105,6 +105,7 @@ def test_gradients_in_color_and_strength_are_what_lamps_send():
             every[color][number] = one[number].at[color].add(1)
         expected = np.array([sent(*each) - sent(*one) for each in every])
         np.testing.assert_allclose(got, expected, rtol=1e-3)
+    np.testing.assert_allclose(jax.jit(sent)(*one), sent(*one), rtol=1e-5)
 
 
 def test_probes_see_the_light_and_the_parts_where_they_are(close):
