@@ -194,7 +194,7 @@ def off(mine: np.ndarray, alone: np.ndarray, exact: list[tuple[np.ndarray, np.nd
 
 
 def norm(value, one: np.ndarray, other: np.ndarray) -> float:
-    """Of the difference from what two noisy pictures are means of: their noise has no part in the product."""
+    """Norm of a picture's difference from the mean that two noisy pictures share; their noise cancels in the product."""
     return float(np.sqrt(max(np.sum((value - one) * (value - other), dtype=np.float64), 0)))
 
 

@@ -42,7 +42,7 @@ class Caster:
         """The triangle that each ray meets, -1 for none, the weights of its corners, and where the rays start.
 
         Args:
-            rays: Of vertices or points of a part.
+            rays: The rays that start from vertices or points of a part.
             first: Number of the part's first vertex.
             points: The points; None for the vertices.
         """

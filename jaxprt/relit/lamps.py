@@ -43,7 +43,7 @@ class SceneLamps(eqx.Module):
         """Radiance of each lamp, the mean over its area; intensity of each point light.
 
         Args:
-            appearances: Of all parts, at their vertices.
+            appearances: The materials of all parts at their vertices.
             changed: Point lights that are not as the scene has them, by their names.
         """
         rows = [
