@@ -194,7 +194,7 @@ def off(mine: np.ndarray, alone: np.ndarray, exact: list[tuple[np.ndarray, np.nd
 
 
 def norm(value, one: np.ndarray, other: np.ndarray) -> float:
-    """Norm of a picture's difference from the mean that two noisy pictures share; their noise cancels in the product."""
+    """Norm of the difference from a picture that is known as two noisy ones, whose noise falls out of the product."""
     return float(np.sqrt(max(np.sum((value - one) * (value - other), dtype=np.float64), 0)))
 
 
