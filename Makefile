@@ -48,8 +48,9 @@ docs: $(VENV)/.setup-docs ## the documentation in build/docs, warnings are error
 	$(BIN)/python docs/offline.py build/docs
 
 clean: ## remove what was computed and cached; .venv stays
-	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks docs/reference/*.rst
-	find jaxprt tests benchmarks notebooks -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf
+	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks
+	find docs/reference -name "*.rst" -delete
+	find jaxprt tests benchmarks notebooks docs -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf
 
 # Installed again only when the requirements have changed. Each extra has a stamp of its own.
 $(VENV)/.setup: pyproject.toml constraints.txt

@@ -46,8 +46,23 @@ def members(module: types.ModuleType) -> list[str]:
     return found
 
 
-def pages() -> Iterator[tuple[str, str]]:
-    """Each page's name and its text. An object stands at the first of its names, the shortest."""
+def pages() -> dict[str, str]:
+    """The text of each page by its path. Pages of packages list those of their modules, in a folder of their name."""
+    found = dict(_pages())
+    path = {}
+    for name in found:
+        outer = [each for each in found if name.startswith(f"{each}.") and each != "jaxprt"]
+        short = name.removeprefix("jaxprt.")
+        path[name] = short.replace(".", "/", 1) if outer else short
+    for name in found:
+        inner = sorted(each for each in path.values() if each.startswith(f"{path[name]}/"))
+        if inner:
+            found[name] += "\n.. toctree::\n   :maxdepth: 1\n\n" + "".join(f"   /reference/{each}\n" for each in inner)
+    return {path[name]: text for name, text in found.items()}
+
+
+def _pages() -> Iterator[tuple[str, str]]:
+    """An object stands at the first of its names, the shortest."""
     seen: set[int] = set()
     everything = modules()
     for name in sorted(everything, key=lambda each: (each.count("."), each)):
@@ -69,12 +84,12 @@ def pages() -> Iterator[tuple[str, str]]:
 
 def _write(app: Sphinx) -> None:
     folder = pathlib.Path(app.srcdir) / "reference"
-    wanted = {f"{name}.rst": text for name, text in pages()}
-    for old in folder.glob("*.rst"):
-        if old.name not in wanted:
+    wanted = {folder / f"{name}.rst": text for name, text in pages().items()}
+    for old in folder.rglob("*.rst"):
+        if old not in wanted:
             old.unlink()
-    for name, text in wanted.items():
-        path = folder / name
+    for path, text in wanted.items():
+        path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
 
