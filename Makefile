@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables notebooks clean
+.PHONY: help setup demo view check test test-long bench tables notebooks dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,6 +42,15 @@ tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
 	$(BIN)/python notebooks/execute.py $(sort $(wildcard notebooks/*.ipynb))
+
+dist: $(VENV)/.setup-dist ## wheel and source distribution in dist/, checked, installed into an empty environment and run there
+	rm -rf dist build/installed
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+	$(PYTHON) -m venv build/installed
+	build/installed/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/installed && bin/python -I "$(CURDIR)/tests/installed.py" "$(CURDIR)"
 
 clean: ## remove what was computed and cached; .venv stays
 	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache
