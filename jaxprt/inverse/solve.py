@@ -232,7 +232,7 @@ def marquardt(
 
 
 def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:
-    """Squared norms of the Jacobian's columns, estimated by random signs, and the units of parameters, inverse roots."""
+    """Squared norms of the Jacobian's columns, estimated by random signs, and the parameters' units: inverse roots."""
     probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), dtype)
     square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
     whole = jnp.max(square)
