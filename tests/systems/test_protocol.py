@@ -271,7 +271,7 @@ def reflected_fraction(model: Callable, height: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", METALS)
 def test_white_metals_in_a_white_furnace_send_what_single_scattering_reflects(name, roughness):
     if roughness not in METALS[name]:
-        pytest.skip("its maps are coarser than the lobe; the limitations in the README say so")
+        pytest.skip("its maps are coarser than the lobe; docs/limits.md says so")
     case = made(name, "ball", f"metal {roughness}")
     to = np.asarray(EYE) - np.asarray(case.mesh.position)
     height = np.sum(to / np.linalg.norm(to, axis=1, keepdims=True) * np.asarray(case.mesh.normal), 1)
