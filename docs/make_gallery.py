@@ -7,7 +7,6 @@ minutes on two cores.
 import os
 import pathlib
 import sys
-import tempfile
 from collections.abc import Callable
 
 import numpy as np
@@ -20,6 +19,7 @@ from jaxprt.scene import TexturedMaterial, builtin
 from jaxprt.scene.mesh import ground_plane
 
 FOLDER = pathlib.Path(__file__).parent / "pictures"
+KEPT = pathlib.Path(__file__).parents[1] / "output" / "gallery"  # what was precomputed, for later runs
 DATA = pathlib.Path(os.environ.get("JAXPRT_DATA", ""))
 EDGE = 384
 LIGHTS = {
@@ -107,32 +107,30 @@ def systems() -> None:
 
 def scenes() -> None:
     """Scenes with their materials, and meshes with one each, by lobes."""
-    with tempfile.TemporaryDirectory() as folder:
-        pictures = {}
-        for name in ("Duck", "CesiumMilkTruck", "BoxTextured"):
-            scene = prt.load_scene(DATA / "scenes" / f"{name}.glb")
-            ground = prt.Part("ground", ground_plane(scene.mesh, vertices=6000), matte(0.5))
-            whole = prt.Scene([*scene.parts, ground])
-            relit = prt.precompute(whole, system=Lobes(6), path=f"{folder}/{name}", progress=False)
-            pictures[name] = exposed(relit.picture(light("courtyard"), camera(scene.mesh)))
-        for name, file, color, metallic, roughness, azimuth in (
-            ("Stanford bunny, gold", "stanford_bunny.ply", (1.0, 0.71, 0.29), 1.0, 0.4, 0.0),
-            ("Nefertiti, plaster", "nefertiti.ply", (0.8, 0.76, 0.7), 0.0, 0.8, 0.3),
-            ("Suzanne, plastic", "suzanne.obj", (0.1, 0.3, 0.6), 0.0, 0.3, 0.4),
-        ):
-            mesh = prt.load_mesh(DATA / "meshes" / file)
-            material = TexturedMaterial(base_color=color, metallic=metallic, roughness=roughness)
-            relit = prt.precompute(standing(mesh, material), system=Lobes(6), path=f"{folder}/{name}", progress=False)
-            pictures[name] = exposed(relit.picture(light("courtyard"), camera(mesh, azimuth=azimuth)))
-        sheet("scenes", pictures, columns=3)
+    pictures = {}
+    for name in ("Duck", "CesiumMilkTruck", "BoxTextured"):
+        scene = prt.load_scene(DATA / "scenes" / f"{name}.glb")
+        ground = prt.Part("ground", ground_plane(scene.mesh, vertices=6000), matte(0.5))
+        whole = prt.Scene([*scene.parts, ground])
+        relit = prt.precompute(whole, system=Lobes(6), path=KEPT / f"{name} on a ground", progress=False)
+        pictures[name] = exposed(relit.picture(light("courtyard"), camera(scene.mesh)))
+    for name, file, color, metallic, roughness, azimuth in (
+        ("Stanford bunny, gold", "stanford_bunny.ply", (1.0, 0.71, 0.29), 1.0, 0.4, 0.0),
+        ("Nefertiti, plaster", "nefertiti.ply", (0.8, 0.76, 0.7), 0.0, 0.8, 0.3),
+        ("Suzanne, plastic", "suzanne.obj", (0.1, 0.3, 0.6), 0.0, 0.3, 0.4),
+    ):
+        mesh = prt.load_mesh(DATA / "meshes" / file)
+        material = TexturedMaterial(base_color=color, metallic=metallic, roughness=roughness)
+        relit = prt.precompute(standing(mesh, material), system=Lobes(6), path=KEPT / name, progress=False)
+        pictures[name] = exposed(relit.picture(light("courtyard"), camera(mesh, azimuth=azimuth)))
+    sheet("scenes", pictures, columns=3)
 
 
 def lights() -> None:
-    """One object in each light, by lobes."""
-    mesh = prt.load_mesh(DATA / "meshes" / "rocker_arm.ply")
-    material = TexturedMaterial(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.35)
-    relit = prt.precompute(standing(mesh, material), system=Lobes(8), progress=False)
-    view = relit.picture_view(camera(mesh))
+    """The duck in each light, by lobes."""
+    scene = prt.load_scene(DATA / "scenes" / "Duck.glb")
+    relit = prt.precompute(scene, system="lobe", path=KEPT / "Duck", progress=False)
+    view = relit.picture_view(camera(scene.mesh))
     sheet("lights", {name: exposed(view.picture(light(name))) for name in LIGHTS}, columns=4)
 
 
