@@ -38,10 +38,10 @@ def relit(folder: str) -> prt.RelitScene:
     return prt.precompute(scene, system=prt.relit.Lobes(6), roughness=(0.25, 0.8), path=folder)
 
 
-def settle(page: Page) -> None:
-    """Waits until the newest look is shown."""
-    stats = f"{_ROOT}.querySelector('.canvas')?.stats"
-    page.wait_for_function(f"() => {{ const s = {stats}; return s && s.shown >= 0 && s.shown === s.seq; }}")
+def settle(page: Page, *, rest: bool = False) -> None:
+    """Waits until the newest look is shown, or the picture at rest as well."""
+    stats, more = f"{_ROOT}.querySelector('.canvas')?.stats", "&& s.stills > 0" if rest else ""
+    page.wait_for_function(f"() => {{ const s = {stats}; return s && s.shown >= 0 && s.shown === s.seq {more}; }}")
 
 
 def frame(page: Page) -> Image.Image:
@@ -52,7 +52,7 @@ def frame(page: Page) -> Image.Image:
 def play(page: Page) -> list[Image.Image]:
     """Orbits, turns the light, and drags a material through roughness and reflectance: 36 frames."""
     frames = []
-    settle(page)
+    settle(page, rest=True)
     page.evaluate(f"() => {{ {_ROOT}.querySelector('.line').style.visibility = 'hidden'; }}")
     middle = (SHOWN[0] * 0.35, SHOWN[1] * 0.55)
 
