@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables notebooks clean
+.PHONY: help setup demo view check test test-long bench tables notebooks docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,9 +43,14 @@ notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full siz
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
 	$(BIN)/python notebooks/execute.py $(sort $(wildcard notebooks/*.ipynb))
 
+docs: $(VENV)/.setup-docs ## the documentation in build/docs, warnings are errors; JAXPRT_DOCS_EXECUTE=1 executes the notebooks
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
+	$(BIN)/python docs/offline.py build/docs
+
 clean: ## remove what was computed and cached; .venv stays
-	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache
-	find jaxprt tests benchmarks notebooks -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf
+	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks
+	find docs/reference -name "*.rst" -delete
+	find jaxprt tests benchmarks notebooks docs -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf
 
 # Installed again only when the requirements have changed. Each extra has a stamp of its own.
 $(VENV)/.setup: pyproject.toml constraints.txt
