@@ -25,6 +25,7 @@ MOST_ERROR = {
     "concave": 0.5,  # of all bounces against one alone
     "device": 0.0,  # Here it is the CPU itself.
     "factorization": 1e-4,
+    "failures": 0.3,
     "gradients": 1e-7,
     "interreflection": 0.65,
     "inverse": 0.1,
