@@ -1,6 +1,7 @@
 """What do scenes like those of Sun et al. 2007 cost, with two bounces? The columns of their Table 1.
 
-    python -m benchmarks.paper_scenes [--quick] [--only SCENE...] [--store FOLDER] [--output FILE]
+    python -m benchmarks.paper_scenes [--quick] [--only SCENE...] [--most VERTICES] [--store FOLDER]
+        [--output FILE]
 
 Scenes have several regions whose materials change while all of them light each other. Room, chess, walls and ring are
 made by formula (`jaxprt.scene.interiors`). The others stand in for the paper's meshes, which are not public: scans of
@@ -8,7 +9,7 @@ JAXPRT_DATA, simplified so that each scene has the paper's number of vertices. W
 
 Lines `precompute` have the time of transport and bounces, the bytes of the bounces' tensor and of the direct light, and
 the peak of the process's memory. Where a run was stopped, a `--store` goes on from there, and the seconds of all runs
-are added up. `--least` leaves scenes out that have more vertices than that.
+are added up. `--most` leaves out the scenes whose counterpart in the paper has more vertices.
 
 Lines `frame` are of a picture of 512 x 512 pixels with 4 samples of coverage each: all vertices are relit and then
 drawn, as in the paper. `view` has a new view in each frame, `material` a new view and new materials, `light` a new
@@ -48,7 +49,12 @@ EDGE = 512  # pixels
 LOBES = 6
 COOK_TORRANCE = tuple(itertools.product((0.0, 1.0), (0.05, 0.1, 0.2, 0.4, 0.8)))  # F0 and roughness
 BLINN_PHONG = (2.0, 6.0, 20.0, 60.0, 200.0)
-SHARP = 128  # terms where caustics are looked at
+PATHS = {
+    "functions": 3,
+    "terms": 16,
+}  # of sets along light paths, besides the diffuse one; the paper has four functions
+SHARP = (20.0, 200.0)  # exponents where caustics are looked at
+SHARP_TERMS = 64
 ROOM = (0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9)  # its walls are one region
 
 
@@ -147,12 +153,12 @@ def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what is precomputed, and go on")
     parser.add_argument("--only", nargs="+", choices=list(RECIPES), metavar="SCENE", help=", ".join(RECIPES))
-    parser.add_argument("--least", type=int, metavar="VERTICES", help="leave larger scenes out")
+    parser.add_argument("--most", type=int, metavar="VERTICES", help="leave larger scenes out")
     arguments = parser.parse_args(options)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
     for name in arguments.only or (["walls"] if arguments.quick else RECIPES):
         published = RECIPES[name].published
-        if arguments.least and published and published.vertices > arguments.least:
+        if arguments.most and published and published.vertices > arguments.most:
             continue
         for line in measure(prepare(name, quick=arguments.quick, store=arguments.store), arguments.quick):
             harness.report(line, arguments.output)
@@ -169,7 +175,7 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     """
     recipe = RECIPES[name]
     mesh = recipe.mesh(quick)
-    sharp = "terms" in recipe.options
+    sharp = "edge" in recipe.options  # finer light than that of the paper's scenes
     seen, met, family = sets(recipe.space, quick=quick, sharp=sharp)
     regions: list[Any] = [seen] * _regions(mesh)
     paths: list[Any] = [met] * len(regions)
@@ -181,17 +187,18 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     given: dict[str, Any] = (
         {"edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2} | dict(recipe.options) | options
     )
-    given.pop("terms", None)
     if quick:
         given |= {"edge": 4, "size": 8, "components": 8, "modes": 16}
-    marks = "_".join(f"{key}{value}" for key, value in given.items())
+    marks = "_".join(f"{key}{value}" for key, value in given.items() if key != "bounces")
     start = time.perf_counter()
     try:
         transport = dynamic.precompute(mesh, regions, size=size, path=folder and folder / "direct", progress=False)
         path = folder and folder / marks
         tensor = bounces.precompute(mesh, paths, path=path, progress=False, **given)
     finally:
-        seconds, peak = _spent(folder and folder / f"{marks}.json", time.perf_counter() - start)
+        seconds, peak = _spent(
+            folder and folder / f"{marks}_bounces{given['bounces']}.json", time.perf_counter() - start
+        )
     direct = dynamic.DynamicSystem(transport, regions, samples=1 if quick else 2)
     system = prt.total(direct, bounces.BouncesSystem(tensor, direct))
     return Made(name, recipe, mesh, system, family.navigation, seconds, peak)
@@ -215,20 +222,21 @@ def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:
 def sets(space: str, *, quick: bool, sharp: bool) -> tuple[dynamic.DynamicBrdf, dynamic.DynamicBrdf, navigation.Family]:
     """What is seen of a set of BRDFs, by lobes, what light meets on its way, by terms, and the way through the set.
 
-    Usual light paths have 32 terms and views smoothed to degree 5. Sharp ones, for caustics, have a tensor of the
-    BRDFs themselves with more terms, which keeps lobes three times as narrow.
+    Usual light paths have 16 terms and views smoothed to degree 5. Sharp ones, for caustics, have a tensor of the
+    BRDFs themselves with more terms, which keeps lobes narrower.
     """
     if space == "BP":
-        family = navigation.blinn_phong(exponents=BLINN_PHONG[::4] if quick else BLINN_PHONG)
+        knots = SHARP if sharp else BLINN_PHONG
+        family = navigation.blinn_phong(exponents=(knots[0], knots[-1]) if quick else knots)
     else:
         family = navigation.cook_torrance(
             point=np.array([each for each in COOK_TORRANCE if not quick or each[1] in (0.05, 0.8)])
         )
     seen = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
-    small: dict[str, Any] = {"functions": 2, "terms": 4, "resolution": 8} if quick else {}
+    sizes: dict[str, Any] = {"functions": 2, "terms": 4, "resolution": 8} if quick else PATHS
     if not sharp:
-        return seen, bounces.factor(family.brdf, navigation=family.navigation, **small), family
-    ranks = (2, 4, 4) if quick else (len(family.brdf), SHARP, SHARP)
+        return seen, bounces.factor(family.brdf, navigation=family.navigation, **sizes), family
+    ranks = (2, 4, 4) if quick else (len(family.brdf), SHARP_TERMS, SHARP_TERMS)
     return seen, dynamic.factor(family.brdf, None, ranks=ranks, resolution=8 if quick else 32), family
 
 
@@ -330,7 +338,11 @@ def _scan(file: str, faces: int, quick: bool, axes: str = "xyz") -> Mesh:
 
 
 def _room(quick: bool) -> Mesh:
-    """The room with its three walls as one region; a quick one is a box of as many regions."""
+    """The room with its three walls as one region; a quick one is as many balls."""
+    if quick:
+        ball = builtin.sphere(rings=4, sectors=6)
+        place = np.stack(np.divmod(np.arange(max(ROOM) + 1), 4), -1) @ np.array([[0, 3.0, 0], [3.0, 0, 0]])
+        return join([make_mesh(np.asarray(ball.position) + each, ball.face) for each in place])
     mesh = interiors.room()
     region = jnp.asarray(ROOM, jnp.int32)[mesh.region]
     return eqx.tree_at(lambda each: each.region, mesh, region)
@@ -373,15 +385,15 @@ RECIPES = {
     "ring": Recipe(
         lambda quick: interiors.ring(spacing=4.0 if quick else 1.0),
         "BP",
-        {0: (0.02, [0.9, 0.7, 0.35], 60.0)},
+        {0: (0.02, [0.9, 0.7, 0.35], 200.0)},
         {1: 0.4},
         "daylight",
         ([0.1, 0.66, 0.56], _ABOVE, 0.6),
         None,
-        {"edge": 16, "size": 32, "modes": 160, "components": 48, "terms": SHARP},
+        {"edge": 16, "modes": 96},
     ),
     "chess": Recipe(
-        lambda quick: _grounded(_scan("", 0, quick), quick, 25) if quick else interiors.chess_sides(),
+        lambda quick: interiors.corner(_scan("", 0, quick), cells=4) if quick else interiors.chess_sides(),
         "CT",
         {0: ([0.35, 0.05, 0.04], 0.6, [0.1, 0.2]), 1: ([0.6, 0.55, 0.4], 0.6, [0.1, 0.2])},
         {2: [0.65, 0.55, 0.4], 3: [0.12, 0.08, 0.06]},
