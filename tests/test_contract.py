@@ -96,6 +96,9 @@ HOST = {
     "systems.harmonic.transfer.precompute": "traces rays",
     "systems.harmonic.transfer.precompute_diffuse": "traces rays",
     "systems.harmonic.transfer.check": "checks values",
+    "systems.harmonic.transfer.check_memory": "the same",
+    "systems.harmonic.clustered.precompute_clustered": "traces rays",
+    "systems.harmonic.clustered.compress": "gives vectors of either sign",
     "systems.bright_texels.samples_for": "compares rules on the host",
     "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",
     "sphere.cubemap.axes": "a NumPy table of axes",
@@ -395,6 +398,11 @@ class Draw:
     def harmonic(self, *nodes):
         """A BRDF in four harmonics, over the view angle or on a map."""
         return harmonic_system.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
+
+    def clustered_transfer(self):
+        """Two clusters of two vertices, of degree 1, with one component."""
+        parts = self.normal(2, 9), self.normal(2, 1, 9), self.normal(2, 2, 1), self.normal(3, 3), self.rotation(3)
+        return harmonic_system.ClusteredTransfer(*parts, jnp.array([0, 3, 1]), self.uniform(2), self.uniform(2))
 
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
@@ -722,6 +730,9 @@ EXAMPLES = {
     ),
     "systems.harmonic.transfer.transfer": example(
         lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
+    ),
+    "systems.harmonic.clustered.clustered_light": example(
+        lambda draw: call(draw.clustered_transfer(), draw.normal(4, 3)), gradient=("transport", "light"), batch=False
     ),
     "systems.harmonic.transfer.visible": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "systems.harmonic.transfer.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),

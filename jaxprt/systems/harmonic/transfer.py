@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
@@ -91,12 +91,14 @@ def precompute(
 
     Raises:
         ValueError: Sizes out of range, positions or normals that are not finite, or a store made from something else.
+        MemoryError: The matrices do not fit into memory, which is known before any ray is traced.
         BlockingIOError: The store is being written by another process.
         RuntimeError: A worker of the executor died.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
+    check_memory(len(visibility.rays.chosen(mesh, vertex)), degree)
     job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)
@@ -272,6 +274,26 @@ class _Job(visibility.rays.VisibilityJob):
         name, function = ("vector", transfer_diffuse) if self.diffuse else ("matrix", transfer)
         made = function(seen, self.frame[self.part(block)], degree=self.degree)
         return {name: np.asarray(made)[:, None]}, count.rays
+
+
+def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1) -> None:
+    """Refuses matrices that do not fit into memory.
+
+    Args:
+        vertices: Number of vertices.
+        degree: Highest degree of the harmonics.
+        copies: How many of them are held at once.
+        colors: Number of colors of each.
+
+    Raises:
+        MemoryError: They do not fit.
+    """
+    each = 4 * (degree + 1) ** 4 * colors
+    require.memory(
+        f"transfer matrices of degree {degree} for {vertices:,} vertices, {each:,} bytes each,",
+        copies * vertices * each,
+        "take jaxprt.harmonic.precompute_clustered, a lower degree, or fewer vertices (vertex=)",
+    )
 
 
 def check(degree: int, size: int) -> None:
