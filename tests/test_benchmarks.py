@@ -29,6 +29,7 @@ MOST_ERROR = {
     "interreflection": 0.65,
     "inverse": 0.1,
     "lobes": 0.15,
+    "low_frequency": 0.06,  # of nine coefficients of irradiance
     "million": 1e-5,
     "pictures": 0.6,
     "precompute_separable": 3e-3,

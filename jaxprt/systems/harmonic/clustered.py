@@ -92,9 +92,9 @@ class ClusteredTransfer(eqx.Module):
         """The first components of each cluster; the error counts what the others held.
 
         Raises:
-            ValueError: There are fewer components, or a negative number is asked for.
+            ValueError: There are fewer components, or none is asked for.
         """
-        require.between("components", components, 0, self.component.shape[1])
+        require.between("components", components, 1, self.component.shape[1])
         kept, rest = self.component[:, :components], self.component[:, components:]
         squared = jnp.einsum("pnk,k->pn", rest**2, jnp.asarray(_metric(self.degree), rest.dtype))
         lost = jnp.sum(squared * jnp.sum(self.weight[..., components:] ** 2, 1), 1)
