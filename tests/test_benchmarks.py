@@ -31,6 +31,7 @@ MOST_ERROR = {
     "interreflection": 0.65,
     "inverse": 0.1,
     "lobes": 0.15,
+    "low_frequency": 0.06,  # of nine coefficients of irradiance
     "million": 1e-5,
     "paper_scenes": 0.5,  # of tensors of few components
     "pictures": 0.6,
