@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables notebooks docs clean
+.PHONY: help setup demo view check test test-long bench tables notebooks docs dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,6 +46,15 @@ notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full siz
 docs: $(VENV)/.setup-docs ## the documentation in build/docs, warnings are errors; JAXPRT_DOCS_EXECUTE=1 executes the notebooks
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
 	$(BIN)/python docs/offline.py build/docs
+
+dist: $(VENV)/.setup-dist ## wheel and source distribution in dist/, checked, installed into an empty environment and run there
+	rm -rf dist build/installed
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+	$(PYTHON) -m venv build/installed
+	build/installed/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/installed && bin/python -I "$(CURDIR)/tests/installed.py" "$(CURDIR)"
 
 clean: ## remove what was computed and cached; .venv stays
 	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks
