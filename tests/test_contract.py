@@ -98,6 +98,7 @@ HOST = {
     "systems.harmonic.transfer.check": "checks values",
     "systems.harmonic.transfer.check_memory": "the same",
     "systems.harmonic.clustered.precompute_clustered": "traces rays",
+    "systems.harmonic.exchange": "reads and writes files",
     "systems.harmonic.clustered.compress": "gives vectors of either sign",
     "systems.bright_texels.samples_for": "compares rules on the host",
     "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",

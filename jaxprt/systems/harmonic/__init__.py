@@ -1,7 +1,8 @@
 """The harmonic system: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002)."""
 
-from jaxprt.systems.harmonic import clustered, interreflection, relight, system, table, transfer
+from jaxprt.systems.harmonic import clustered, exchange, interreflection, relight, system, table, transfer
 from jaxprt.systems.harmonic.clustered import ClusteredTransfer, clustered_light, precompute_clustered
+from jaxprt.systems.harmonic.exchange import export_transfer, import_transfer
 from jaxprt.systems.harmonic.interreflection import interreflect, interreflect_diffuse
 from jaxprt.systems.harmonic.relight import (
     combine,
@@ -33,6 +34,9 @@ __all__ = [
     "clustered_light",
     "combine",
     "diffuse_radiance",
+    "exchange",
+    "export_transfer",
+    "import_transfer",
     "interreflect",
     "interreflect_diffuse",
     "interreflection",
