@@ -48,9 +48,8 @@ HOST = {
     "require": "checks values",
     "compile": "takes functions",
     "inverse": "takes functions, and fits on the host",
-    "cli.report": "measures, and writes files",
-    "cli.animation": "the same",
-    "cli.play": "serves pages",
+    "cli": "reads and writes files, measures, and serves pages",
+    "brdf.fitted": "reads files",
     "view": "the same, and answers messages",
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
@@ -893,7 +892,7 @@ def _public() -> dict[str, Callable]:
     """Public functions, and public classes that can be called, by their name without the package's."""
     result = {}
     for module in pkgutil.walk_packages(jaxprt.__path__, "jaxprt."):
-        if module.name.endswith(("__main__", "cli.main")):
+        if module.name.endswith("__main__"):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
             if name.startswith("_") or getattr(value, "__module__", None) != module.name:
