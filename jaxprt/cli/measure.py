@@ -27,7 +27,7 @@ _VERTICES = 300
 @option(
     "--error",
     group="System",
-    type=options.Finite(0, 1, open=True),
+    type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
     default=0.05,
     show_default=True,

@@ -231,7 +231,7 @@ camera = together(
     option(
         "--elevation",
         group="Camera",
-        type=Finite(-90, 90),
+        type=Finite(-90.0, 90.0),
         default=15.0,
         metavar="DEGREES",
         show_default=True,

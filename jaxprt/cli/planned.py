@@ -18,7 +18,7 @@ from jaxprt.relit.planning import Plan, key_of, plan
 @option(
     "--error",
     group="Plan",
-    type=options.Finite(0, 1, open=True),
+    type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
     default=0.05,
     show_default=True,
@@ -27,7 +27,7 @@ from jaxprt.relit.planning import Plan, key_of, plan
 @option(
     "--rate",
     group="Plan",
-    type=options.Finite(0, open=True),
+    type=options.Finite(0.0, open=True),
     metavar="FPS",
     default=30.0,
     show_default=True,

@@ -32,7 +32,7 @@ _ERROR = 0.05
 @option(
     "--error",
     group="System",
-    type=options.Finite(0, 1, open=True),
+    type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
     help="Relative error that the planned system must meet.  [default: 0.05]",
 )
