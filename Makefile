@@ -15,7 +15,7 @@ help: ## this list
 
 setup: $(VENV)/.setup ## install the package, with what the demo needs
 demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
-	$(BIN)/python -m jaxprt --output output/demo
+	$(BIN)/python -m jaxprt relight --output output/demo
 
 view: $(VENV)/.setup ## play with the embedded scene in the browser: ARGS="mesh.ply light.hdr" for files
 	$(BIN)/python -m jaxprt view $(ARGS)

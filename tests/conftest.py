@@ -63,7 +63,7 @@ def pytest_unconfigure() -> None:
 
 
 # These files take minutes each. One that came last would leave the other process idle.
-LONG = ("test_notebooks.py", "test_benchmarks.py", "test_docs.py", "cli/test_main.py")
+LONG = ("test_notebooks.py", "test_benchmarks.py", "test_docs.py", "cli/test_relight.py")
 COARSE = pytest.StashKey[set[pathlib.Path]]()  # files with tests that ask for `coarse`
 
 

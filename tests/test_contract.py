@@ -48,9 +48,8 @@ HOST = {
     "require": "checks values",
     "compile": "takes functions",
     "inverse": "takes functions, and fits on the host",
-    "cli.report": "measures, and writes files",
-    "cli.animation": "the same",
-    "cli.play": "serves pages",
+    "cli": "reads and writes files, measures, and serves pages",
+    "brdf.fitted": "reads a file",
     "view": "the same, and answers messages",
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
@@ -119,6 +118,7 @@ HOST = {
     "brdf.measured.load_merl": "reads a file",
     "brdf.measured.load_npf": "reads a file",
     "brdf.measured.load_lafortune": "reads a file",
+    "brdf.measured.one_of": "checks a name",
     "brdf.models.color": "converts a parameter where it enters",
     "brdf.models.scalar": "the same",
     "brdf.models.both_above": "gives truth values",
@@ -916,7 +916,7 @@ def _public() -> dict[str, Callable]:
     """Public functions, and public classes that can be called, by their name without the package's."""
     result = {}
     for module in pkgutil.walk_packages(jaxprt.__path__, "jaxprt."):
-        if module.name.endswith(("__main__", "cli.main")):
+        if module.name.endswith("__main__"):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
             if name.startswith("_") or getattr(value, "__module__", None) != module.name:
