@@ -82,7 +82,7 @@ def _local(region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _rounded(count: int) -> int:
     """A number of points from few numbers, so that programs serve many pictures."""
-    step = max(1, 1 << max(count - 1, 0).bit_length() >> 2)
+    step = max(1, 1 << max(count - 1, 0).bit_length() >> 3)
     return max(16, -(-count // step) * step)
 
 

@@ -47,6 +47,7 @@ from jaxprt.scene.occluder import simplify
 
 EDGE = 512  # pixels
 LOBES = 6
+SIZES = {"direct": 32, "edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2}
 COOK_TORRANCE = tuple(itertools.product((0.0, 1.0), (0.05, 0.1, 0.2, 0.4, 0.8)))  # F0 and roughness
 BLINN_PHONG = (2.0, 6.0, 20.0, 60.0, 200.0)
 PATHS = {
@@ -54,7 +55,7 @@ PATHS = {
     "terms": 16,
 }  # of sets along light paths, besides the diffuse one; the paper has four functions
 SHARP = (20.0, 200.0)  # exponents where caustics are looked at
-SHARP_TERMS = 64
+SHARP_TERMS = 40
 ROOM = (0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9)  # its walls are one region
 
 
@@ -100,7 +101,7 @@ class Recipe(NamedTuple):
         light: Name of its light: a file of the data folder, or "daylight".
         camera: Eye and target over the diagonal of the scene, from its middle, and the angle of view.
         published: The paper's row; None where there is none.
-        options: Of the bounces, where they are not the usual ones.
+        options: Of the bounces, where they are not the usual ones; and "direct", the edge of the faces of direct light.
     """
 
     mesh: Callable[[bool], Mesh]
@@ -183,22 +184,19 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
         fixed = separable.factor(Lambert(albedo), terms=1, resolution=8)
         regions[number], paths[number] = fixed, fixed
     folder = store and store / name
-    size = 16 if quick else 64
-    given: dict[str, Any] = (
-        {"edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2} | dict(recipe.options) | options
-    )
+    given: dict[str, Any] = {**SIZES, **recipe.options, **options}
+    size = given.pop("direct")
     if quick:
-        given |= {"edge": 4, "size": 8, "components": 8, "modes": 16}
+        size, given = 16, given | {"edge": 4, "size": 8, "components": 8, "modes": 16}
     marks = "_".join(f"{key}{value}" for key, value in given.items() if key != "bounces")
     start = time.perf_counter()
     try:
-        transport = dynamic.precompute(mesh, regions, size=size, path=folder and folder / "direct", progress=False)
-        path = folder and folder / marks
-        tensor = bounces.precompute(mesh, paths, path=path, progress=False, **given)
+        path = folder and folder / f"direct{size}"
+        transport = dynamic.precompute(mesh, regions, size=size, path=path, progress=False)
+        tensor = bounces.precompute(mesh, paths, path=folder and folder / marks, progress=False, **given)
     finally:
-        seconds, peak = _spent(
-            folder and folder / f"{marks}_bounces{given['bounces']}.json", time.perf_counter() - start
-        )
+        kept = folder and folder / f"{marks}_bounces{given['bounces']}.json"
+        seconds, peak = _spent(kept, time.perf_counter() - start)
     direct = dynamic.DynamicSystem(transport, regions, samples=1 if quick else 2)
     system = prt.total(direct, bounces.BouncesSystem(tensor, direct))
     return Made(name, recipe, mesh, system, family.navigation, seconds, peak)
@@ -383,14 +381,14 @@ RECIPES = {
         None,
     ),
     "ring": Recipe(
-        lambda quick: interiors.ring(spacing=4.0 if quick else 1.0),
+        lambda quick: interiors.ring(spacing=4.0 if quick else 1.5),
         "BP",
         {0: (0.02, [0.9, 0.7, 0.35], 200.0)},
         {1: 0.4},
         "daylight",
         ([0.1, 0.66, 0.56], _ABOVE, 0.6),
         None,
-        {"edge": 16, "modes": 96},
+        {"direct": 64, "edge": 16, "modes": 96},
     ),
     "chess": Recipe(
         lambda quick: interiors.corner(_scan("", 0, quick), cells=4) if quick else interiors.chess_sides(),

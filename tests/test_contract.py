@@ -717,7 +717,7 @@ EXAMPLES = {
     ),
     "systems.bounces.gather.arrive": example(
         lambda draw: call(
-            draw.normal(5, 4, 2),
+            draw.normal(5, 2, 4),
             draw.rotation(5),
             draw.separable(),
             draw.integer(2, 3),
