@@ -8,7 +8,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables notebooks docs dist clean
+.PHONY: help setup demo view check test test-long bench tables figures notebooks docs dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,6 +38,9 @@ bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable 
 
 tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half an hour: ARGS="--mesh stanford_bunny" for one
 	$(BIN)/python -m benchmarks.tables $(ARGS)
+
+figures: $(VENV)/.setup-bench ## the figures of the papers, into docs/figures: NAME=sun2007_figure_5 for one; more than an hour
+	$(BIN)/python -m benchmarks.figures $(NAME) $(ARGS)
 
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
