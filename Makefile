@@ -8,14 +8,14 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables notebooks docs clean
+.PHONY: help setup demo view check test test-long bench tables figures notebooks docs dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.setup ## install the package, with what the demo needs
 demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
-	$(BIN)/python -m jaxprt --output output/demo
+	$(BIN)/python -m jaxprt relight --output output/demo
 
 view: $(VENV)/.setup ## play with the embedded scene in the browser: ARGS="mesh.ply light.hdr" for files
 	$(BIN)/python -m jaxprt view $(ARGS)
@@ -39,6 +39,9 @@ bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable 
 tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half an hour: ARGS="--mesh stanford_bunny" for one
 	$(BIN)/python -m benchmarks.tables $(ARGS)
 
+figures: $(VENV)/.setup-bench ## the figures of the papers, into docs/figures: NAME=sun2007_figure_5 for one; more than an hour
+	$(BIN)/python -m benchmarks.figures $(NAME) $(ARGS)
+
 notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
 	$(BIN)/python notebooks/execute.py $(sort $(wildcard notebooks/*.ipynb))
@@ -46,6 +49,15 @@ notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full siz
 docs: $(VENV)/.setup-docs ## the documentation in build/docs, warnings are errors; JAXPRT_DOCS_EXECUTE=1 executes the notebooks
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs
 	$(BIN)/python docs/offline.py build/docs
+
+dist: $(VENV)/.setup-dist ## wheel and source distribution in dist/, checked, installed into an empty environment and run there
+	rm -rf dist build/installed
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+	$(PYTHON) -m venv build/installed
+	build/installed/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/installed && bin/python -I "$(CURDIR)/tests/installed.py" "$(CURDIR)"
 
 clean: ## remove what was computed and cached; .venv stays
 	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks

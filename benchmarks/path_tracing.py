@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import plugins
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert
 from jaxprt.image import raster
 from jaxprt.scene import Camera, Environment, Mesh, environment
 
@@ -78,7 +78,7 @@ def available() -> bool:
 
 def picture(
     mesh: Mesh,
-    materials: Sequence[CookTorrance | AshikhminShirley | Lambert],
+    materials: Sequence[CookTorrance | AshikhminShirley | BlinnPhong | Lambert],
     light: Environment,
     camera: Camera,
     *,

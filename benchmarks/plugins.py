@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.brdf.varying import PerVertex
 
 _SMOOTHEST = 1e-3  # least roughness, and least alpha of GGX, as jaxprt.brdf has it
@@ -22,7 +22,7 @@ _GLOSSY = 0.5  # least share of samples by half vectors: a faint highlight is br
 TANGENT = "vertex_tangent"  # attribute of shapes
 
 
-def bsdf(material: CookTorrance | AshikhminShirley | Lambert | MetallicRoughness | PerVertex) -> Any:
+def bsdf(material: CookTorrance | AshikhminShirley | BlinnPhong | Lambert | MetallicRoughness | PerVertex) -> Any:
     """Mitsuba's material, or what loads as one; a variant must be set.
 
     A material of each vertex takes its parameters from the attributes of its shape, see `attributes`.
@@ -42,9 +42,11 @@ def bsdf(material: CookTorrance | AshikhminShirley | Lambert | MetallicRoughness
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
     if isinstance(material, CookTorrance):
         return _cook_torrance()(material)
+    if isinstance(material, BlinnPhong):
+        return _blinn_phong()(material)
     if isinstance(material, AshikhminShirley):
         return _ashikhmin_shirley()(material)
-    kinds = "CookTorrance, AshikhminShirley, Lambert, MetallicRoughness or PerVertex"
+    kinds = "CookTorrance, AshikhminShirley, BlinnPhong, Lambert, MetallicRoughness or PerVertex"
     raise ValueError(f"materials must be {kinds}, got {type(material).__name__}")
 
 
@@ -250,6 +252,34 @@ def _cook_torrance() -> Any:
             g = drjit.minimum(1, 2 * half.z * drjit.minimum(wi.z, wo.z) / cos_d)
             lobe = self.distribution(half) * g / (wi.z * wo.z) * _schlick(self.f0, cos_d)
             return (self.diffuse + self.specular * lobe) / drjit.pi
+
+    return Model
+
+
+@per_variant
+def _blinn_phong() -> Any:
+    drjit, mitsuba = modules()
+
+    class Model(_glossy()):
+        colors, scalars = ("diffuse", "specular"), ("exponent",)
+
+        def albedos(self, wi):
+            return self.specular, self.diffuse
+
+        def half(self, u, wi):
+            # Cosines u^(1 / (n + 1)) have the density (n + 1) cos^n / (2 pi).
+            cosine = drjit.power(drjit.maximum(u.x, 1e-7), 1 / (self.exponent + 1))
+            radius = drjit.safe_sqrt(1 - cosine**2)
+            sine, across = drjit.sincos(2 * drjit.pi * u.y)
+            return mitsuba.Vector3f(radius * across, radius * sine, cosine)
+
+        def density(self, half, wi, cos_d):
+            return (self.exponent + 1) / (2 * drjit.pi) * drjit.power(half.z, self.exponent)
+
+        def value(self, wi, wo, half, cos_d):
+            n = self.exponent
+            peak = (n + 2) * (n + 4) / (8 * drjit.pi * (drjit.exp2(-n / 2) + n))
+            return self.diffuse / drjit.pi + self.specular * peak * drjit.power(half.z, n)
 
     return Model
 

@@ -12,14 +12,14 @@ each squared error. Pixels are points of 4 samples here and means over squares t
 picture, `indirect_error` that of light that was reflected at least once, relative to that light; both are relative L2
 over the pixels that the scene fills, and the medians over the triples. `indirect_fraction` is how much of the picture
 the indirect part is. `seconds` are of a new picture, rays included. Without LLVM of version 17 or newer, which Mitsuba
-needs, there are no errors.
+needs, there are no errors. A store keeps Mitsuba's pictures too, so that a run that was stopped goes on.
 """
 
 import dataclasses
 import pathlib
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -60,15 +60,30 @@ class Triple(NamedTuple):
     materials: dict[str, TexturedMaterial]
 
 
+class Sizes(NamedTuple):
+    """How many random triples there are, Mitsuba's samples per pixel, and whether Mitsuba may take long for these."""
+
+    triples: int
+    samples: int
+    quick: bool = False
+
+
 def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
-    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what was precomputed")
+    parser.add_argument(
+        "--store", type=pathlib.Path, metavar="FOLDER", help="keep what was made, Mitsuba's pictures too"
+    )
     parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write ours and Mitsuba's, both parts")
     parser.add_argument("--only", metavar="SCENE", help=f"one of {', '.join(SCENES)}")
+    parser.add_argument(
+        "--triples", type=int, default=TRIPLES, metavar="N", help="random ones; up to three of these at each roughness"
+    )
+    parser.add_argument("--samples", type=int, default=SAMPLES, metavar="N", help="Mitsuba's, per pixel")
     arguments = parser.parse_args(options)
     for name in SCENES[:1] if arguments.quick else SCENES:
         if arguments.only in (None, name):
-            for line in measure(name, arguments.quick, arguments.store, arguments.pictures):
+            sizes = Sizes(1, 4, quick=True) if arguments.quick else Sizes(arguments.triples, arguments.samples)
+            for line in measure(name, arguments.quick, arguments.store, arguments.pictures, sizes):
                 harness.report(line, arguments.output)
 
 
@@ -87,24 +102,28 @@ def scene_of(name: str, quick: bool) -> Scene:
     return Scene([Part(f"region {number}", each, _MATTE) for number, each in enumerate(split(mesh))])
 
 
-def measure(name: str, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None):
+def measure(name: str, quick: bool, store: pathlib.Path | None, pictures: pathlib.Path | None, sizes: Sizes):
     """Lines of one scene."""
     scene = scene_of(name, quick)
     lights = lights_of(quick)
     path = store and store / f"reflections_{name}"
-    sizes = Lobes(lobes=2, texels=2) if quick else Lobes(lobes=8)
+    recipe = Lobes(lobes=2, texels=2) if quick else Lobes(lobes=8)
     low = (0.4, 0.5) if quick else RANGE
     size = lights[0].radiance.shape[-2]
-    whole = precompute(scene, system=sizes, bounces=BOUNCES, roughness=low, size=size, path=path, progress=False)
+    whole = precompute(scene, system=recipe, bounces=BOUNCES, roughness=low, size=size, path=path, progress=False)
     common = {"benchmark": "reflections", "scene": name, "vertices": whole.vertices, "bytes": memory(whole)}
+    keep = store and store / f"mitsuba_{name}"
     random = np.random.default_rng(5)
-    every = [drawn(random, scene, lights, low, quick) for _ in range(1 if quick else TRIPLES)]
-    yield {**common, "case": f"{name}, random materials", **judged(whole, every, quick, pictures and pictures / name)}
+    every = [drawn(random, scene, lights, low, quick) for _ in range(sizes.triples)]
+    found = judged(whole, every, sizes, pictures and pictures / name, keep)
+    yield {**common, "case": f"{name}, random materials", **found}
     for roughness in ROUGHNESS[2:3] if quick else ROUGHNESS:
         rough = max(roughness, low[0])
-        alike = [each._replace(materials=of_roughness(each.materials, rough)) for each in every[:3]]
+        few = every[: min(3, -(-sizes.triples // 3))]
+        alike = [each._replace(materials=of_roughness(each.materials, rough)) for each in few]
         folder = pictures and pictures / f"{name}_{roughness}"
-        yield {**common, "case": f"{name}, roughness {roughness}", **judged(whole, alike, quick, folder)}
+        own = keep and keep / f"roughness_{roughness}"
+        yield {**common, "case": f"{name}, roughness {roughness}", **judged(whole, alike, sizes, folder, own)}
 
 
 def lights_of(quick: bool) -> list[Environment]:
@@ -142,7 +161,9 @@ def of_roughness(materials: dict[str, TexturedMaterial], roughness: float) -> di
     }
 
 
-def judged(whole: RelitScene, triples: list[Triple], quick: bool, folder: pathlib.Path | None) -> dict:
+def judged(
+    whole: RelitScene, triples: list[Triple], sizes: Sizes, folder: pathlib.Path | None, keep: pathlib.Path | None
+) -> dict:
     """Medians over some triples."""
     direct = RelitScene(whole.scene, whole.direct, whole.shading)
     first = triples[0]
@@ -150,11 +171,11 @@ def judged(whole: RelitScene, triples: list[Triple], quick: bool, folder: pathli
     rows = []
     for number, (light, camera, materials) in enumerate(triples):
         mine, alone = (np.asarray(each.picture(light, camera, materials=materials)) for each in (whole, direct))
-        if not (quick or path_tracing.available()):
+        if not (sizes.quick or path_tracing.available()):
             continue
         parts = [dataclasses.replace(each, material=materials[each.name]) for each in whole.scene.parts]
         start = time.perf_counter()
-        exact = reference(Scene(parts), light, camera, 4 if quick else SAMPLES)
+        exact = kept(keep and keep / f"{number}.npz", Scene(parts), light, camera, sizes.samples)
         spent = (time.perf_counter() - start) / 4  # two of four pictures have the bounces
         shown = np.asarray(raster.rasterize(whole.mesh, camera).triangle)[..., None] >= 0
         rows.append(
@@ -165,13 +186,27 @@ def judged(whole: RelitScene, triples: list[Triple], quick: bool, folder: pathli
             write(folder / f"triple_{number}.png", mine, alone, exact[0])
     none = {"error": None, "peer_seconds": None, "peer_error": None}
     found = {key: float(np.median([row[key] for row in rows])) for key in rows[0]} if rows else none
-    return {**timing.line(), **found, "peer": "mitsuba", "peer_samples": SAMPLES}
+    return {**timing.line(), **found, "peer": "mitsuba", "peer_samples": sizes.samples}
 
 
-def reference(scene: Scene, light: Environment, camera: Camera, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def kept(path: pathlib.Path | None, *asked: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What `reference` makes, from a file if there is one."""
+    if path is None or not path.is_file():
+        made = reference(*asked)
+        if path is None:
+            return made
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, pictures=np.asarray(made, np.float32))
+    with np.load(path) as file:
+        return [(one, other) for one, other in file["pictures"]]
+
+
+def reference(
+    scene: Scene, light: Environment, camera: Camera, samples: int, *, bounces: int = BOUNCES
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Two pictures with bounces and two of direct light, of unlike seeds."""
     parts = traced_parts(scene)
-    depths = (2 + BOUNCES, 2)
+    depths = (2 + bounces, 2)
     return [
         tuple(path_tracing.trace(parts, light, camera, depth=depth, samples=samples, seed=seed) for depth in depths)
         for seed in (1, 2)

@@ -2,11 +2,13 @@
 
     python -m benchmarks.relight_harmonic [--quick] [--output FILE] [--plot FILE]
 
-Times are of real meshes of JAXPRT_DATA (a sphere without it) and of a sphere of 150,000 vertices, 25 coefficients,
-three colors of light. General: light and view change, measured against rotating the light alone. Transfer: the same
-with shadows; fixed light and fixed view: what is left to do when only the other changes. These are measured against
-reading their arrays once on two threads. Transfer matrices hold random numbers, on which times do not depend.
-`frames_per_second` are whole frames with drawing, in 512 x 512 pixels; where the view is fixed, colors alone are drawn.
+Times are of the rows of Table 1, by real meshes of JAXPRT_DATA (spheres of as many vertices without it), 25
+coefficients and three colors of light. The teapot is divided until it has the paper's number of vertices. Other meshes
+of about as many stand in for the head, the bird and the tyrannosaur, which are not to be had. General: light and view
+change, measured against rotating the light alone. Transfer: the same with shadows; fixed light and fixed view: what is
+left to do when only the other changes. These are measured against reading their arrays once on two threads. Transfer
+matrices hold random numbers, on which times do not depend. `frames_per_second` are whole frames with drawing, in
+512 x 512 pixels; where the view is fixed, colors alone are drawn.
 
 Errors are relative L2 of radiance against quadrature over all texels, on vertices of the bunny that face the eye.
 Precomputed transfer is timed against Embree alone on the very rays that it traces.
@@ -15,6 +17,7 @@ Precomputed transfer is timed against Embree alone on the very rays that it trac
 import pathlib
 import time
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +28,36 @@ from benchmarks.precompute_separable import Recorder, embree_alone
 from jaxprt import harmonic, reference, scene, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import interpolate, rasterize
-from jaxprt.scene import Mesh, builtin, camera, load_mesh
+from jaxprt.scene import Mesh, builtin, camera, load_mesh, subdivision
 from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems.harmonic import TransferMatrix
 
 DEGREE = 4
-# Frames per second of the paper: no transfer, transfer, fixed light, fixed view (2.2 GHz Pentium 4, Radeon 8500).
-PAPER = {"buddha": (4.05, 3.22, 15.6, 127.0), "teapot": (2.0, 1.64, 9.5, 48.9)}
-MESHES = {"buddha": "happy_buddha_100k.ply", "dragon": "dragon_100k.ply", "nefertiti": "nefertiti.ply"}
+
+
+class Row(NamedTuple):
+    """A row of the paper's Table 1, and the mesh that stands for it here.
+
+    Attributes:
+        vertices: Of the paper's mesh.
+        frames: A second: no transfer, transfer, fixed light, fixed view (2.2 GHz Pentium 4, Radeon 8500).
+        file: The mesh here.
+        divided: Whether it is divided until it has the paper's vertices.
+    """
+
+    vertices: int
+    frames: tuple[float, float, float, float]
+    file: str
+    divided: bool = False
+
+
+PAPER = {
+    "teapot": Row(152_413, (2.0, 1.64, 9.5, 48.9), "teapot.obj", divided=True),
+    "head": Row(50_060, (5.24, 4.18, 25.3, 130.0), "nefertiti.ply"),
+    "buddha": Row(49_990, (4.05, 3.22, 15.6, 127.0), "happy_buddha_100k.ply"),
+    "bird": Row(48_668, (6.04, 4.74, 28.4, 128.0), "horse.ply"),
+    "tyra": Row(100_000, (2.62, 2.08, 9.9, 71.5), "armadillo.ply", divided=True),
+}
 LIGHTS = {"grace": "grace_cross.hdr", "eucalyptus": "eucalyptus_rnl_cross.hdr", "sunrise": "polyhaven_sunrise_1k.exr"}
 WINDOWS = {
     "none": lambda light: jnp.ones(harmonics.degree_of(len(light)) + 1),
@@ -59,14 +84,40 @@ def main(options: Sequence[str] | None = None) -> None:
 
 
 def meshes(quick: bool) -> dict[str, Mesh]:
-    """What is relit: about 50,000 vertices each, and 150,000."""
-    folder = harness.data() / "meshes"
+    """What is relit: the rows of Table 1."""
     if quick:
         return {"sphere": builtin.sphere(rings=20, sectors=40)}
-    found = {name: load_mesh(folder / file) for name, file in MESHES.items() if (folder / file).exists()}
-    return (found or {"sphere": builtin.sphere(rings=160, sectors=312)}) | {
-        "teapot": builtin.sphere(rings=275, sectors=550)  # The paper's largest, in size alone.
-    }
+    return {name: table_mesh(name) for name in PAPER}
+
+
+def table_mesh(name: str) -> Mesh:
+    """The mesh of a row; without the data a sphere of as many vertices."""
+    row = PAPER[name]
+    path = harness.data() / "meshes" / row.file
+    if not path.exists():
+        rings = round((row.vertices / 2) ** 0.5)
+        return builtin.sphere(rings=rings, sectors=2 * rings)
+    mesh = load_mesh(path)
+    return divided(mesh, row.vertices) if row.divided else mesh
+
+
+def divided(mesh: Mesh, vertices: int) -> Mesh:
+    """The mesh with its longest edges halved until it has a number of vertices, or as near below as that leads."""
+    face, position, divisions = np.asarray(mesh.face), np.asarray(mesh.position), []
+    while len(position) < vertices:
+        edges = subdivision.Edges(position, face)
+        rank = np.argsort(np.argsort(-edges.length, kind="stable"))
+        low, high = 0, len(rank)
+        while low < high:
+            count = (low + high + 1) // 2
+            fits = len(position) + edges.added[edges.closed(rank < count)].sum() <= vertices
+            low, high = (count, high) if fits else (low, count - 1)
+        if not low:
+            break
+        divisions.append(edges.divide(edges.closed(rank < low)))
+        face = divisions[-1].face
+        position = np.concatenate([position, subdivision.middle(position, divisions[-1].parent)])
+    return subdivision.subdivide(mesh, divisions)
 
 
 def frames(quick: bool) -> list[dict]:
@@ -103,7 +154,13 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
     exact = {"transfer": harmonic.combine(harmonic.transferred_light(shadowed, light), view)}
     exact["fixed view, transfer"] = exact["transfer"]
     lines = []
-    paper = dict(zip(("general", "transfer", "fixed light", "fixed view"), PAPER.get(name, ()), strict=False))
+    paper = dict(
+        zip(
+            ("general", "transfer", "fixed light", "fixed view"),
+            PAPER[name].frames if name in PAPER else (),
+            strict=False,
+        )
+    )
     edge = 512 if repeats > 3 else 64
     shot = camera.orbit(mesh, width=edge, height=edge)
     drawn = rasterize(mesh, shot)
@@ -183,7 +240,7 @@ def errors(quick: bool) -> list[dict]:
 
 def precomputation(quick: bool) -> dict:
     """Transfer matrices of 50,000 vertices against their rays alone."""
-    name, mesh = next(iter(meshes(quick).items()))
+    name, mesh = next(iter(meshes(quick).items())) if quick else ("buddha", table_mesh("buddha"))
     recorder, size = Recorder(mesh), 32
     start, normal = visibility.start_points(mesh, recorder), np.asarray(mesh.normal)
     harmonic.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), progress=False)

@@ -26,7 +26,7 @@ import numpy as np
 import jaxprt as prt
 from benchmarks import harness
 from jaxprt import image, view
-from jaxprt.cli.play import embedded
+from jaxprt.cli.inputs import embedded
 from jaxprt.scene import TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages
@@ -35,7 +35,7 @@ _FIRST = """
 import sys, time
 from jaxprt.cli import play
 play.keep_programs()
-made, lights = play.ready(play._parser().parse_args(["--output", sys.argv[1]]))
+made, lights = play.ready(play.chosen(["--output", sys.argv[1]]))
 server = play.serve(made, environments=lights)
 print(server.url, flush=True)
 server.wait()
@@ -78,7 +78,9 @@ def hands(bounces: int, *, quick: bool) -> Iterator[dict[str, Any]]:
     size, repeats = (8, 3) if quick else (64, 15)
     recipe = prt.relit.Lobes(1, texels=2) if quick else prt.relit.Lobes(6)
     free = (0.25, 0.35) if quick else (0.25, 0.8)
-    made = prt.precompute(embedded(), system=recipe, roughness=free, bounces=bounces, size=size, progress=False)
+    made = prt.precompute(
+        embedded(playable=True), system=recipe, roughness=free, bounces=bounces, size=size, progress=False
+    )
     lights = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     server = view.serve(made, environments=lights)
     page = Page(server.url)

@@ -53,6 +53,8 @@ napoleon_attr_annotations = False  # the signature of the class has the types
 html_theme = "sphinx_book_theme"
 html_title = "jaxprt"
 html_copy_source = False
+html_static_path = ["_static"]
+html_css_files = ["mathml.css"]
 html_theme_options = {
     "use_download_button": False,
     "use_fullscreen_button": False,

@@ -12,7 +12,7 @@
 #SBATCH --time=02:00:00
 
 set -euo pipefail
-relight=(python -m jaxprt --mesh "$1" --output "$2" --system lobe)
+relight=(python -m jaxprt relight "$1" --output "$2" --system lobe)
 "${relight[@]}" --part "$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT"
 if [ "$SLURM_ARRAY_TASK_ID" = 1 ]; then
     sbatch --dependency="afterok:$SLURM_ARRAY_JOB_ID" --cpus-per-task=4 --mem=8G --wrap "$(printf '%q ' "${relight[@]}")"

@@ -1,10 +1,6 @@
 """Runs the command line: `python -m jaxprt`."""
 
-import sys
-
-from jaxprt.cli.main import main
-from jaxprt.cli.play import keep_programs
+from jaxprt.cli.main import run
 
 if __name__ == "__main__":
-    keep_programs()
-    sys.exit(main())
+    run()

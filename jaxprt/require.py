@@ -125,6 +125,52 @@ def length(name: str, value: Any, count: int) -> None:
         raise ValueError(f"{name} must be {count}, got {value.shape[0]}")
 
 
+def memory(what: str, needed: int, advice: str) -> None:
+    """Refuses work whose result does not fit into the memory of the device, or of this machine, before it begins.
+
+    What is free on this machine is Linux's MemAvailable, and what a limit of the process's group leaves; elsewhere
+    nothing is refused.
+
+    Args:
+        what: What takes the memory, for the message: "transfer matrices of degree 14 for 36,000 vertices".
+        needed: Its bytes.
+        advice: What takes less.
+
+    Raises:
+        MemoryError: It does not fit; says how much is needed, how much is free, and what to do.
+    """
+    free = available_memory()
+    if free is not None and needed > free:
+        raise MemoryError(f"{what} take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; {advice}")
+
+
+def available_memory() -> int | None:
+    """Bytes that an array may take where JAX puts it; None where that is not known."""
+    free = [_host_memory()]
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        if "bytes_limit" in stats:
+            free.append(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
+    known = [each for each in free if each is not None]
+    return min(known) if known else None
+
+
+def _host_memory() -> int | None:
+    """Bytes that are free on this machine for this process."""
+    try:
+        with open("/proc/meminfo") as file:
+            lines = dict(line.split(":", 1) for line in file)
+        free = 1024 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return None
+    try:
+        with open("/sys/fs/cgroup/memory.max") as limit, open("/sys/fs/cgroup/memory.current") as used:
+            return min(free, int(limit.read()) - int(used.read()))
+    except (OSError, ValueError):  # No group, or one without a limit.
+        return free
+
+
 def kind(name: str, value: Any, *wanted: type, source: str) -> None:
     """Refuses objects of other classes than those wanted.
 

@@ -6,6 +6,7 @@ They are ``data``, ``coarse``, ``bound``, ``x64``, ``unchecked``, ``close``, ``l
 import ctypes
 import functools
 import gc
+import importlib.metadata
 import mmap
 import os
 import pathlib
@@ -25,8 +26,11 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here
 # programs for several compiling threads costs a fifth of the time of compiling them.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_force_host_platform_device_count=4",  # for what is laid over several devices; all else is on the first
+    "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_force_host_platform_device_count=4"  # for what is laid over several devices; all else is on the first
+    # jaxlib 0.11 ends the process when it meets this flag, which it no longer has.
+    + " --xla_cpu_use_fusion_emitters=false"
+    * importlib.metadata.version("jaxlib").startswith("0.10."),
 )
 
 import jax
@@ -59,7 +63,7 @@ def pytest_unconfigure() -> None:
 
 
 # These files take minutes each. One that came last would leave the other process idle.
-LONG = ("test_notebooks.py", "test_benchmarks.py", "cli/test_main.py")
+LONG = ("test_notebooks.py", "test_benchmarks.py", "test_docs.py", "cli/test_relight.py")
 COARSE = pytest.StashKey[set[pathlib.Path]]()  # files with tests that ask for `coarse`
 
 

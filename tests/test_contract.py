@@ -48,9 +48,8 @@ HOST = {
     "require": "checks values",
     "compile": "takes functions",
     "inverse": "takes functions, and fits on the host",
-    "cli.report": "measures, and writes files",
-    "cli.animation": "the same",
-    "cli.play": "serves pages",
+    "cli": "reads and writes files, measures, and serves pages",
+    "brdf.fitted": "reads a file",
     "view": "the same, and answers messages",
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
@@ -85,10 +84,10 @@ HOST = {
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
     "require.length": "checks a shape",
-    "systems.separable.members.cluster": "sorts on the host, where data enters",
-    "systems.separable.members.clusters_for": "a count",
-    "systems.separable.members.coordinates": "NumPy on the host",
-    "systems.separable.members.places": "a NumPy table of rows",
+    "visibility.members.cluster": "sorts on the host, where data enters",
+    "visibility.members.clusters_for": "a count",
+    "visibility.members.coordinates": "NumPy on the host",
+    "visibility.members.places": "a NumPy table of rows",
     "systems.separable.clustered.precompute": "runs workers and writes files",
     "systems.separable.clustered.compress": "gives half precision, and vectors of either sign: no one dtype or answer",
     "systems.separable.sparse.rms": "counts on the host, after precomputation",
@@ -96,6 +95,10 @@ HOST = {
     "systems.harmonic.transfer.precompute": "traces rays",
     "systems.harmonic.transfer.precompute_diffuse": "traces rays",
     "systems.harmonic.transfer.check": "checks values",
+    "systems.harmonic.transfer.check_memory": "the same",
+    "systems.harmonic.clustered.precompute_clustered": "traces rays",
+    "systems.harmonic.exchange": "reads and writes files",
+    "systems.harmonic.clustered.compress": "gives vectors of either sign",
     "systems.bright_texels.samples_for": "compares rules on the host",
     "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",
     "sphere.cubemap.axes": "a NumPy table of axes",
@@ -115,6 +118,7 @@ HOST = {
     "brdf.measured.load_merl": "reads a file",
     "brdf.measured.load_npf": "reads a file",
     "brdf.measured.load_lafortune": "reads a file",
+    "brdf.measured.one_of": "checks a name",
     "brdf.models.color": "converts a parameter where it enters",
     "brdf.models.scalar": "the same",
     "brdf.models.both_above": "gives truth values",
@@ -209,6 +213,9 @@ HOST = {
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",
     "sphere.harmonics.degree_of": "arithmetic on shapes",
+    "sphere.harmonics.basis": "by NumPy or JAX, as its first argument says; evaluate is the function",
+    "sphere.products.quadrature": "NumPy tables",
+    "scene.light_probes.irradiance": "checks values; its pure part is sphere.lighting.irradiance",
     "sphere.haar.face_edge": "arithmetic on shapes",
 }
 
@@ -393,6 +400,11 @@ class Draw:
         """A BRDF in four harmonics, over the view angle or on a map."""
         return harmonic_system.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
 
+    def clustered_transfer(self):
+        """Two clusters of two vertices, of degree 1, with one component."""
+        parts = self.normal(2, 9), self.normal(2, 1, 9), self.normal(2, 2, 1), self.normal(3, 3), self.rotation(3)
+        return harmonic_system.ClusteredTransfer(*parts, jnp.array([0, 3, 1]), self.uniform(2), self.uniform(2))
+
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
         return harmonic_system.TransferMatrix(
@@ -485,6 +497,13 @@ EXAMPLES = {
     "sphere.harmonics.lanczos": example(nothing, degree=5),
     "sphere.harmonics.natural": example(nothing, degree=5),
     "sphere.harmonics.least_laplacian": example(lambda draw: call(draw.normal(9, 2), draw.uniform())),
+    "sphere.products.product": example(lambda draw: call(draw.normal(9, 3), draw.normal(4, 1)), degree=3),
+    "sphere.products.operator": example(lambda draw: call(draw.normal(9, 2)), degree=2),
+    "sphere.products.triple": example(lambda draw: call(draw.normal(9, 3), draw.normal(4, 1), draw.normal(16, 3))),
+    "sphere.lighting.irradiance": example(lambda draw: call(draw.normal(9, 3), draw.unit(5))),
+    "sphere.lighting.dominant_direction": example(lambda draw: call(draw.normal(9, 3))),
+    "sphere.lighting.directional_light": example(lambda draw: call(draw.normal(9, 3))),
+    "sphere.lighting.directional_and_ambient": example(lambda draw: call(draw.normal(9, 3))),
     "sphere.harmonics.disc": example(lambda draw: call(draw.unit(4), draw.uniform(4)), degree=4),
     # Derivatives by a rotation are along rotations only; tests of the module's own compare those.
     "sphere.rotation.about_z": example(lambda draw: call(draw.normal(9, 2, 4), draw.normal(4), draw.normal(4))),
@@ -698,7 +717,7 @@ EXAMPLES = {
     ),
     "systems.bounces.gather.arrive": example(
         lambda draw: call(
-            draw.normal(5, 4, 2),
+            draw.normal(5, 2, 4),
             draw.rotation(5),
             draw.separable(),
             draw.integer(2, 3),
@@ -713,6 +732,10 @@ EXAMPLES = {
     "systems.harmonic.transfer.transfer": example(
         lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
     ),
+    "systems.harmonic.clustered.clustered_light": example(
+        lambda draw: call(draw.clustered_transfer(), draw.normal(4, 3)), gradient=("transport", "light"), batch=False
+    ),
+    "systems.harmonic.transfer.visible": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "systems.harmonic.transfer.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "systems.harmonic.transfer.from_visibility": example(
         lambda draw: call(draw.normal(9, 2), draw.rotation(2)), degree=1, gradient=("coefficient",)
@@ -893,7 +916,7 @@ def _public() -> dict[str, Callable]:
     """Public functions, and public classes that can be called, by their name without the package's."""
     result = {}
     for module in pkgutil.walk_packages(jaxprt.__path__, "jaxprt."):
-        if module.name.endswith(("__main__", "cli.main")):
+        if module.name.endswith("__main__"):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
             if name.startswith("_") or getattr(value, "__module__", None) != module.name:

@@ -15,7 +15,7 @@ from jaxprt import bounces
 
 FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-LARGEST = 300_000  # bytes
+LARGEST = 2_000_000  # bytes
 # A folder of some machine: a home, a temporary or an installed one, on POSIX or Windows.
 MACHINE = re.compile(r"(?<![\w.])/(?:home|root|Users|tmp|var|opt|usr|mnt|work|private)/|site-packages|[A-Z]:\\")
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import path_tracing, plugins
 from jaxprt import reference
-from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.image import pixels, raster
 from jaxprt.scene import Camera, Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
@@ -22,6 +22,7 @@ MATERIALS = (
     AshikhminShirley(0.3, 0.5, 150.0, 20.0),
 )
 SHARP = (
+    BlinnPhong([0.4, 0.2, 0.1], [0.1, 0.3, 0.2], 30.0),
     *(CookTorrance([0.4, 0.2, 0.1], [0.5, 0.6, 0.7], roughness, [0.1, 0.3, 0.2]) for roughness in (0.1, 0.3, 0.5)),
     *(AshikhminShirley([0.4, 0.2, 0.1], [0.1, 0.3, 0.2], nu, nv) for nu, nv in ((20.0, 150.0), (8.0, 2.0))),
     MetallicRoughness([0.8, 0.4, 0.2], 0.5, 0.4),

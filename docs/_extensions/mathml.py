@@ -46,7 +46,7 @@ def visit_block(translator, node: nodes.Element) -> None:
     """Writes an equation of its own, with its number where it has one."""
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
     names = "".join(f' id="{name}"' for name in node.get("ids", [])[:1])
-    translator.body.append(f'<div class="math"{names}>{number}')
+    translator.body.append(f'<div class="equation"{names}>{number}')
     try:
         translator.body.append(to_mathml(node.astext(), display="block"))
     except Exception as error:

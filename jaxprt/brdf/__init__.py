@@ -1,7 +1,8 @@
 """BRDFs: analytic models and measured data."""
 
-from jaxprt.brdf import cylinders, measured, microfacet, models, navigation, scattered
+from jaxprt.brdf import cylinders, fitted, measured, microfacet, models, navigation, scattered
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
+from jaxprt.brdf.fitted import load_ngan
 from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
 from jaxprt.brdf.microfacet import GGX, GGXInterface, MetallicRoughness, SchlickDiffuse
 from jaxprt.brdf.models import (
@@ -32,8 +33,10 @@ __all__ = [
     "Ward",
     "WardDuer",
     "cylinders",
+    "fitted",
     "load_lafortune",
     "load_merl",
+    "load_ngan",
     "load_npf",
     "load_scattered",
     "measured",

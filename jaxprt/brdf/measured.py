@@ -273,7 +273,7 @@ def load_npf(path: str | pathlib.Path, material: str, *, names: str | pathlib.Pa
     known = names.read_text(encoding="utf-8").split()
     if len(known) > _ROWS:
         raise ValueError(f"{names}: must hold at most {_ROWS} names, got {len(known)}")
-    index = known.index(_known(material, known, names))
+    index = known.index(one_of(material, known, names))
     size, required = path.stat().st_size, _ROWS * _COLUMNS * 3 * 4
     if size != required:
         raise ValueError(f"{path}: must have {required} bytes, got {size}")
@@ -312,7 +312,7 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
         known = {str(name): entry for name, entry in json.loads(pathlib.Path(path).read_text())["materials"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{form}: {error!r}") from error
-    entry = known[_known(material, list(known), path)]
+    entry = known[one_of(material, list(known), path)]
     try:
         diffuse = np.array(entry["diffuse"], float).reshape(3)
         cxy, cz, exponent = (
@@ -329,7 +329,12 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
     return models.Lafortune(diffuse=diffuse, cx=cxy, cy=cxy, cz=cz, exponent=exponent)
 
 
-def _known(material: str, known: list[str], path: str | pathlib.Path) -> str:
+def one_of(material: str, known: list[str], path: str | pathlib.Path) -> str:
+    """The material, if a file has it.
+
+    Raises:
+        ValueError: It does not; the message has names that are near.
+    """
     if material not in known:
         near = difflib.get_close_matches(material, known, 5, 0.4) or known[:5]
         raise ValueError(

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import tqdm
-from jaxtyping import Array
 
 from jaxprt import files, image
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.brdf.navigation import Family
+from jaxprt.cli.inputs import about
 from jaxprt.cli.report import Made, View
 from jaxprt.relit import regions
 from jaxprt.scene import Camera, TexturedMaterial
@@ -62,7 +62,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
         materials.append(part.material)
     changing = [each for each in materials if isinstance(each, CookTorrance)]
     if not changing:
-        raise ValueError("the dynamic system needs a part that can change: give --brdf cook-torrance or --material")
+        raise ValueError("the dynamic system needs a part that can change: give --brdf or --material cook-torrance")
     start = timeit.default_timer()
     rough = sorted({*ROUGHNESS, *(float(each.roughness) for each in changing)})
     # The model is linear in F0, and columns interpolate along F0 alone, so that two values of it are enough.
@@ -75,8 +75,9 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
     }
     cost: dict[str, Any] = {"fit_seconds": timeit.default_timer() - start}
     start, mesh, store = timeit.default_timer(), view.scene.mesh, output / "dynamic"
+    size = next(iter(view.lights.values())).radiance.shape[-2]
     brdfs = [fixed.get(number, members) for number in range(len(materials))]
-    transport = dynamic.precompute(mesh, brdfs, path=store / "direct")
+    transport = dynamic.precompute(mesh, brdfs, size=size, path=store / "direct")
     direct = DynamicSystem(transport, brdfs)
     cost |= {"seconds": timeit.default_timer() - start, "bytes": transport.nbytes}
     reflected = None
@@ -126,7 +127,7 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
     for number in tqdm.trange(frames, desc="animate", unit="frame", disable=not progress):
         turn = number / frames
         camera = _swung(view.camera, _ORBIT * np.sin(2 * np.pi * turn))
-        lamp = rotate(light, _about(2 * np.pi * turn))
+        lamp = rotate(light, about(2 * np.pi * turn))
         now = materials(ready, view, turn=turn)
         picture = regions.of_regions(system, mesh, camera, materials=now).picture(lamp)
         stops = image.automatic_exposure(picture) if stops is None else stops
@@ -135,12 +136,7 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
     return result
 
 
-def _about(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
-
-
 def _swung(camera: Camera, angle: float) -> Camera:
     """A camera moved around what it looks at, about the vertical."""
-    offset = jnp.matmul(_about(angle), camera.eye - camera.target, precision="highest")
+    offset = jnp.matmul(about(angle), camera.eye - camera.target, precision="highest")
     return Camera(camera.target + offset, camera.target, camera.up, camera.field_of_view, camera.width, camera.height)

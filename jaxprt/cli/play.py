@@ -1,55 +1,116 @@
-"""Shows scenes to play with in the browser: `python -m jaxprt view [FILES]`."""
+"""Shows scenes to play with in the browser: `jaxprt view`."""
 
-import argparse
-import dataclasses
+import errno
 import os
+import socket
 import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
-import equinox as eqx
+import click
 import jax
 
-import jaxprt as prt
-from jaxprt.relit import Harmonics, Lobes, RelitScene
-from jaxprt.relit.recipes import Recipe
-from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
-from jaxprt.scene.mesh import ground_plane, split
-from jaxprt.scene.scene import numbered
-from jaxprt.view import export, serve
+from jaxprt.cli import inputs, options, sizes
+from jaxprt.cli.options import option
+from jaxprt.relit import RelitScene
+from jaxprt.relit.build import precompute
+from jaxprt.scene import Environment, Scene
+from jaxprt.view import serve
 
-_LIGHTS = {".exr", ".hdr", ".pic"}
-_PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
-_ROUGHNESS = (0.25, 0.8)  # that materials can have; smoother ones take more time for each look
+ROUGHNESS = (0.25, 0.8)  # that materials can have; smoother ones take more time for each look
+LOBES = 6
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Runs the command until it is stopped.
+@click.command(cls=options.Command, short_help="Play with a scene in the browser.")
+@options.scene
+@options.light
+@options.systems(("lobe", "harmonic"), default="lobe", words="One, or both, which a key changes.  [default: lobe]")
+@option(
+    "--bounces",
+    group="System",
+    type=options.Bounces(),
+    default="0",
+    help='How often parts reflect light onto each other, or "all".  [default: 0]',
+)
+@options.few_sizes
+@options.folder("Folder that keeps what was precomputed, for later runs.")
+@option(
+    "--port",
+    group="Viewer",
+    type=click.IntRange(0, 65535),
+    default=0,
+    help="Of this machine.  [default: a free one]",
+)
+@option(
+    "--no-browser",
+    "browser",
+    group="Viewer",
+    is_flag=True,
+    flag_value=False,
+    default=True,
+    help="Only print the address.",
+)
+def command(**given: Any) -> None:
+    """Play with a scene in the browser.
 
-    Raises:
-        ValueError: A file is none that can be shown.
-        OSError: It cannot be read, or the port cannot be taken.
-    """
-    options = _parser().parse_args(arguments)
-    if options.export is not None and options.export.suffix.lower() != ".html":
-        raise ValueError(f"--export takes a file *.html, got {options.export}")
-    if options.export is not None and (len(options.system) > 1 or len(options.lobes) > 1):
-        raise ValueError("--export takes one system, and one number of lobes, got several")
-    made, lights = ready(options)
-    if options.export is not None:
-        piece = export(next(iter(made.values())), options.export, environments=lights)
-        print(f"jaxprt: {piece.path}, {piece.nbytes:,} bytes, {100 * piece.error:.1f} % off the whole scene")
-        return
-    server = serve(made, environments=lights, port=options.port)
-    print(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it", flush=True)
-    if options.browser:
+    FILEs are meshes and scenes, and environments, in any order; the embedded scene and lights without. Parts without
+    a material of their own are of red plastic. Ctrl-C ends the viewer.
+
+    \b
+    Examples:
+      jaxprt view
+      jaxprt view scene.glb grace.hdr --output kept
+      jaxprt view bunny.ply --ground --system lobe,harmonic --lobes 3,6,12 --bounces 1
+      jaxprt view bunny.ply --brdf metallic-roughness:base_color=.9/.6/.2,roughness=.3 --port 8080 --no-browser
+    """  # noqa: D301
+    check_port(given["port"])
+    made, lights = ready(SimpleNamespace(**given))
+    server = _serve(made, lights, given["port"])
+    click.echo(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it")
+    sys.stdout.flush()
+    if given["browser"]:
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
     try:
         server.wait()
     except KeyboardInterrupt:
         server.close()
+
+
+def chosen(arguments: Sequence[str]) -> SimpleNamespace:
+    """The options that arguments stand for."""
+    return SimpleNamespace(**command.make_context("view", list(arguments)).params)
+
+
+def check_port(port: int) -> None:
+    """Refuses a port that is taken before anything is computed.
+
+    Raises:
+        ValueError: It is taken, or may not be.
+    """
+    if port:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as attempt:
+            attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers take it
+            try:
+                attempt.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise _no_port(port, error) from error
+
+
+def _no_port(port: int, error: OSError) -> ValueError:
+    why = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "only the administrator may use it"}
+    reason = why.get(error.errno or 0, error.strerror)
+    return ValueError(f"--port must be free, got {port}: {reason}; without --port a free one is taken")
+
+
+def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: int) -> Any:
+    try:
+        return serve(made, environments=lights, port=port)
+    except OSError as error:
+        raise _no_port(port, error) from error
 
 
 def keep_programs() -> None:
@@ -63,102 +124,29 @@ def keep_programs() -> None:
     jax.config.update("jax_compilation_cache_max_size", 2**31)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m jaxprt view", description=__doc__)
-    parser.add_argument(
-        "files", type=Path, nargs="*", metavar="FILE", help="meshes and scenes, HDR and EXR environments; embedded ones"
-    )
-    parser.add_argument("--system", choices=["lobe", "harmonic"], nargs="+", default=["lobe"], help="one, or both")
-    parser.add_argument("--lobes", type=_counts, default=[6], help="of each BRDF: 6, or several as 3,6,12 (default 6)")
-    parser.add_argument(
-        "--bounces", type=bounces, metavar="N", default=0, help='of light between parts, or "all" (default 0)'
-    )
-    parser.add_argument("--ground", action="store_true", help="stand the scene on a diffuse ground plane")
-    parser.add_argument("--output", type=Path, help="folder that keeps what was precomputed, for later runs")
-    parser.add_argument("--export", type=Path, metavar="HTML", help="write a page that needs no Python, and end")
-    parser.add_argument("--port", type=int, default=0, help="of this machine (default: a free one)")
-    parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
-    return parser
-
-
-def bounces(text: str) -> int | str:
-    """How many times light is reflected: a whole number, or "all"."""
-    if text != "all" and not text.isdecimal():
-        raise argparse.ArgumentTypeError(f'must be a whole number of at least 0, or "all", got {text!r}')
-    return text if text == "all" else int(text)
-
-
-def _counts(text: str) -> list[int]:
-    """Numbers with commas between them."""
-    try:
-        return list(dict.fromkeys(int(each) for each in text.split(",")))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a whole number, or several as 3,6,12, got {text!r}") from None
-
-
-def ready(options: argparse.Namespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
+def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
     """The scene of the options, made ready by each system, and its lights."""
-    if not all(1 <= each <= 64 for each in options.lobes):
-        raise ValueError(f"--lobes must be from 1 to 64, got {', '.join(map(str, options.lobes))}")
-    if not 0 <= options.port < 2**16:
-        raise ValueError(f"--port must be from 0 to 65535, got {options.port}")
-    scene, lights = _scene(options), _lights(options.files)
-    recipes: list[tuple[str, str, Recipe]] = [("lobe", f"{count} lobes", Lobes(count)) for count in options.lobes]
-    recipes.append(("harmonic", "harmonics", Harmonics(laplacian=0.4)))
-    made = {
-        name: prt.precompute(
-            scene,
-            system=recipe,
-            bounces=options.bounces,
-            roughness=_ROUGHNESS,
-            path=None if options.output is None else options.output / system,  # what lobes of any number share
-            progress=sys.stderr.isatty(),
-        )
-        for system, name, recipe in recipes
-        if system in options.system
-    }
+    scene, lights = inputs.scene(given, playable=True), inputs.lights(given)
+    made = {}
+    for system in given.system:
+        recipes = sizes.recipes(system, given, lobes=LOBES)
+        for recipe in recipes.values():
+            shown = f"{recipe.lobes} lobes" if system == "lobe" else "harmonics"  # pyright: ignore
+            path = None if given.output is None else given.output / system  # what lobes of any number share
+            made[shown] = prepared(scene, lights, recipe, given.bounces, path)
     return made, lights
 
 
-def _scene(options: argparse.Namespace) -> Scene:
-    meshes = [path for path in options.files if path.suffix.lower() not in _LIGHTS]
-    if not meshes:
-        if options.ground:
-            raise ValueError("--ground needs a mesh: the embedded scene has a board")
-        return embedded()
-    loaded = [prt.load_scene(path) for path in meshes]
-    parts = [_playable(part) for scene in loaded for part in scene.parts]
-    names = numbered([part.name for part in parts])
-    parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
-    if options.ground:
-        parts.append(Part("ground", ground_plane(Scene(parts).mesh), _matte(0.5)))
-    return Scene(parts, cameras=loaded[0].cameras)
-
-
-def embedded() -> Scene:
-    """Chess pieces of plastic on a board."""
-    pieces, light, dark = split(builtin.chess())
-    return Scene(
-        [
-            Part("pieces", pieces, _PLASTIC),
-            Part("light squares", light, _matte((0.6, 0.55, 0.45))),
-            Part("dark squares", dark, _matte((0.12, 0.08, 0.06))),
-        ]
+def prepared(
+    scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None
+) -> RelitScene:
+    """The scene, made ready by one recipe, for materials of many roughnesses."""
+    return precompute(
+        scene,
+        system=recipe,
+        bounces=bounces,
+        roughness=ROUGHNESS,
+        size=next(iter(lights.values())).radiance.shape[-2],
+        path=path,
+        progress=sys.stderr.isatty(),
     )
-
-
-def _playable(part: Part) -> Part:
-    """A part without a material of its own is plastic, so that there is something to play with."""
-    return dataclasses.replace(part, material=_PLASTIC) if eqx.tree_equal(part.material, _matte(0.5)) else part
-
-
-def _matte(color: float | tuple[float, ...]) -> TexturedMaterial:
-    return TexturedMaterial(base_color=color, metallic=0.0, specular=0.0)
-
-
-def _lights(files: Sequence[Path]) -> dict[str, Environment]:
-    found = [path for path in files if path.suffix.lower() in _LIGHTS]
-    if not found:
-        return {"daylight": builtin.daylight(), "studio": builtin.studio()}
-    names = numbered([path.stem for path in found])
-    return {name: prt.load_environment(path) for name, path in zip(names, found, strict=True)}

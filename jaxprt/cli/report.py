@@ -129,9 +129,14 @@ def plan(
 
 
 def make(
-    view: View, recipe: Recipe, output: Path, *, bounces: int | str | None, executor: Executor | None = None
+    view: View,
+    recipe: Recipe | dict[str, Recipe],
+    output: Path,
+    *,
+    bounces: int | str | None,
+    executor: Executor | None = None,
 ) -> Made:
-    """Makes a scene ready by one recipe; what is finished is kept in a folder.
+    """Makes a scene ready by one recipe, or one for each part; what is finished is kept in a folder.
 
     Raises:
         ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
@@ -139,7 +144,8 @@ def make(
     size = next(iter(view.lights.values())).radiance.shape[-2]
     made = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
     for part in view.scene.parts:
-        made.cost[part.name] = {"recipe": type(recipe).__name__, **vars(recipe)}
+        own = recipe[part.name] if isinstance(recipe, dict) else recipe
+        made.cost[part.name] = {"recipe": type(own).__name__, **vars(own)}
     return made
 
 
@@ -328,6 +334,13 @@ def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[
     for sizes, system in TABLES[name](shading, target):
         rows.append({"system": name, **sizes, **_row(system, blend, view, truth)})
     return rows
+
+
+def row_text(row: dict[str, Any]) -> str:
+    """A row of a table in words."""
+    return "  ".join(
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
+    )
 
 
 def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Light, material, or both, that explain pictures best."""
+"""Fits of light, material, or both to pictures."""
 
 from collections.abc import Callable
 
@@ -23,30 +23,31 @@ def light(
     error: float = 0.05,
     steps: int = 200,
 ) -> Fit:
-    """The light under which an object looks as in pictures, painted ones perhaps.
+    """Finds the light under which an object looks as it does in the pictures. The pictures may be paintings.
 
-    Few numbers without bounds or a prior, as spherical harmonics are, are solved for at once, in the space of what the
-    pictures determine; what they do not stays as it is at the start. Others are found by projected gradients,
-    accelerated, each number in units of what it changes; or by L-BFGS without bounds.
+    At most 512 parameters without bounds and prior, such as spherical harmonics, are found by one linear solve.
+    It changes only the combinations of parameters that the pictures determine; the others keep their starting values.
+    More parameters, or parameters with a prior, are found iteratively: by projected gradients with momentum where there
+    are bounds, otherwise by L-BFGS. Each parameter is scaled by how much it changes the pictures.
 
     Args:
-        radiance: Of the light and an eye, of every vertex; linear in the light.
-        start: An `Environment`, spherical harmonics, or any arrays.
-        pixels: From `observe`.
-        lower: Bounds: one number for all, or a pytree like the start, with None where there is no bound.
-        upper: The same from above.
-        prior: Added to half the squared residual; as `smoothness` of the texels or their sum, times a weight.
-        error: Largest relative L2 error at which a combination of numbers counts as determined, estimated from how much
-            parts of the pictures disagree about it. A smaller error keeps fewer combinations. Only for
-            numbers that are solved for at once.
-        steps: At most so many.
+        radiance: Function (light, eye) -> radiance of every vertex. It must be linear in the light.
+        start: An `Environment`, spherical harmonics, or any pytree of arrays.
+        pixels: The result of `observe`.
+        lower: Lower bounds: one number for all, or a pytree like the start with None where there is no bound.
+        upper: Upper bounds, in the same form.
+        prior: Function of the light that is added to half the squared residual, such as a weight times `smoothness`.
+        error: Largest relative L2 error at which a combination of parameters counts as determined. It is estimated by
+            leaving out blocks of pixels. A smaller value keeps fewer combinations. Only for the linear solve.
+        steps: Largest number of iterations.
 
     Raises:
-        TypeError: The start has what are no numbers; radiance or a prior that is no function; pixels that are not from
-            `observe`; steps that are no whole number; or a call inside `jax.jit`, `jax.vmap` or `jax.grad`.
-        ValueError: Bounds of another structure, that exclude the start, or each other; steps below 1; a prior that is
-            not one number; radiance of another shape than the mesh and the pictures have, that is not finite, or, where
-            it is solved for at once, not linear.
+        TypeError: The start holds something other than numbers; `radiance` or `prior` is not a function; `pixels` is
+            not from `observe`; `steps` is not a whole number; or the call is inside `jax.jit`, `jax.vmap` or
+            `jax.grad`.
+        ValueError: Bounds have another structure than the start, exclude it, or cross each other; `steps` is below 1;
+            the prior is not one number; the radiance has another shape than the mesh and the pictures require, is not
+            finite, or is not linear in the light.
 
     Reference: Nocedal and Wright 2006, chapters 10 and 16.
     """
@@ -74,32 +75,35 @@ def material(
     upper: PyTree = None,
     steps: int = 50,
 ) -> Fit:
-    """The material that looks as in pictures under a known light: parameters of a model, coordinates, weights.
+    """Finds the material that looks as it does in the pictures, under a known light.
 
-    Levenberg and Marquardt's steps, of numbers that are free: those between bounds are sines, those beyond one bound
-    hyperbolas; numbers whose bounds are positive and more than 100 times apart go by their logarithm. A start at a
-    bound is moved inside, by a hundredth of the range.
+    The material may be the parameters of a BRDF model, coordinates in a family of BRDFs, or weights. The method is that
+    of Levenberg and Marquardt in unbounded variables: a parameter between two bounds is the sine of its variable, and a
+    parameter with one bound a hyperbola of it. Parameters whose bounds are positive and more than 100 times apart are
+    fitted by their logarithm. A start at a bound is moved inside by a hundredth of the range.
 
     Args:
-        radiance: Of the material and an eye, of every vertex; differentiable in the material.
-        start: A pytree of numbers, as a model is: a few hundred at most.
-        pixels: From `observe`.
-        lower: Bounds: one number for all, or a pytree like the start, with None where there is no bound.
-        upper: The same from above.
-        steps: At most so many.
+        radiance: Function (material, eye) -> radiance of every vertex, differentiable in the material.
+        start: A pytree of at most 512 numbers, such as a BRDF model.
+        pixels: The result of `observe`.
+        lower: Lower bounds: one number for all, or a pytree like the start with None where there is no bound.
+        upper: Upper bounds, in the same form.
+        steps: Largest number of iterations.
 
     Raises:
-        TypeError: The start has what are no numbers; radiance that is no function; pixels that are not from `observe`;
-            steps that are no whole number; or a call inside `jax.jit`, `jax.vmap` or `jax.grad`.
-        ValueError: Bounds of another structure, that exclude the start, or each other; more than 512 numbers; steps
-            below 1; or radiance of another shape than the mesh and the pictures have, or that is not finite.
+        TypeError: The start holds something other than numbers; `radiance` is not a function; `pixels` is not from
+            `observe`; `steps` is not a whole number; or the call is inside `jax.jit`, `jax.vmap` or `jax.grad`.
+        ValueError: Bounds have another structure than the start, exclude it, or cross each other; there are more than
+            512 numbers; `steps` is below 1; or the radiance has another shape than the mesh and the pictures require,
+            or is not finite.
 
     Reference: Madsen, Nielsen, Tingleff 2004, "Methods for non-linear least squares problems".
     """
     _check(radiance, pixels)
     first, unravel = numbers.raveled(start, steps)
     if len(first) > solve.DENSE:
-        raise ValueError(f"at most {solve.DENSE} numbers can be fitted so, got {len(first)}: use light for many")
+        required = f"at most {solve.DENSE} parameters can be fitted by this method"
+        raise ValueError(f"{required}, got {len(first)}: use light for more")
     low, high = (numbers.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
     numbers.check(first, low, high)
     free, bounded, pinned = numbers.freed(first, low, high)
@@ -120,26 +124,27 @@ def jointly(
     scale: bool = True,
     steps: int = 50,
 ) -> Fit:
-    """Light and material: the light for the start's material, as by `light`, and then both, as by `material`.
+    """Finds light and material together.
 
-    A light twice as bright and a material half as bright look alike: pictures do not determine which. So the light is
-    held at the norm of the start's, unless something in the scene is known.
+    It first finds the light for the starting material, by the method of `light`, and then both, by that of `material`.
+    Pictures cannot tell a light twice as bright from a material half as bright. The norm of the light is therefore held
+    at its starting value, unless the radiance of some part of the scene is known.
 
     Args:
-        radiance: Of the light, the material and an eye; linear in the light.
-        start: Light and material, of 512 numbers at most together.
-        pixels: From `observe`.
-        lower: Bounds of the material, as in `material`.
-        upper: The same from above.
-        scale: Whether to hold the light's norm; not where the radiance has a part that is known, as a color patch.
-        steps: At most so many.
+        radiance: Function (light, material, eye) -> radiance of every vertex. It must be linear in the light.
+        start: The pair (light, material), of at most 512 numbers together.
+        pixels: The result of `observe`.
+        lower: Lower bounds of the material, in the form that `material` takes.
+        upper: Upper bounds of the material, in the same form.
+        scale: Whether to hold the norm of the light. Give False where a part is known, such as a color chart.
+        steps: Largest number of iterations.
 
     Returns:
-        The value is light and material. Deviations are those with the light's norm held, if it is.
+        A fit whose value is the pair (light, material). Its deviations assume the norm of the light where that is held.
 
     Raises:
-        TypeError: As in `light` and `material`; or the start is no pair.
-        ValueError: As in `light` and `material`; or the start's light is black.
+        TypeError: The start is not a pair, or for the reasons that `light` and `material` give.
+        ValueError: The light of the start is black, or for the reasons that `light` and `material` give.
     """
     _check(radiance, pixels)
     if not isinstance(start, tuple | list) or len(start) != 2:
@@ -148,10 +153,11 @@ def jointly(
     first = light(lambda each, eye: radiance(each, made, eye), dark, pixels)
     (lit, of_light), (own, of_material) = numbers.raveled(first.value, steps), numbers.raveled(made, steps)
     if len(lit) + len(own) > solve.DENSE:
-        raise ValueError(f"at most {solve.DENSE} numbers can be fitted so, got {len(lit)} and {len(own)}")
+        required = f"light and material may have at most {solve.DENSE} parameters together"
+        raise ValueError(f"{required}, got {len(lit)} and {len(own)}")
     norm, found = (float(jnp.linalg.norm(each)) for each in (numbers.raveled(dark, steps)[0], lit))
     if not (norm > 0 and found > 0):
-        raise ValueError(f"the light must not be black, got one of norm {norm} at the start, and {found} then")
+        raise ValueError(f"the light must not be black, got norm {norm} at the start and {found} after the first fit")
     low, high = (numbers.bound(each, made, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
     numbers.check(own, low, high)
     free, bounded, pinned = numbers.freed(own, low, high)
@@ -177,7 +183,7 @@ def jointly(
 
 
 def _check(radiance: Callable, pixels: Pixels) -> None:
-    """Refuses what is no function or not from `observe`."""
+    """Refuses a radiance that is not a function, and pixels that are not from `observe`."""
     if not callable(radiance):
         raise TypeError(f"the radiance must be a function, got {type(radiance).__name__}")
     if not isinstance(pixels, Pixels):

@@ -1,4 +1,4 @@
-"""Numbers of a light or a material in a row, with bounds and without."""
+"""Parameters of a light or a material as one flat array, and their bounds."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ _LOG = 100.0  # ratio of bounds above which a number is fitted in its logarithm
 
 
 def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
-    """The start's numbers in a row, and how they are put back."""
+    """The numbers of the start as one array, and the function that restores its structure."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
         raise TypeError(f"steps must be a whole number, got {steps!r}")
     if steps < 1:
@@ -29,22 +29,22 @@ def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
     start = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), start)
     first, unravel = ravel_pytree(start)
     if not first.size:
-        raise ValueError("the start must be finite numbers, at least one, got none")
+        raise ValueError("the start must hold at least one number, got none")
     require.finite("the start, its numbers in a row,", first)
     return first, unravel
 
 
 def outside(*values: PyTree) -> None:
-    """Refuses to fit inside `jax.jit` and other transformations, where values are not known."""
+    """Refuses a call inside `jax.jit` or another transformation, where values are not known."""
     traced = any(isinstance(each, Tracer) for each in jax.tree.leaves(values))
     if traced or isinstance(jnp.zeros(()) + 0, Tracer):
         raise TypeError(
-            "fits need values that are known, so call them outside of jax.jit, jax.vmap and jax.grad, got traced arrays"
+            "a fit needs concrete values: call it outside of jax.jit, jax.vmap and jax.grad, got traced arrays"
         )
 
 
 def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
-    """A bound of each number, from one for all, a pytree like the start, or None, also in places of it."""
+    """The bound of each number, given as one number, a pytree like the start, or None, which may replace a leaf."""
     outside(bound)
     (bounds, made), (values, whole) = (jax.tree.flatten(each, is_leaf=lambda x: x is None) for each in (bound, start))
     if made != whole:
@@ -65,7 +65,7 @@ def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
 
 
 def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
-    """Refuses starts outside their bounds, as these are in the start's precision."""
+    """Refuses a start outside its bounds, which are compared in the precision of the start."""
     x = np.asarray(first)
     crossed = np.flatnonzero(~(low < high))
     if crossed.size:
@@ -81,9 +81,10 @@ def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
 
 
 def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Callable, Callable]:
-    """Numbers without bounds that stand for those with, the way back, and which of them are at a bound.
+    """Unbounded variables for bounded numbers, the map back to the numbers, and which numbers are at a bound.
 
-    Between two bounds x is a sine, beyond one a hyperbola, which a long step cannot leave for good, as it can logits.
+    A number between two bounds is the sine of its variable; a number with one bound is a hyperbola of it. A long step
+    cannot get stuck there, as it can with a logistic function.
 
     Reference: James and Roos 1975, MINUIT.
     """

@@ -1,4 +1,4 @@
-"""What pictures show of a mesh, and how far a scene is from them."""
+"""Pixels of pictures that show a mesh, and the residual of a scene's radiance at them."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -20,7 +20,7 @@ _BENT = 0.25  # between corners' normals: about 14 degrees
 
 
 def _mask(value) -> Array | None:
-    """Booleans, or numbers as image files have them: 0, and one other value that is 1 or 255."""
+    """A mask as booleans. Image files store 0 and 1, or 0 and 255."""
     if value is None or isinstance(value, Tracer):
         return value
     known = np.asarray(value)
@@ -46,11 +46,12 @@ class Picture(eqx.Module):
     """A picture of the object. NumPy arrays become arrays.
 
     Attributes:
-        image: Its pixels, linear: radiance times the exposure.
-        camera: From where, with the image's size.
-        mask: Pixels that count: booleans, or 0 where a pixel does not count and 1 or 255 where it does. All if None.
-        exposure: What radiance was multiplied by.
-        saturation: Value at which pixels are clipped, in any color; those do not count. None if none are.
+        image: Linear pixel values: radiance times the exposure.
+        camera: Camera of the picture, with the size of the image.
+        mask: Which pixels count: booleans, or 0 where a pixel does not count and 1 or 255 where it does. None for all.
+        exposure: Factor from radiance to pixel values.
+        saturation: Value at which the camera clips. Pixels that reach it in any color do not count. None if no pixel is
+            clipped.
     """
 
     image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
@@ -61,14 +62,14 @@ class Picture(eqx.Module):
 
 
 class Pixels(eqx.Module):
-    """Pixels of pictures that count, and what of the vertices each shows.
+    """The pixels that count, and which vertices each of them shows.
 
     Attributes:
-        eye: Of each picture.
-        vertex: Three vertices of each pixel, those of picture n from n times the number of vertices on.
+        eye: Position of the camera of each picture.
+        vertex: The three vertices of the triangle at each pixel. Indices of picture n start at n * vertices.
         weight: Their barycentric weights, times the exposure.
-        value: What the pixel has.
-        vertices: How many the mesh has.
+        value: Value of each pixel.
+        vertices: Number of vertices of the mesh.
     """
 
     eye: Float[Array, "n 3"]
@@ -79,20 +80,23 @@ class Pixels(eqx.Module):
 
 
 def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
-    """Finds what pictures show of a mesh: pixels that see it, not at its silhouette, inside masks, and not saturated.
+    """Finds the pixels that show the mesh and count in a fit.
 
-    Nor do triangles count whose corners' normals differ by more than 14 degrees: there vertices are too far apart for
-    what lies between them. Of a picture that has more of such pixels than others the less bent half counts.
+    A pixel counts if it lies inside its mask, is not saturated and is not at the silhouette of the mesh. Pixels on
+    triangles whose normals differ by more than 14 degrees between corners do not count either, because radiance
+    interpolated between these vertices is wrong. If this excludes most pixels of a picture, the less curved half
+    counts.
 
     Raises:
-        TypeError: What is no `Mesh`, `Picture` or `Camera`; or a call inside `jax.jit`, `jax.vmap` or `jax.grad`.
-        ValueError: No pictures; an image that is not of floating point, gray or in three colors; an image or mask of
-            another size than the camera's; images that differ in colors;
-            pixels that count and are negative or not finite; exposures or saturations that are not positive numbers;
-            pictures that are black; or no pixel that counts.
+        TypeError: An argument is not a `Mesh`, `Picture` or `Camera`; or the call is inside `jax.jit`, `jax.vmap` or
+            `jax.grad`.
+        ValueError: There are no pictures; an image is not floating point with one or three colors; an image or a mask
+            has another size than its camera; images have different numbers of colors; a pixel that counts is negative
+            or not finite; an exposure or a saturation is not a positive number; all pictures are black; or no pixel
+            counts.
     """
     if isinstance(pictures, Picture) or not isinstance(pictures, Iterable):
-        raise TypeError(f"pictures must be a sequence of them, got one {type(pictures).__name__}")
+        raise TypeError(f"pictures must be a sequence of Picture, got one {type(pictures).__name__}")
     if not isinstance(mesh, Mesh):
         raise TypeError(f"the mesh must be a Mesh, got {type(mesh).__name__}")
     pictures = list(pictures)
@@ -102,7 +106,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]
     colors = {each.image.shape[2] for each in pictures}
     if len(colors) > 1:
-        raise ValueError(f"all pictures must have as many colors, got {sorted(colors)}")
+        raise ValueError(f"all pictures must have the same number of colors, got {sorted(colors)}")
     vertex, weight, value = (np.concatenate(each) for each in zip(*parts, strict=True))
     if not len(value):
         raise ValueError("pictures must show the mesh in a pixel that counts, got none")
@@ -164,19 +168,20 @@ def _bent(mesh: Mesh, triangle: np.ndarray) -> np.ndarray:
 
 
 def _inside(seen: np.ndarray) -> np.ndarray:
-    """Pixels that are seen, all around too: at silhouettes cameras mix the object with what is behind."""
+    """Seen pixels whose neighbors are seen too. At silhouettes a camera mixes the object with its background."""
     wide = np.pad(seen, 1)
     height, width = seen.shape
     return np.all([wide[i : i + height, j : j + width] for i in range(3) for j in range(3)], 0)
 
 
 def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Array, " m"]:
-    """What a scene's pictures differ by from those observed, in units of the norm of these.
+    """Difference between the scene's pixels and the observed ones, relative to the norm of the observed ones.
 
     Args:
-        radiance: Function (parameters, eye) -> radiance of every vertex. Parts without the eye are computed once.
-        parameters: Of the radiance.
-        pixels: What was observed.
+        radiance: Function (parameters, eye) -> radiance of every vertex. What does not depend on the eye is computed
+            once.
+        parameters: Parameters of the radiance.
+        pixels: The observed pixels.
     """
     color = jax.vmap(lambda eye: radiance(parameters, eye))(pixels.eye)
     required = (len(pixels.eye), pixels.vertices, pixels.value.shape[1])
@@ -194,7 +199,7 @@ class Residual(eqx.Module):
     Attributes:
         radiance: Function (parameters, eye) -> radiance of every vertex.
         like: Parameters of the same structure and shapes.
-        pixels: What was observed.
+        pixels: The observed pixels.
     """
 
     radiance: Callable
@@ -202,12 +207,12 @@ class Residual(eqx.Module):
     pixels: Pixels
 
     def __call__(self, row: Float[Array, " n"]) -> Float[Array, " m"]:
-        """What the pictures differ by."""
+        """The residual of these numbers."""
         return residual(self.radiance, ravel_pytree(self.like)[1](row), self.pixels)
 
 
 def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:
-    """Mean square of differences between neighboring texels, across the edges of faces too: a prior of light."""
+    """Mean squared difference between neighboring texels, across the edges of faces too: a prior of light."""
     if np.ndim(radiance) != 4 or np.shape(radiance)[0] != 6:
         got = list(radiance.shape) if hasattr(radiance, "shape") else type(radiance).__name__
         raise ValueError(f"the radiance must be that of texels, [6, n, n, c], got {got}: of an Environment `.radiance`")

@@ -1,4 +1,4 @@
-"""Least squares by jaxopt, which no other module knows."""
+"""Least-squares solvers. This is the only module that imports jaxopt."""
 
 import functools
 import warnings
@@ -33,18 +33,18 @@ _SAFETY = 1.1
 
 
 class Fit(NamedTuple):
-    """What explains pictures.
+    """The result of a fit.
 
     Attributes:
-        value: The light or material, as the start is made; what the pictures do not determine keeps its start.
-        residual: Difference from the pictures relative to them, in L2: at the start and after each step.
-        deviation: Standard deviation of each number, as far as parts of the pictures disagree about it; infinite for
-            what the pictures do not determine, and for numbers at their bounds: the pictures may want them farther
-            out, and do not determine how far. Those of the others hold while these stay. What all parts have in
-            common, as a material that no number can be, is not in it. Of many numbers (over 512) a lower bound, since
-            others may make up for each.
-        determined: Orthonormal combinations of the numbers that the pictures determine, in a row as `ravel_pytree` has
-            them; of a material those of its free numbers. None of many numbers.
+        value: The light or material, with the structure of the start. What the pictures do not determine keeps its
+            starting value.
+        residual: Relative L2 difference from the pictures, at the start and after each step.
+        deviation: Standard deviation of each parameter, estimated from how much blocks of pixels disagree about it. It
+            is infinite for parameters that the pictures do not determine and for parameters at a bound. The deviations
+            of the others assume that those stay fixed. Deviations do not reveal a wrong model; the residual does. With
+            more than 512 parameters they are lower bounds, because a change of one may be compensated by others.
+        determined: Orthonormal combinations of parameters that the pictures determine, in the order of `ravel_pytree`;
+            for a material, combinations of its unbounded variables. None with more than 512 parameters.
     """
 
     value: Any
@@ -54,12 +54,12 @@ class Fit(NamedTuple):
 
     @property
     def rank(self) -> int | None:
-        """How many combinations of numbers the pictures determine."""
+        """Number of combinations of parameters that the pictures determine."""
         return None if self.determined is None else len(self.determined)
 
 
 def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m"], Float[Array, "n m"]]]:
-    """A function with its derivatives, linearized once and by one number after another, so that no batch is held."""
+    """A function and its Jacobian, column by column from one linearization, so that no batch is held in memory."""
 
     def both(x):
         value, along = jax.linearize(function, x)
@@ -70,12 +70,12 @@ def _with_slopes(function: Callable) -> Callable[[Array], tuple[Float[Array, " m
 
 @eqx.filter_jit
 def _slopes(function: Callable, x: Array) -> tuple[Float[Array, " m"], Float[Array, "n m"]]:
-    """As `_with_slopes`, of a function that is a pytree: the next with the same shapes needs no compiling."""
+    """`_with_slopes` of a function that is a pytree: the next function with the same shapes needs no compiling."""
     return _with_slopes(function)(x)
 
 
 def _determined(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions that pictures determine, apart from rounding, and their singular values."""
+    """Directions whose singular values are above rounding, and these values."""
     square, axis = np.linalg.eigh(rows @ rows.T)
     value = np.sqrt(np.maximum(square, 0))
     known = value > _KNOWN * max(value[-1], np.finfo(np.float32).tiny)
@@ -83,10 +83,10 @@ def _determined(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """By how much what is left may have moved each direction, as blocks of neighboring pixels disagree about it.
+    """Standard error of the solution along each direction, by leaving out blocks of neighboring pixels.
 
-    What is left of noisy pictures is independent from pixel to pixel and averages out; what is left of a scene that
-    differs is not, and does so from block to block at best.
+    Noise is independent from pixel to pixel and averages out. The residual of a wrong model is correlated between
+    neighboring pixels and averages out between blocks at best.
 
     Each block moves the directions by (S^2 - J_b^T J_b)^-1 J_b^T r_b when it is left out, with singular values S.
 
@@ -107,7 +107,7 @@ def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndar
 
 
 def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Of each number; infinite outside the directions."""
+    """Standard deviation of each parameter; infinite outside the span of the directions."""
     deviation = np.linalg.norm(axis @ scores, axis=1)
     return np.where(1 - np.sum(axis**2, 1) > _UNKNOWN, np.inf, deviation)
 
@@ -121,10 +121,10 @@ def _finite(*arrays: Array) -> None:
 
 
 def at_once(function: Callable, first: Array, unravel: Callable, error: float) -> Fit:
-    """A linear problem, by singular values; what is not determined stays as it is.
+    """Solves a linear problem by singular values. What is not determined keeps its starting value.
 
-    Directions are left out whose deviations would together be more than the error allows of all that is determined.
-    Truncation as in Hansen 1998, "Rank-deficient and discrete ill-posed problems".
+    Directions are left out so that the deviations of the kept ones together stay below `error` times the solution's
+    norm. Truncation as in Hansen 1998, "Rank-deficient and discrete ill-posed problems".
     """
     r, slope = _slopes(function, first)
     _finite(r, slope)
@@ -156,7 +156,7 @@ _product = jit(jnp.vdot)
 
 @functools.cache
 def _jaxopt() -> Any:
-    """The package, imported when it is first needed: that takes as long as half of jaxprt."""
+    """The package jaxopt, imported at first use, because importing it takes half as long as importing jaxprt."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
         import jaxopt
@@ -165,9 +165,9 @@ def _jaxopt() -> Any:
 
 @functools.cache
 def _marquardt_steps() -> tuple[Callable, Callable, Callable]:
-    """First state, next state and step of jaxopt's method of Levenberg and Marquardt.
+    """Programs for the first state, the next state and one step of jaxopt's Levenberg-Marquardt method.
 
-    Residual and derivatives are arguments of these programs, so that fits of the same shapes share them.
+    Residual and Jacobian are arguments of these programs, so that fits of the same shapes share them.
     """
     solver = _jaxopt().LevenbergMarquardt(
         lambda u, residual, jac: residual,
@@ -193,7 +193,7 @@ def marquardt(
     *,
     held: int = 0,
 ) -> Fit:
-    """By steps of Levenberg and Marquardt in free numbers, which others follow from; the last residuals are held."""
+    """Levenberg-Marquardt steps in unbounded variables. After convergence the residuals repeat the last one."""
     evaluate = _with_slopes(function)
 
     def both(place):
@@ -232,7 +232,7 @@ def marquardt(
 
 
 def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:
-    """What each number changes, squared, estimated by random signs; and its unit, the reciprocal of the root."""
+    """Squared norms of the Jacobian's columns, estimated by random signs, and the parameters' units: inverse roots."""
     probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), dtype)
     square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
     whole = jnp.max(square)
@@ -240,7 +240,7 @@ def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:
 
 
 def _step_length(curved: Callable, x: Array) -> Array:
-    """A safe step for an objective, by the largest eigenvalue of its curvature: power iteration."""
+    """A safe step length: the inverse of the largest eigenvalue of the curvature, by power iteration."""
     tiny = jnp.finfo(x.dtype).tiny
 
     def step(_, towards):
@@ -252,7 +252,7 @@ def _step_length(curved: Callable, x: Array) -> Array:
 
 
 def _first_order(value: Callable, bounded: bool, length, steps: int) -> Any:
-    """Makes a solver of jaxopt: it takes fixed steps where there are bounds, and searches along lines elsewhere."""
+    """Makes a solver of jaxopt: projected gradients with fixed steps within bounds, L-BFGS with line search without."""
     options = {"maxiter": steps, "implicit_diff": False}
     if not bounded:
         return _jaxopt().LBFGS(value, **options)
@@ -261,9 +261,9 @@ def _first_order(value: Callable, bounded: bool, length, steps: int) -> Any:
 
 
 def descend(function: Callable, first: Array, unravel: Callable, bound, prior: Callable | None, steps: int) -> Fit:
-    """By first derivatives, each number in units of what it changes.
+    """First-order descent, with each parameter scaled by how much it changes the residual.
 
-    Momentum is dropped where the objective rises.
+    Momentum is reset where the objective rises.
 
     Reference: O'Donoghue and Candes 2015, "Adaptive restart for accelerated gradient schemes".
     """
@@ -326,7 +326,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
 
 
 def _deviations(square: np.ndarray, place: np.ndarray, limit: Sequence, noise: float) -> np.ndarray:
-    """Deviation of each number; infinite where residuals hardly depend on it, and at its bounds."""
+    """Deviation of each parameter; infinite where the residual hardly depends on it, and at its bounds."""
     known = square > _KNOWN**2 * square.max()
     for low, high in limit:
         known &= (np.asarray(low) < place) & (place < np.asarray(high))

@@ -267,7 +267,8 @@ class RelitScene(System):
             lamp = None if self.lamps is None else self.lamps.number(number)
             lobes = self.lobes[number]
             if reflecting is not None and lobes is not None and self.rays:
-                reflecting = SharpPart(reflecting.position, reflecting.frame, reflecting.brdf, lobes, self.rays)
+                own_of = reflecting.position, reflecting.frame, reflecting.brdf
+                reflecting = SharpPart(*own_of, lobes, self.rays, sent=reflecting.sent)
             surfaces.append(
                 Surface(part, first, shading, system, reflecting, lit, own, material, curvature[number], lamp)
             )

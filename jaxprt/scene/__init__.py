@@ -16,7 +16,7 @@ from jaxprt.scene import (
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
 from jaxprt.scene.formats.scene_file import load_scene
-from jaxprt.scene.light_probes import light_probe
+from jaxprt.scene.light_probes import irradiance, light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
 from jaxprt.scene.scene import Part, PointLight, Scene
@@ -34,6 +34,7 @@ __all__ = [
     "camera",
     "environment",
     "interiors",
+    "irradiance",
     "light_probe",
     "light_probes",
     "light_samples",

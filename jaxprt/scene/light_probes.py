@@ -1,12 +1,13 @@
-"""Light probes: the first nine harmonics of an environment, as other tools have them."""
+"""Harmonics of an environment: light probes as other tools have them, and irradiance."""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import harmonics
+from jaxprt.sphere import harmonics, lighting
 
 _DEGREE = 2
 _COSINE = (1.0, 2 / 3, 1 / 4)  # what a clamped cosine over pi leaves of each band: Ramamoorthi and Hanrahan 2001
@@ -55,3 +56,35 @@ def light_probe(environment: Environment, *, tool: str) -> Float[Array, "9 3"]:
     if tool == "Unity":
         basis[list(_MIRRORED)] *= -1
     return coefficient * jnp.asarray(band * basis, coefficient.dtype)[:, None]
+
+
+def irradiance(environment: Environment, normal: ArrayLike, *, degree: int = 8) -> Float[Array, "... c"]:
+    """Irradiance of surfaces under an environment by their normals, without shadows and without a table.
+
+    By the harmonics of the light. Degree 2, nine coefficients, is what is usual; higher degrees cost little.
+
+    Args:
+        environment: One light.
+        normal: Unit normals in the world.
+        degree: The largest l.
+
+    Returns:
+        Irradiance in the radiance's units times sr; it can be slightly negative where a small sun rings.
+        Differentiable in light and normals.
+
+    Raises:
+        TypeError: The light is no Environment.
+        ValueError: It is a batch of lights or not finite, normals are not [.., 3] or not finite, or the degree is
+            negative.
+
+    Reference: Ramamoorthi and Hanrahan 2001, "An efficient representation for irradiance environment maps".
+    """
+    require.kind("the light", environment, Environment, source="jaxprt.load_environment")
+    if environment.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(environment.radiance.shape)}")
+    require.finite("the light", environment.radiance)
+    if np.ndim(normal) < 1 or np.shape(normal)[-1] != 3:
+        raise ValueError(f"normals must be [.., 3], got {list(np.shape(normal))}")
+    require.finite("normals", normal)
+    coefficient = harmonics.project(environment.radiance, degree=degree)
+    return lighting.irradiance(coefficient, jnp.asarray(normal, coefficient.dtype))

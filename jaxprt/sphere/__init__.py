@@ -1,5 +1,15 @@
 """Functions on the sphere and hemisphere: directions, disk maps, cubemaps, wavelets, spherical harmonics."""
 
-from jaxprt.sphere import cubemap, directions, haar, harmonics, hemisphere, rotation
+from jaxprt.sphere import conventions, cubemap, directions, haar, harmonics, hemisphere, lighting, products, rotation
 
-__all__ = ["cubemap", "directions", "haar", "harmonics", "hemisphere", "rotation"]
+__all__ = [
+    "conventions",
+    "cubemap",
+    "directions",
+    "haar",
+    "harmonics",
+    "hemisphere",
+    "lighting",
+    "products",
+    "rotation",
+]

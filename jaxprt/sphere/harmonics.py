@@ -75,8 +75,8 @@ def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b 
         ValueError: The degree is negative.
     """
     direction = direction.astype(jnp.result_type(direction.dtype, float))  # Whole numbers would round the basis.
-    basis = _basis(jnp, direction, degree) if degree <= _UNROLLED else _basis_by_scan(direction, degree)
-    return jnp.moveaxis(basis, 0, -1)
+    value = basis(jnp, direction, degree) if degree <= _UNROLLED else _basis_by_scan(direction, degree)
+    return jnp.moveaxis(value, 0, -1)
 
 
 @jit
@@ -130,7 +130,7 @@ def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "l
     return jnp.concatenate(part)[place].reshape(-1, *channel)
 
 
-def _basis(xp: ModuleType, direction: Any, degree: int) -> Any:
+def basis(xp: ModuleType, direction: Any, degree: int) -> Any:
     """Basis functions [lm, *b] by NumPy or JAX.
 
     sin(theta)^m cos(m phi) and sin(theta)^m sin(m phi) are the real and imaginary parts of (x + iy)^m; what remains
@@ -235,7 +235,7 @@ def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np
         place = _three_faces(*np.meshgrid(s / 2, t / 2, indexing="ij"))
         length = np.linalg.norm(place, axis=-1)
         area = np.tile(np.outer(high - low, high - low).ravel() / 4, 3)
-        table += wu * wv * area / length**3 * _basis(np, place / length[:, None], degree)
+        table += wu * wv * area / length**3 * basis(np, place / length[:, None], degree)
 
     l = _band(degree)
     m = np.arange(len(l)) - l * (l + 1)

@@ -6,6 +6,7 @@ import pathlib
 import secrets
 import socket
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 from jaxprt.view import messages
@@ -32,6 +33,7 @@ const close = mount(document.getElementById("viewer"), ask);
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
 </script></body></html>
 """
+_PATIENCE = 10.0  # seconds
 # Nothing from elsewhere is loaded, and no other page may show or read this one.
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -66,10 +68,15 @@ class Server:
         self._thread.start()
 
     def close(self) -> None:
-        """Stops to serve, and gives the port back."""
+        """Stops to serve, gives the port back, and waits some seconds for answers that are being computed.
+
+        A thread that computes when the interpreter ends would take the process with it.
+        """
+        self._server.session.end()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+        self._server.idle.wait(_PATIENCE)
 
     def wait(self) -> None:
         """Waits until the server is closed."""
@@ -82,8 +89,24 @@ class _Listener(http.server.ThreadingHTTPServer):
 
     def __init__(self, port: int, session: Session, token: str):
         self.session, self.token = session, token
+        self.idle, self._answers, self._count = threading.Event(), 0, threading.Lock()
+        self.idle.set()
         self._open: set[socket.socket] = set()
         super().__init__(("127.0.0.1", port), _Handler)
+
+    @contextlib.contextmanager
+    def answering(self) -> Iterator[None]:
+        """Counts the answers that are being computed."""
+        with self._count:
+            self._answers += 1
+            self.idle.clear()
+        try:
+            yield
+        finally:
+            with self._count:
+                self._answers -= 1
+                if not self._answers:
+                    self.idle.set()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Remembers connections: browsers keep them open."""
@@ -144,7 +167,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         except ValueError as error:
             self._send(400, str(error).encode(), "text/plain")
             return
-        self._send(200, messages.pack(*self.server.session.answer(content, buffers)), "application/octet-stream")
+        with self.server.answering():
+            answer = messages.pack(*self.server.session.answer(content, buffers))
+        self._send(200, answer, "application/octet-stream")
 
     def _allowed(self) -> bool:
         """Refuses wrong tokens, other names for this machine, and pages of other origins."""

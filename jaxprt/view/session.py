@@ -75,6 +75,11 @@ class Session:
         self.stages = Stages(every, lights)
         self._lock = threading.Lock()
         self._newest: OrderedDict[str, int] = OrderedDict()  # number of the newest look of each viewer
+        self._ended = False
+
+    def end(self) -> None:
+        """Gives up the pictures that are being made: nobody waits for them any more."""
+        self._ended = True
 
     def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
         """The answer to a message of the browser. A message that is wrong is answered by one that says why."""
@@ -225,7 +230,7 @@ class Session:
 
         def between() -> None:
             with self._lock:
-                late = seq < self._newest.get(viewer, 0)
+                late = self._ended or seq < self._newest.get(viewer, 0)
             if late:
                 raise _LateError
 

@@ -1,6 +1,6 @@
 """What vertices see of the distant sphere: rays, hits, stored visibility, the loop over blocks, and refinement."""
 
-from jaxprt.visibility import blocks, diffuse, hits, occluder, points, rays, refinement, stored
+from jaxprt.visibility import blocks, diffuse, hits, members, occluder, points, rays, refinement, stored
 from jaxprt.visibility.blocks import Part, UnfinishedError
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.points import point_starts
@@ -19,6 +19,7 @@ __all__ = [
     "exhaustive",
     "fractional",
     "hits",
+    "members",
     "occluder",
     "point_starts",
     "points",

@@ -1,16 +1,18 @@
-"""The command `python -m jaxprt view`: files become a scene and lights, and a page is served."""
+"""The commands `jaxprt view` and `jaxprt export`: files become a scene and lights, and a page is served or written."""
 
-import argparse
 import http.client
+import json
+import socket
 import urllib.parse
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxprt as prt
 from jaxprt import files
-from jaxprt.__main__ import main
-from jaxprt.cli import play
+from jaxprt.cli import inputs, play
+from jaxprt.cli.main import program
 from jaxprt.view import messages
 
 OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
@@ -22,7 +24,8 @@ def small(coarse, bound, monkeypatch):
     bound(monkeypatch, prt.load_environment, size=8)
     for name in ("tabulate",):
         bound(monkeypatch, getattr(prt.lobe, name), resolution=8)
-    monkeypatch.setattr(play, "_ROUGHNESS", (0.5, 0.6))
+    bound(monkeypatch, play.precompute, size=8)
+    monkeypatch.setattr(play, "ROUGHNESS", (0.5, 0.6))
 
 
 @pytest.fixture
@@ -33,38 +36,66 @@ def place(tmp_path):
     return tmp_path
 
 
-def options(*argument: str) -> argparse.Namespace:
-    return play._parser().parse_args(list(argument))
+def main(arguments):
+    """Exit status of the command line."""
+    with pytest.raises(SystemExit) as end:
+        program(arguments, prog_name="jaxprt")
+    return end.value.code or 0
+
+
+def options(*argument: str) -> SimpleNamespace:
+    return play.chosen(argument)
 
 
 def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(place):
     given = options(*(str(place / name) for name in ("first.obj", "sky.exr", "second.obj")), "--ground")
-    scene = play._scene(given)
+    scene = inputs.scene(given, playable=True)
     assert len({part.name for part in scene.parts}) == 3
     assert [float(part.material.specular) for part in scene.parts] == [1, 1, 0]
-    assert list(play._lights(given.files)) == ["sky"]
+    assert list(inputs.lights(given)) == ["sky"]
 
 
 def test_without_files_there_are_the_chess_pieces_in_two_lights():
-    scene = play._scene(options())
+    scene = inputs.scene(options(), playable=True)
     assert [part.name for part in scene.parts] == ["pieces", "light squares", "dark squares"]
-    assert list(play._lights([])) == ["daylight", "studio"]
+    assert list(inputs.lights(options("--light-size", "8"))) == ["daylight", "studio"]
 
 
-def test_a_page_without_python_is_written(place, monkeypatch, capsys):
-    monkeypatch.setattr(prt, "precompute", lambda scene, **more: precompute(scene, **more | {"size": 8}))
-    page = place / "piece.html"
-    assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--lobes", "1", "--export", str(page)]) == 0
-    assert f"{page}, {page.stat().st_size:,} bytes" in capsys.readouterr().out
-    several = ["view", str(place / "first.obj"), "--lobes", "1,2", "--export", str(page)]
-    assert main(several) == 2
-    assert "one number of lobes" in capsys.readouterr().err
-    assert main(["view", str(place / "first.obj"), "--export", "piece.txt"]) == 2
-    assert "--export takes a file *.html, got piece.txt" in capsys.readouterr().err
+def test_a_page_a_baked_scene_and_probes_are_written(place, capsys):
+    out = [place / name for name in ("piece.html", "baked.glb", "probes.json")]
+    files = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1"]
+    written = [word for path in out for word in ("--output", str(path))]
+    assert main(["export", *files, *written, "--json", "--tool", "three.js,unity"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [row["kind"] for row in told] == ["page", "baked", "probes"]
+    assert [row["bytes"] for row in told] == [path.stat().st_size for path in out]
+    assert 0 <= told[0]["error"] < 0.3  # visibility of 8 texels along an edge
+    assert (told[1]["light"], told[1]["exposure"] > 0) == ("sky", True)
+    probes = json.loads(out[2].read_text())
+    assert list(probes) == ["three.js", "Unity"]
+    constant = np.zeros((9, 3))
+    constant[0] = 0.5 * np.sqrt(4 * np.pi)  # the light is 0.5 everywhere
+    np.testing.assert_allclose(probes["three.js"]["sky"], constant, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--output", "piece.txt"], "--output must end in .html, .glb, .json, got piece.txt"),
+        (["--output", "absent/piece.html"], "got absent/piece.html: there is no absent"),
+        (["--output", "piece.html", "--lobes", "1,2"], "one number of lobes"),
+        (["--output", "piece.html", "--system", "lobe,harmonic"], "one system"),
+        ([], "Missing option '--output'"),
+    ],
+)
+def test_exports_that_cannot_be_written_are_refused_before_anything_is_computed(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr(inputs, "lights", None)
+    assert main(["export", *arguments]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_the_page_of_files_is_served(place, monkeypatch, capsys):
-    monkeypatch.setattr(prt.scene.builtin, "daylight", None)
+    monkeypatch.setattr(inputs.builtin, "daylight", None)
     opened = []
     monkeypatch.setattr(play.webbrowser, "open", opened.append)
     answers = []
@@ -79,22 +110,29 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
 
     monkeypatch.setattr(prt.view.Server, "wait", look)
     store = str(place / "store")
-    monkeypatch.setattr(prt, "precompute", lambda scene, **more: precompute(scene, **more | {"size": 8}))
-    assert main(["view", str(place / "first.obj"), str(place / "sky.exr"), "--output", store, "--lobes", "1,2"]) == 0
+    files = [str(place / "first.obj"), str(place / "sky.exr")]
+    assert main(["view", *files, "--output", store, "--lobes", "1,2", "--light-size", "8"]) == 0
     assert answers[0]["lights"] == ["sky"]
     assert list(answers[0]["systems"]) == ["1 lobes", "2 lobes"]
     assert answers[0]["vertices"] == 4
     assert "http://127.0.0.1:" in capsys.readouterr().out
 
 
-precompute = prt.precompute
+def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch, capsys):
+    monkeypatch.setattr(play, "ready", None)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["view", "--port", str(port)]) == 2
+    assert f"--port must be free, got {port}: another program uses it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        (["--lobes", "0"], "--lobes must be from 1 to 64, got 0"),
-        (["--port", "70000"], "--port must be from 0 to 65535, got 70000"),
+        (["--lobes", "0"], "'--lobes': 0 is not in the range 1<=x<=64"),
+        (["--port", "70000"], "'--port': 70000 is not in the range 0<=x<=65535"),
         (["--ground"], "--ground needs a mesh"),
         (["nothing.obj"], "nothing.obj"),
         (["nothing.exr"], "nothing.exr"),

@@ -24,7 +24,7 @@ from jaxprt.files import mapped
 from jaxprt.sphere import hemisphere
 
 # Host records of the command line and of reports; they hold functions and file names.
-UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.cli.main", "jaxprt.__main__"}
+UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.__main__"}
 
 
 def classes():

@@ -333,9 +333,9 @@ def test_broken_pixels_are_refused_where_they_count(mesh, view, image, value):
         (lambda i, v: [Picture(i, v, mask=np.ones((4, 4), bool))], ValueError, "mask of picture 0"),
         (lambda i, v: [Picture(i, v, mask=np.zeros((EDGE, EDGE), bool))], ValueError, "in a pixel that counts"),
         (lambda i, v: [Picture(i, v, exposure=0.0)], ValueError, "exposure of picture 0 must be positive, got 0"),
-        (lambda i, v: [Picture(i, v), Picture(i[..., :1], v)], ValueError, r"as many colors, got \[1, 3\]"),
+        (lambda i, v: [Picture(i, v), Picture(i[..., :1], v)], ValueError, r"the same number of colors, got \[1, 3\]"),
         (lambda i, v: [Picture(0 * i, v)], ValueError, "must not be black"),
-        (lambda i, v: Picture(i, v), TypeError, "a sequence of them, got one Picture"),
+        (lambda i, v: Picture(i, v), TypeError, "a sequence of Picture, got one Picture"),
         (lambda i, v: [Picture(i[..., 0], v)], ValueError, r"linear radiance \[h, w, 1 or 3\] .* float32\[32, 32\]"),
         (lambda i, v: [Picture((255 * i).astype(np.uint8), v)], ValueError, r"got uint8\[32, 32, 3\]"),
         (lambda i, v: [Picture(np.ones((EDGE, EDGE, 4), np.float32), v)], ValueError, "alpha belongs to the mask"),
@@ -464,9 +464,9 @@ def test_lights_that_cannot_be_fitted_are_refused(shaded, options, error, messag
         ({"a": 0.5}, {"lower": {"b": 0.1}}, ValueError, "one number, or made like the start"),
         ({"a": 0.5, "b": "red"}, {}, TypeError, "arrays and numbers, in a pytree, got a str"),
         ({"a": np.nan}, {}, ValueError, "the start, its numbers in a row, must be finite, got 1 of 1"),
-        ({"a": np.ones(600)}, {}, ValueError, "at most 512 numbers can be fitted so, got 600"),
+        ({"a": np.ones(600)}, {}, ValueError, "at most 512 parameters can be fitted by this method, got 600"),
         ({"a": 0.5}, {"steps": 0}, ValueError, "steps must be at least 1, got 0"),
-        ({}, {}, ValueError, "at least one, got none"),
+        ({}, {}, ValueError, "at least one number, got none"),
     ],
 )
 def test_materials_that_cannot_be_fitted_are_refused(mesh, view, image, start, options, error, message):

@@ -110,7 +110,7 @@ def test_gradients_of_high_degree_in_float32_are_those_of_finite_differences(x64
     (gradient,) = pull(jnp.broadcast_to(jnp.asarray(weight, jnp.float32), (len(direction), len(weight))))
 
     def along(axis, h):  # NumPy's copy of the same polynomial, in float64.
-        return np.asarray(weight) @ harmonics._basis(np, direction + h * np.eye(3)[axis], degree)
+        return np.asarray(weight) @ harmonics.basis(np, direction + h * np.eye(3)[axis], degree)
 
     h = 1e-4
     expected = [(8 * (along(i, h) - along(i, -h)) - (along(i, 2 * h) - along(i, -2 * h))) / (12 * h) for i in range(3)]

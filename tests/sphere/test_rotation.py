@@ -92,11 +92,11 @@ def test_in_float32_every_special_rotation_keeps_the_theorem(close):
 def test_degree_50_rotates_in_float32(x64, close):
     # By NumPy's copy of the basis, which another test compares with SciPy's, as it need not be compiled.
     direction = np.asarray(unit(4, 100))
-    basis = harmonics._basis(np, direction, 50)
+    basis = harmonics.basis(np, direction, 50)
     for name in ("random", "half turn about x", "pole all but fixed"):
         turn = jnp.asarray(MATRIX[name], jnp.float32)
         actual = rotation.rotate(jnp.asarray(basis, jnp.float32), turn)
-        expected = harmonics._basis(np, direction @ MATRIX[name].T, 50)
+        expected = harmonics.basis(np, direction @ MATRIX[name].T, 50)
         close(actual, expected)
 
 

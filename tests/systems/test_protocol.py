@@ -134,6 +134,12 @@ def matrices(name: str, model: str) -> tuple[prt.System, Any]:
     return harmonic.HarmonicSystem(transport, harmonic_table(model)), None
 
 
+def clustered_matrices(name: str, model: str) -> tuple[prt.System, Any]:
+    options = {"degree": 4, "size": SIZE, "progress": False, "clusters": max(1, len(mesh(name).position) // 24)}
+    transport = harmonic.precompute_clustered(mesh(name), components=3 if name == "triangle" else 20, **options)
+    return harmonic.ClusteredSystem(transport, harmonic_table(model)), None
+
+
 def vectors(name: str, model: str) -> tuple[prt.System, Any]:
     transport = harmonic.precompute_diffuse(mesh(name), degree=4, size=SIZE, progress=False)
     return harmonic.DiffuseSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
@@ -187,6 +193,7 @@ MADE = {
     "separable, quantized": Promise(quantized, 0.01, 0.1),
     "separable, clustered": Promise(clustered, 0.02, 0.1),
     "harmonic": Promise(matrices, 0.02, 0.25),
+    "harmonic, clustered": Promise(clustered_matrices, 0.02, 0.25),
     "harmonic, diffuse": Promise(vectors, 0.02, None),
     "lobe": Promise(lobes, 0.02, 0.1),
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
@@ -232,6 +239,7 @@ def test_a_white_surface_in_a_white_furnace_is_white(name):
 # horizon; maps of 16 x 16, whose texels are wider than narrow lobes, hold wide ones alone.
 METALS = {
     "harmonic": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
+    "harmonic, clustered": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
     "lobe": {0.05: (0.15, 0.6), 0.3: (0.02, 0.06), 1.0: (0.01, 0.04)},
     "lobe, bright texels": {0.05: (0.15, 0.6), 0.3: (0.02, 0.06), 1.0: (0.01, 0.04)},
     "separable": {1.0: (0.02, 0.04)},
@@ -271,7 +279,7 @@ def reflected_fraction(model: Callable, height: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", METALS)
 def test_white_metals_in_a_white_furnace_send_what_single_scattering_reflects(name, roughness):
     if roughness not in METALS[name]:
-        pytest.skip("its maps are coarser than the lobe; the limitations in the README say so")
+        pytest.skip("its maps are coarser than the lobe; docs/limits.md says so")
     case = made(name, "ball", f"metal {roughness}")
     to = np.asarray(EYE) - np.asarray(case.mesh.position)
     height = np.sum(to / np.linalg.norm(to, axis=1, keepdims=True) * np.asarray(case.mesh.normal), 1)
@@ -610,7 +618,7 @@ def test_only_systems_are_relit():
         prt.radiance(made("lobe").system, Environment(jnp.ones((0, 6, SIZE, SIZE, 3))), eye=EYE)
 
 
-BLENDED = ["separable", "harmonic", "lobe", "lobe, bright texels"]
+BLENDED = ["separable", "harmonic", "harmonic, clustered", "lobe", "lobe, bright texels"]
 
 
 @pytest.mark.parametrize("name", BLENDED)

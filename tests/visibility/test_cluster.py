@@ -162,7 +162,7 @@ def test_the_examples_run_here(tmp_path):
         command = ["bash", str(ROOT / "examples" / "slurm_array.sh"), "mesh.obj", "shared"]
         done = subprocess.run(command, env=path | slurm, **both)
     assert "all parts are done" in done.stdout
-    assert (tmp_path / "wrapped").read_text() == "python -m jaxprt --mesh mesh.obj --output shared --system lobe \n"
+    assert (tmp_path / "wrapped").read_text() == "python -m jaxprt relight mesh.obj --output shared --system lobe \n"
     command = ["python", str(ROOT / "examples" / "cluster.py"), "mesh.obj", "scene"]
     subprocess.run([sys.executable, *command[1:]], env=path, **both)
     assert len(prt.files.load(tmp_path / "scene.saved").scene.parts) == 1

@@ -260,7 +260,8 @@ def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run:
     for number, basis in zip(numbers.tolist(), bases, strict=True):
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
-        result.append(run.compute(job, f"response_{number}", f"region {number}")["response"])
+        found = run.compute(job, f"response_{number}", f"region {number}")["response"]
+        result.append(np.ascontiguousarray(found.swapaxes(1, 2)))
     return tuple(result)
 
 

@@ -100,6 +100,50 @@ def factor(
     return DynamicBrdf(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
 
 
+def shared(
+    brdfs: Sequence[Callable], *, functions: int, terms: int = 32, resolution: int = 32
+) -> tuple[SeparableBrdf, Float[Array, "m c p"]]:
+    """Functions of which each of some BRDFs and its colors is a sum, chosen as in `factor` but with all BRDFs alike.
+
+    Args:
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all of as many colors, without diffuse parts.
+        functions: How many there are for all of them; as many as BRDFs times colors at most.
+        terms: Light factors that they share, or as many as the maps hold.
+        resolution: Edge of the square maps in texels.
+
+    Returns:
+        The functions as colors of one factored BRDF, a diffuse one of albedo 1 last. Their weights for each BRDF and
+        color, those of the diffuse one zero; the largest weight of each of the others is 1.
+
+    Raises:
+        ValueError: A BRDF is negative or not finite.
+    """
+    found, size = _evened(dynamic.reflected.reflect(brdfs, None, resolution=resolution))
+    smooth, colors = _smoothed(found), found.tensor.shape[1]
+    kinds = min(smooth.shape[1], len(found.area))
+    ranks = (min(functions, len(smooth)), kinds, min(terms, found.tensor.shape[3]))
+    least = tucker.oriented(tucker.truncated(smooth, ranks=ranks))
+    view, light = _maps(found, least)
+    along = _projected(smooth, least)
+    error = _missed(smooth, along, least)
+    weight = along.reshape(len(brdfs), colors, -1) * size[:, None, None]
+    most = jnp.max(jnp.abs(weight), (0, 1))
+    most = jnp.where(most > 0, most, 1)
+    core = jnp.eye(len(most) * ranks[2], dtype=view.dtype).reshape(len(most), ranks[2], -1).swapaxes(1, 2)
+    light_map, view_map = _functions(core * most[:, None, None], view, light)
+    weight = jnp.pad(weight / most, ((0, 0), (0, 0), (0, 1)))
+    return SeparableBrdf(light_map, view_map, error, hemisphere.parabolic_coordinates), weight
+
+
+@jit
+def _evened(found: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
+    """What BRDFs reflect, each divided by the size of what it sends, and that size."""
+    sent = _smoothed(found).reshape(len(found.tensor), -1)
+    size = jnp.sqrt(jnp.sum(sent**2, 1))
+    size = jnp.where(size > 0, size, 1)
+    return found._replace(tensor=found.tensor / size[:, None, None, None]), size
+
+
 def _check_count(name: str, value: int, most: int) -> None:
     """Refuses what is no whole number from 1 to the tensor's size."""
     if not isinstance(value, int | np.integer) or not 1 <= value <= most:

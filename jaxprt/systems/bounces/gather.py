@@ -90,7 +90,7 @@ class Rays(NamedTuple):
 
 @functools.partial(jit, static_argnames=("points",))
 def arrive(
-    response: Float[Array, "v l k"],
+    response: Float[Array, "v k l"],
     frame: Float[Array, "v 3 3"],
     basis: SeparableBrdf,
     owner: Int[Array, " g"],
@@ -104,7 +104,8 @@ def arrive(
     """What surfaces send to some points, summed over the rays of each by some measures.
 
     Args:
-        response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`.
+        response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`, with the
+            light last: along it rows are read whole, which takes a third of the time.
         frame: Of these vertices.
         basis: Functions of the surfaces.
         owner: Of each group of rays the point that they arrive at; this and more as `Rays` has it.
@@ -123,10 +124,10 @@ def arrive(
         wo = jnp.sum(frame[corner] * -direction[:, None, None], -1)
         wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
         view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
-        sent = jnp.einsum("hckp,hclk->hpl", view, response[corner])
+        sent = jnp.einsum("hckp,hckl->hpl", view, response[corner])
         return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent)), None
 
-    shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[1])
+    shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[2])
     groups = (owner, corner, weight, direction, measure)
     return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
 

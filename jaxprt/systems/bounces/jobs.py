@@ -63,7 +63,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
 
     Attributes:
         bases: Functions of each region.
-        response: Of their light factors, at the vertices of each region.
+        response: Of their light factors, at the vertices of each region; the light is the last axis.
         white: Weights of all functions by which a bounce is judged.
         scale: Of all functions, by which errors of decompositions count them.
         region: Number of each vertex's region.
@@ -83,7 +83,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         """What the result depends on."""
         maps = [basis.coordinates.__name__ for basis in self.bases]
         made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
-        kinds = self.response[0].shape[1]
+        kinds = self.response[0].shape[2]
         own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components}
         return self.made_by(self.system, ALGORITHM, **own)
 
@@ -93,7 +93,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            parts |= {f"response {number}": response}
+            parts |= {f"response {number}": response.swapaxes(1, 2)}  # As stores of earlier releases have it.
         return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
@@ -104,7 +104,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         result = []
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             if number not in found:
-                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[1])
+                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
                 result.append(np.zeros(shape, np.float32))
                 continue
             rays, own = found[number], np.flatnonzero(self.region == number)
@@ -146,7 +146,7 @@ class TransferJob(_PathJob):
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
             "core": Layout((1, self.modes, self.components, harmonic, functions), 0, "float16"),
-            "mode": Layout((1, self.response[0].shape[1], self.modes), 0, "float32"),
+            "mode": Layout((1, self.response[0].shape[2], self.modes), 0, "float32"),
             "error": Layout((1,), 0, "float32"),
             "energy": Layout((1, functions), 0, "float32"),
             "white": Layout((self.step,), 0, "float32"),
@@ -172,13 +172,13 @@ class TransferJob(_PathJob):
         self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int
     ) -> "AgainJob":
         """The job of a second bounce, off surfaces that the first one lights."""
-        fine = math.isqrt(self.response[0].shape[1] // 6)
+        fine = math.isqrt(self.response[0].shape[2] // 6)
         edge = min(_AGAIN, fine)
         shape = (len(mode), 6, edge, fine // edge, edge, fine // edge, -1)
         coarse = mode.reshape(shape).sum((3, 5)).reshape(len(mode), 6 * edge * edge, -1)
         count = coarse.shape[1] * len(function)
         counts = [np.sum(self.region == number) for number in range(len(self.bases))]
-        response = [np.zeros((n, count, b.terms), np.float32) for n, b in zip(counts, self.bases, strict=True)]
+        response = [np.zeros((n, b.terms, count), np.float32) for n, b in zip(counts, self.bases, strict=True)]
         local = np.zeros(len(self.region), np.int32)
         for number, each in enumerate(counts):
             local[self.region == number] = np.arange(each)
@@ -188,7 +188,7 @@ class TransferJob(_PathJob):
                 own = self.region[member] == number
                 if own.any():
                     made = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
-                    response[number][local[member[own]]] = np.asarray(made)[own]
+                    response[number][local[member[own]]] = np.asarray(made)[own].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
         return AgainJob(**{**same, "response": tuple(response), "components": components}, function=function)
 
@@ -209,7 +209,7 @@ class AgainJob(_PathJob):
     def layout(self) -> Mapping[str, Layout]:
         """Shapes of one block."""
         functions = len(self.function)
-        light = self.response[0].shape[1] // functions
+        light = self.response[0].shape[2] // functions
         shape = (1, light, self.components, (DEGREE + 1) ** 2, functions, functions)
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),

@@ -16,6 +16,7 @@ from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.relight import LitTransfer, area_mean, collect, gathered, light_side
 from jaxprt.systems.bounces.tensor import TransferTensor
+from jaxprt.systems.bounces.varying import Sent
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.protocol import Blend
 
@@ -27,11 +28,14 @@ class ReflectingPart(eqx.Module):
         position: Positions of the vertices.
         frame: Their frames; rows are tangent, bitangent, normal.
         brdf: Table of degree 3, from `jaxprt.harmonic.tabulate`.
+        sent: Weights of the channels of the part's BRDF in the tensor, by channels of `brdf` and roughness. None where
+            both are the same channels, and what the part sends to others has one roughness.
     """
 
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     brdf: HarmonicBrdf
+    sent: Sent | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         """Refuses tables of another degree than that of the light that arrives."""
@@ -56,8 +60,8 @@ class PartBounces(protocol.System):
     """Light that the parts of a scene reflect onto each other and themselves, without the direct light.
 
     Materials are a `Blend` for each part, or None for one whose BRDF is as it was tabulated. What a part sends to
-    others has its mean weights over its area, and patch by patch the difference in albedo, as diffuse light; what its
-    vertices make of light that arrives has their own.
+    others has its mean weights and roughness over its area, and patch by patch the difference in albedo, as diffuse
+    light; what its vertices make of light that arrives has their own.
 
     Attributes:
         tensor: From `jaxprt.bounces.precompute` with one factored BRDF for each part, of the same channels.
@@ -141,9 +145,11 @@ class PartBounces(protocol.System):
         """Mean weights of a part's channels over its area; None without any."""
         if blend is None:
             return None
-        blend.check(len(part.position), self.tensor.factor[number].shape[1])
+        channels = self.tensor.factor[number].shape[1] if part.sent is None else part.sent.factor.shape[1]
+        blend.check(len(part.position), channels)
         first = sum(len(each.position) for each in self.part[:number])
-        return area_mean(blend.weight, self.tensor.area[first : first + len(part.position)])
+        area = self.tensor.area[first : first + len(part.position)]
+        return area_mean(blend.weight, area) if part.sent is None else part.sent.mean(blend, area)
 
     def _changes(self, blends: Sequence, means: Sequence[Array | None]) -> Float[Array, "v c"] | None:
         """What the albedo of each vertex is more than that of its part; None without blends or patches."""
@@ -155,7 +161,10 @@ class PartBounces(protocol.System):
                 rows.append(jnp.zeros((len(part.position), 1), part.position.dtype))
                 continue
             channel = jnp.matmul(self.tensor.patches.strength[number], self.tensor.factor[number], precision="highest")
-            rows.append(jnp.einsum("k,vkc->vc", channel, blend.weight - mean, precision="highest"))
+            if part.sent is None:
+                rows.append(jnp.einsum("k,vkc->vc", channel, blend.weight - mean, precision="highest"))
+            else:
+                rows.append(part.sent.values(blend, channel) - jnp.matmul(channel, mean, precision="highest"))
         colors = max(each.shape[1] for each in rows)
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 

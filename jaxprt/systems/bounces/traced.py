@@ -95,7 +95,7 @@ class SharpPart(ReflectingPart):
     @property
     def plain(self) -> ReflectingPart:
         """The same part, of which nothing is traced."""
-        return ReflectingPart(self.position, self.frame, self.brdf)
+        return ReflectingPart(self.position, self.frame, self.brdf, sent=self.sent)
 
     def rays(
         self,

@@ -1,6 +1,8 @@
 """The harmonic system: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002)."""
 
-from jaxprt.systems.harmonic import interreflection, relight, system, table, transfer
+from jaxprt.systems.harmonic import clustered, exchange, interreflection, relight, system, table, transfer
+from jaxprt.systems.harmonic.clustered import ClusteredTransfer, clustered_light, precompute_clustered
+from jaxprt.systems.harmonic.exchange import export_transfer, import_transfer
 from jaxprt.systems.harmonic.interreflection import interreflect, interreflect_diffuse
 from jaxprt.systems.harmonic.relight import (
     combine,
@@ -15,24 +17,32 @@ from jaxprt.systems.harmonic.relight import (
     view_coefficients,
     world_view,
 )
-from jaxprt.systems.harmonic.system import DiffuseSystem, HarmonicSystem, blended_view
+from jaxprt.systems.harmonic.system import ClusteredSystem, DiffuseSystem, HarmonicSystem, blended_view
 from jaxprt.systems.harmonic.table import HarmonicBrdf, tabulate
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, precompute, precompute_diffuse
 
 __all__ = [
+    "ClusteredSystem",
+    "ClusteredTransfer",
     "DiffuseSystem",
     "HarmonicBrdf",
     "HarmonicSystem",
     "TransferMatrix",
     "TransferVector",
     "blended_view",
+    "clustered",
+    "clustered_light",
     "combine",
     "diffuse_radiance",
+    "exchange",
+    "export_transfer",
+    "import_transfer",
     "interreflect",
     "interreflect_diffuse",
     "interreflection",
     "local_light",
     "precompute",
+    "precompute_clustered",
     "precompute_diffuse",
     "probe_light",
     "project",

@@ -22,7 +22,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.systems.harmonic.table import HarmonicBrdf
-from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check
+from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check, check_memory
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "bounce": 1}
@@ -57,6 +57,7 @@ def interreflect(
 
     Raises:
         ValueError: Transport of other vertices or degree, a region without BRDF, or bounces below 0.
+        MemoryError: The matrices of two bounces do not fit into memory.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5; Sloan, Kautz, Snyder 2002, section 5.
     """
@@ -67,6 +68,7 @@ def interreflect(
         degree = harmonics.degree_of(transport.matrix.shape[-1])
         raise ValueError(f"BRDFs must have the transport's degree {degree} and no parameters, got degrees {wrong}")
     colors = max(transport.matrix.shape[1], *(each.table.shape[1] for each in brdf))
+    check_memory(len(transport.matrix), harmonics.degree_of(transport.matrix.shape[-1]), copies=2, colors=colors)
     shape = (len(transport.matrix), colors, *transport.matrix.shape[2:])
     total = last = np.broadcast_to(np.asarray(transport.matrix), shape)
     for number in range(bounces):

@@ -9,7 +9,8 @@ from jaxprt.brdf.models import scalar
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import harmonics
 from jaxprt.systems import protocol
-from jaxprt.systems.harmonic.relight import combine, project, transferred_light, view_coefficients
+from jaxprt.systems.harmonic.clustered import ClusteredTransfer, clustered_light
+from jaxprt.systems.harmonic.relight import combine, project, transferred_light, view_coefficients, world_view
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
 from jaxprt.systems.protocol import Blend
@@ -57,6 +58,54 @@ class HarmonicSystem(protocol.VertexSystem):
         """Radiance: the dot product of light and BRDF."""
         require.array("the light", light, "lm c v", source="HarmonicSystem.light")
         require.array("the view", view, "lm c v", source="HarmonicSystem.view")
+        return combine(self.carried(light, axis=2), view)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices, or of points."""
+        return len(self.transport.position if self.points is None else self.points)
+
+
+class ClusteredSystem(protocol.VertexSystem):
+    """Clustered principal components of transfer matrices with the harmonics of a BRDF: `HarmonicSystem` in few bytes.
+
+    The arriving light stays in the world, and the view's harmonics are turned there.
+
+    Attributes:
+        transport: Clustered transfer, from `jaxprt.harmonic.precompute_clustered`.
+        brdf: The table, from `jaxprt.harmonic.tabulate`.
+        laplacian: Share of the light's squared Laplacian that a window against ringing leaves, as in `HarmonicSystem`.
+    """
+
+    transport: ClusteredTransfer
+    brdf: HarmonicBrdf
+    laplacian: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
+
+    def __check_init__(self):
+        """Refuses transport and BRDFs of other systems or of unlike degrees."""
+        source = "jaxprt.harmonic.precompute_clustered"
+        require.kind("the transport", self.transport, ClusteredTransfer, source=source)
+        require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
+        if self.brdf.degree != self.transport.degree:
+            raise ValueError(
+                f"the BRDF must have the transport's degree {self.transport.degree}, got {self.brdf.degree}"
+            )
+
+    def light(self, environment: Environment) -> Float[Array, "lm c v"]:
+        """Harmonics of the light that arrives at each vertex, in the world."""
+        coefficient = _projected(environment, self.transport.degree)
+        window = harmonics.least_laplacian(coefficient, self.laplacian)
+        return clustered_light(self.transport, harmonics.convolve(coefficient, window))
+
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
+        """The BRDF's harmonics for each vertex's view, turned to the world."""
+        position, frame = self.place(self.transport)
+        return world_view(frame, blended_view(self.brdf, position, frame, materials, eye=eye))
+
+    def combine(self, light: Float[Array, "lm c _"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
+        """Radiance: the dot product of light and BRDF."""
+        require.array("the light", light, "lm c v", source="ClusteredSystem.light")
+        require.array("the view", view, "lm c v", source="ClusteredSystem.view")
         return combine(self.carried(light, axis=2), view)
 
     @property

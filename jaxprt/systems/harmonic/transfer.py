@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
-from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
+from jaxprt.sphere import cubemap, directions, haar, harmonics, products, rotation
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic": 1}
@@ -91,12 +91,14 @@ def precompute(
 
     Raises:
         ValueError: Sizes out of range, positions or normals that are not finite, or a store made from something else.
+        MemoryError: The matrices do not fit into memory, which is known before any ray is traced.
         BlockingIOError: The store is being written by another process.
         RuntimeError: A worker of the executor died.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
+    check_memory(len(visibility.rays.chosen(mesh, vertex)), degree)
     job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)
@@ -139,11 +141,25 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
 
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
+    return from_visibility(visible(seen, frame, degree=2 * degree), frame, degree=degree)
+
+
+@partial(jit, static_argnames="degree")
+def visible(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "k b"]:
+    """Harmonics of what vertices see, in the world: 1 where light is clear, the mean visibility below the horizon.
+
+    Args:
+        seen: Visibility of each cubemap texel in sixteenths.
+        frame: Rows are tangent, bitangent, normal.
+        degree: Highest degree of the harmonics; transfer matrices need twice theirs.
+
+    Raises:
+        ValueError: d is not 6 n n for a power of two n.
+    """
     flux = _flux(seen, frame)
-    visible = seen.astype(frame.dtype) / visibility.LEVELS
-    mean = jnp.sum(visible * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
-    coefficient = _project(jnp.where(flux > 0, visible, mean), degree=2 * degree)
-    return from_visibility(coefficient, frame, degree=degree)
+    clear = seen.astype(frame.dtype) / visibility.LEVELS
+    mean = jnp.sum(clear * flux, -1, keepdims=True) / jnp.sum(flux, -1, keepdims=True)
+    return _project(jnp.where(flux > 0, clear, mean), degree=degree)
 
 
 @partial(jit, static_argnames="degree")
@@ -159,7 +175,7 @@ def from_visibility(
         frame: Rows are tangent, bitangent, normal; see `right_handed`.
         degree: Highest degree of the matrices.
     """
-    node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
+    node, weight = (jnp.asarray(each, frame.dtype) for each in products.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ coefficient)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
@@ -181,7 +197,7 @@ def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"])
     degree = harmonics.degree_of(matrix.shape[-1])
     back = right_handed(frame).swapaxes(1, 2)
     world = jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(matrix, 0, -1), back), -1, 0)
-    node, weight = (jnp.asarray(each, frame.dtype) for each in _rule(4 * degree))
+    node, weight = (jnp.asarray(each, frame.dtype) for each in products.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     convolved = jax.lax.map(lambda each: jnp.sum((basis @ each) * basis, -1), world)
     coefficient = (weight[:, None] * harmonics.evaluate(node, degree=2 * degree)).T @ convolved.T
@@ -228,16 +244,6 @@ def _project(value: Float[Array, "b d"], *, degree: int) -> Float[Array, "lm b"]
     return harmonics.project(value.T.reshape(6, size, size, -1), degree=degree)
 
 
-@lru_cache(maxsize=4)
-def _rule(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quadrature on the sphere, exact for harmonics up to a degree."""
-    height, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
-    angle = 2 * np.pi * np.arange(degree + 1) / (degree + 1)
-    radius = np.sqrt(1 - height**2)[:, None]
-    node = np.stack([radius * np.cos(angle), radius * np.sin(angle), height[:, None] + 0 * angle], -1)
-    return node.reshape(-1, 3), np.repeat(weight * 2 * np.pi / (degree + 1), degree + 1)
-
-
 def _squared_kernel(degree: int) -> np.ndarray:
     """Factors of the zonal function (sum_i y_i(s) y_i(t))^2, whose sum goes up to a degree, for twice as many bands."""
     height, weight = np.polynomial.legendre.leggauss(2 * degree + 1)
@@ -268,6 +274,26 @@ class _Job(visibility.rays.VisibilityJob):
         name, function = ("vector", transfer_diffuse) if self.diffuse else ("matrix", transfer)
         made = function(seen, self.frame[self.part(block)], degree=self.degree)
         return {name: np.asarray(made)[:, None]}, count.rays
+
+
+def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1) -> None:
+    """Refuses matrices that do not fit into memory.
+
+    Args:
+        vertices: Number of vertices.
+        degree: Highest degree of the harmonics.
+        copies: How many of them are held at once.
+        colors: Number of colors of each.
+
+    Raises:
+        MemoryError: They do not fit.
+    """
+    each = 4 * (degree + 1) ** 4 * colors
+    require.memory(
+        f"transfer matrices of degree {degree} for {vertices:,} vertices, {each:,} bytes each,",
+        copies * vertices * each,
+        "take jaxprt.harmonic.precompute_clustered, a lower degree, or fewer vertices (vertex=)",
+    )
 
 
 def check(degree: int, size: int) -> None:

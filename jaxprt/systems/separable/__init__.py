@@ -4,7 +4,6 @@ from jaxprt.systems.separable import (
     clustered,
     errors,
     factorization,
-    members,
     published,
     quantized,
     relight,
@@ -33,6 +32,7 @@ from jaxprt.systems.separable.relight import (
 from jaxprt.systems.separable.sparse import SparseTransport
 from jaxprt.systems.separable.system import SeparableSystem
 from jaxprt.systems.separable.wavelets import precompute
+from jaxprt.visibility import members
 
 __all__ = [
     "ClusteredTransport",

@@ -25,9 +25,9 @@ from jaxprt.decompose import eigen
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.files.mapped import Reference, reference
 from jaxprt.sphere import haar
-from jaxprt.systems.separable import members, wavelets
+from jaxprt.systems.separable import wavelets
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
-from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility import StoredVisibility, members
 
 # Versions of what makes the results; a release that changes them raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}

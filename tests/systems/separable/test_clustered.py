@@ -16,8 +16,8 @@ from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable import SeparableBrdf, factor
 from jaxprt.systems.separable.clustered import precompute
-from jaxprt.systems.separable.members import cluster
 from jaxprt.systems.separable.wavelets import project
+from jaxprt.visibility.members import cluster
 
 SIZE = 8
 ALL = 6 * SIZE**2

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxprt import visibility
 from jaxprt.decompose import clustering
+from jaxprt.visibility import blocks
 
 _CLUSTERS = 0.84  # for one vertex: 160 for 36,000
 
@@ -44,7 +44,7 @@ def clusters_for(vertices: int) -> int:
     return max(1, round(_CLUSTERS * vertices**0.5))
 
 
-class ClusterJob(visibility.blocks.Job):
+class ClusterJob(blocks.Job):
     """A job whose blocks are clusters.
 
     Attributes:

@@ -1,0 +1,253 @@
+"""Sun et al. 2007: Figures 5, 6 and 7, and the principal components of section 4.3.
+
+A tensor of a set of BRDFs is [BRDF, view, light]. Two norms tell what a decomposition of it leaves. The published one
+is Frobenius' norm of the samples on the orthographic disk. Ours is that of the light of natural spectrum which the
+BRDFs reflect. Errors are squared and relative, as the paper prints them.
+"""
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import harness
+from benchmarks.figures import drawing
+from benchmarks.figures.run import Clock, Run
+from jaxprt import dynamic, image, lobe
+from jaxprt.brdf import navigation
+from jaxprt.decompose import tucker
+from jaxprt.scene import builtin, camera
+from jaxprt.sphere import hemisphere
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.separable.factorization import tabulate
+
+SETS = (1, 2, 3, 4, 5, 6)  # n_h
+TERMS = (4, 8, 12, 16, 20, 24, 28, 32)  # n_wi = n_wo
+ANGLES = (0, 7, 14, 21)
+RESOLUTION = 24  # of maps, in texels
+# What the paper prints: no lobes at the finest ranks, and five functions of the two sets.
+FINEST, PRINCIPAL = 0.952465, {"Cook-Torrance": 6.23e-4, "Blinn-Phong": 1.61e-7}
+
+
+def measured(run: Run) -> navigation.Family:
+    """The fits of Ngan et al.; the embedded grid in a quick run, with a few BRDFs."""
+    path = harness.data() / "brdf" / "ngan2005_cooktorrance.csv"
+    if not run.quick:
+        return navigation.cook_torrance(path=path)
+    return navigation.cook_torrance(point=np.array([(f, m) for f in (0.05, 1.0) for m in (0.1, 0.2, 0.5)]))
+
+
+def place_of(brdf: Any) -> tuple[float, float]:
+    """Fresnel reflectance and roughness of one of the set."""
+    return float(brdf.f0[0]), float(brdf.roughness)
+
+
+def figure_5(run: Run) -> Iterator[dict[str, Any]]:
+    """What 48 settings leave, in both norms, without lobes and with the published ones."""
+    brdfs = measured(run).brdf
+    sets, terms = ((1, 2), (4, 8)) if run.quick else (SETS, TERMS)
+    resolution = 8 if run.quick else RESOLUTION
+    lobes = dynamic.separate(brdfs, separator=functools.partial(lobe.published.mirror_lobes, resolution=resolution))
+    lines = []
+    for name, table in (("none", None), ("published", lobes)):
+        for norm, make in (("disk", samples), ("natural light", reflected)):
+            tensor, whole = make(brdfs, table, resolution=resolution)
+            clock = Clock()
+            left = settings(tensor, whole, sets, terms)
+            most = (max(sets), max(terms), max(terms))
+            swept = best(tensor, whole, most)
+            for (count, rank), squared in left.items():
+                lines.append({"lobes": name, "norm": norm, "n_h": count, "n_w": rank, "squared_error": squared})
+                yield {**lines[-1], "brdfs": len(brdfs), "seconds": clock.seconds}
+            yield {"lobes": name, "norm": norm, "ranks": list(most), "iterated_squared_error": swept}
+    plot_5(lines, run)
+
+
+def samples(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tuple[jax.Array, float]:
+    """Samples on the disk, less the lobes if there are any, and the squared norm of the whole.
+
+    The lobes of the table are narrower than texels. So they are fitted anew to the samples, see `sampled_lobes`.
+    """
+    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    direction = direction[inside]
+    tensor = jnp.asarray(np.stack([np.asarray(tabulate(brdf, direction)[0]) for brdf in brdfs]))
+    whole = squared_norm(tensor)
+    return (tensor, whole) if table is None else (sampled_lobes(tensor, direction), whole)
+
+
+@jax.jit
+def sampled_lobes(tensor: jax.Array, direction: jax.Array) -> jax.Array:
+    """What lobes leave of samples [BRDF, view, light]: Gaussians of fixed widths around the mirror direction.
+
+    EM finds their weights for each BRDF and view, beside a uniform density that stands for the rest. A lobe's sum over
+    the texels is one; that of 0 degrees is the mirror texel alone.
+    """
+    width = jnp.radians(jnp.asarray(ANGLES[1:])) / 3
+
+    def view(argument):
+        wo, rows = argument
+        angle = 2 * jnp.arcsin(jnp.clip(jnp.linalg.norm(direction - wo * jnp.array([-1, -1, 1]), axis=1) / 2, 0, 1))
+        wide = jnp.exp(-((angle[:, None] / width) ** 2) / 2)
+        mirror = (jnp.arange(len(angle)) == jnp.argmin(angle)).astype(wide.dtype)[:, None]
+        density = jnp.concatenate([mirror, wide, jnp.ones_like(mirror)], 1)
+        density = density / jnp.sum(density, 0)
+        total = jnp.sum(rows, 1, keepdims=True)
+
+        def step(weight, _):
+            return weight * ((rows / (weight @ density.T)) @ density), None
+
+        start = jnp.broadcast_to(total / density.shape[1], (len(rows), density.shape[1]))
+        weight = jax.lax.scan(step, start, None, length=100)[0]
+        return rows - weight[:, :-1] @ density[:, :-1].T
+
+    return jnp.moveaxis(jax.lax.map(view, (direction, jnp.moveaxis(tensor, 1, 0))), 0, 1)
+
+
+def reflected(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tuple[jax.Array, float]:
+    """What the BRDFs reflect of natural light, less the lobes, and the squared norm of the whole."""
+    found = dynamic.reflected.reflect(brdfs, table, resolution=resolution)
+    inside = np.flatnonzero(np.asarray(found.area))
+    tensor = found.tensor[:, 0, inside] * jnp.sqrt(found.area[inside])[:, None]
+    return tensor, float(found.whole)
+
+
+def settings(tensor: jax.Array, whole: float, sets: Sequence[int], terms: Sequence[int]) -> dict:
+    """Squared relative errors of truncated higher-order SVDs, all from one core of the highest ranks."""
+    ranks = (max(sets), max(terms), max(terms))
+    core = np.asarray(tucker.hosvd(tensor, ranks=ranks).core, np.float64)
+    norm = squared_norm(tensor)
+    return {(h, n): (norm - np.sum(core[:h, :n, :n] ** 2)) / whole for h in sets for n in terms}
+
+
+def best(tensor: jax.Array, whole: float, ranks: tuple[int, int, int]) -> float:
+    """Squared relative error of the finest setting after two sweeps of the iteration that the paper cites."""
+    core = np.asarray(tucker.hooi(tensor, ranks=ranks, sweeps=2)[0].core, np.float64)
+    return float((squared_norm(tensor) - np.sum(core**2)) / whole)
+
+
+def squared_norm(tensor: jax.Array) -> float:
+    """Sum of squares, in float64 on the host."""
+    return float(sum(np.sum(np.square(np.asarray(each, np.float64))) for each in tensor))
+
+
+def principal(run: Run) -> Iterator[dict[str, Any]]:
+    """What four specular functions leave of both sets, in three norms; the fifth function is the diffuse part."""
+    resolution = 8 if run.quick else RESOLUTION
+    exponents = (1, 5, 20, 100) if run.quick else range(1, 201)
+    families = {"Cook-Torrance": measured(run), "Blinn-Phong": navigation.blinn_phong(exponents=exponents)}
+    for name, family in families.items():
+        most = min(6, len(family.brdf))
+        for norm, table in (
+            ("disk", samples(family.brdf, None, resolution=resolution)[0]),
+            ("disk, BRDFs of equal norm", None),
+            ("natural light", reflected(family.brdf, None, resolution=resolution)[0]),
+        ):
+            table = samples(family.brdf, None, resolution=resolution)[0] if table is None else table
+            rows = np.asarray(table).reshape(len(table), -1)
+            product = np.asarray(jnp.asarray(rows) @ jnp.asarray(rows).T, np.float64)
+            if norm.endswith("equal norm"):
+                product /= np.sqrt(np.diag(product) * np.diag(product)[:, None])
+            value = np.maximum(np.linalg.eigvalsh(product)[::-1], 0)
+            left = 1 - np.cumsum(value) / np.sum(value)
+            yield {
+                **{"set": name, "norm": norm, "brdfs": len(family.brdf)},
+                **{"squared_error": left[:most].tolist(), "paper": PRINCIPAL[name]},
+            }
+
+
+def figure_7(run: Run) -> Iterator[dict[str, Any]]:
+    """The measured points in the plane of Fresnel reflectance and roughness, and its triangles."""
+    from matplotlib import pyplot
+
+    family = measured(run)
+    place = np.array([place_of(each) for each in family.brdf])
+    triangle = getattr(family.navigation, "triangle", None)
+    figure, axis = pyplot.subplots(figsize=(8, 6), dpi=110)
+    if triangle is not None:
+        axis.triplot(*place.T, np.asarray(triangle), color="0.75", linewidth=0.7)
+    axis.plot(*place.T, "k.", markersize=5)
+    axis.set(xlabel="Fresnel reflectance at normal incidence F0", ylabel="roughness m", yscale="log")
+    figure.tight_layout()
+    figure.savefig(run.picture("sun2007_figure_7.png"))
+    pyplot.close(figure)
+    low, high = place.min(0), place.max(0)
+    yield {
+        **{"materials": len(place), "f0": [low[0], high[0]], "m": [low[1], high[1]]},
+        **{"median_f0": float(np.median(place[:, 0])), "median_m": float(np.median(place[:, 1]))},
+        "below_m_0.02": int(np.sum(place[:, 1] < 0.02)),
+        "triangles": 0 if triangle is None else len(triangle),
+    }
+
+
+def figure_6(run: Run) -> Iterator[dict[str, Any]]:
+    """Balls of four measured materials by the tensor alone, and with one to four published lobes."""
+    family, light = measured(run), run.light("grace")
+    chosen = shininess(family, 2 if run.quick else 4)
+    resolution, edge = (8, 16) if run.quick else (RESOLUTION, 384)
+    rings = 8 if run.quick else 112
+    ball = builtin.sphere(rings=rings, sectors=2 * rings)
+    view = camera.orbit(ball, elevation=0.2, width=edge, height=edge)
+    number = np.flatnonzero(np.sum(np.asarray(ball.normal) * (np.asarray(view.eye) - np.asarray(ball.position)), 1) > 0)
+    sets: dict[str, Any] = {"no lobes": None}
+    for count in (1, 4) if run.quick else (1, 2, 3, 4):
+        sets[" ".join(f"{k}°" for k in ANGLES[:count])] = functools.partial(
+            lobe.published.mirror_lobes, angles=ANGLES[:count], resolution=resolution
+        )
+    made = {
+        name: dynamic.factor(
+            family.brdf,
+            None if each is None else dynamic.separate(family.brdf, separator=each),
+            ranks=(2, 4, 4) if run.quick else (4, 8, 8),
+            resolution=resolution,
+        )
+        for name, each in sets.items()
+    }
+    rows, captions = [], []
+    for material in chosen:
+        exact = drawing.unshadowed(ball, family.brdf[material], light, view.eye, number)
+        name = f"{family.name[material]}, m = {place_of(family.brdf[material])[1]:.3g}"
+        radiance, row, titles = {"exact": exact}, [], []
+        for lobes, members in made.items():
+            mixed = members.at(jnp.zeros(len(family.brdf)).at[material].set(1))
+            radiance[lobes] = drawing.unshadowed(ball, mixed, light, view.eye, number)
+        for lobes, color in radiance.items():
+            wrong = float(np.linalg.norm(color - exact) / np.linalg.norm(exact))
+            row.append(np.asarray(image.render(ball, jnp.zeros((len(ball.position), 3)).at[number].set(color), view)))
+            titles.append(f"{name}\nexact" if lobes == "exact" else f"{lobes}\n{100 * wrong:.0f} % off")
+            if lobes != "exact":
+                more = dict(zip(("f0", "m"), place_of(family.brdf[material]), strict=True))
+                yield {"material": family.name[material], "lobes": lobes, "error": wrong, **more}
+        rows.append([drawing.shown(each, like=row[0]) for each in row])
+        captions.append(titles)
+    drawing.sheet(run.picture("sun2007_figure_6.jpg"), rows, captions)
+
+
+def shininess(family: navigation.Family, count: int) -> list[int]:
+    """Materials from the roughest to the sharpest, at equal steps in their order."""
+    order = np.argsort([-place_of(each)[1] for each in family.brdf])
+    return [int(order[place]) for place in np.linspace(0, len(order) - 1, count).astype(int)]
+
+
+def plot_5(lines: Sequence[Mapping[str, Any]], run: Run) -> None:
+    """Squared errors against the rank, a panel for each norm."""
+    from matplotlib import pyplot
+
+    rows = list(lines)
+    norms, kinds = (list(dict.fromkeys(line[key] for line in rows)) for key in ("norm", "lobes"))
+    figure, axes = pyplot.subplots(1, len(norms), figsize=(11, 4.4), dpi=100, squeeze=False)
+    for axis, norm in zip(axes[0], norms, strict=True):
+        for kind, style in zip(kinds, ("--", "-"), strict=True):
+            for place, count in enumerate(dict.fromkeys(line["n_h"] for line in rows)):
+                one = [x for x in rows if (x["norm"], x["lobes"], x["n_h"]) == (norm, kind, count)]
+                label = f"n_h = {count}" if kind == kinds[-1] else None
+                values = [x["squared_error"] for x in one]
+                axis.semilogy([x["n_w"] for x in one], values, style, marker=".", color=f"C{place}", label=label)
+        axis.set(title=f"norm: {norm}", xlabel="n_wi = n_wo", ylabel="squared relative error")
+    axes[0, -1].legend(fontsize=8, title="solid: published lobes\ndashed: none")
+    figure.tight_layout()
+    figure.savefig(run.picture("sun2007_figure_5.png"))
+    pyplot.close(figure)

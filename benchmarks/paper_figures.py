@@ -1,0 +1,278 @@
+"""Pictures for the figures of Sun et al. 2007, from the scenes of `benchmarks.paper_scenes`.
+
+Each figure is a dictionary from titles to pictures in linear radiance, made by changing what the paper's caption says
+is changed: light, view or material. Pictures are made at pixels: what arrives is that of the vertices, interpolated;
+BRDF, view and lobes are the pixel's own. `traced` has Mitsuba's pictures of the same scenes.
+
+    python -m benchmarks.paper_figures FOLDER [--store FOLDER] [--only FIGURE...]     write them as PNG
+"""
+
+import argparse
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import paper_scenes, path_tracing
+from benchmarks.paper_scenes import RECIPES, Look, Made
+from jaxprt import files, image
+from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert
+from jaxprt.image import rasterize, shading_points
+from jaxprt.scene import Camera, Environment
+from jaxprt.scene.points import Points
+
+CHUNK = 1 << 14  # points that are shaded at once
+SAMPLES = 1024  # of Mitsuba's pixels
+WHITE = 1.0  # behind the scenes
+
+
+def picture(
+    made: Made,
+    *,
+    camera: Camera,
+    light: Environment | None = None,
+    materials: Sequence[Any] | None = None,
+    system: Any = None,
+) -> np.ndarray:
+    """A picture of a scene at pixels, anti-aliased, in linear radiance; the background is NaN where nothing is seen.
+
+    Args:
+        made: The scene.
+        camera: From where.
+        light: Its own light if None.
+        materials: Those of all regions; its own if None.
+        system: A part of its system, such as direct light alone; the whole if None.
+    """
+    system = made.system if system is None else system
+    materials = made.materials() if materials is None else materials
+    arrived = system.shade(system.light(paper_scenes.light_of(made) if light is None else light), materials)
+    pixels = shading_points(rasterize(made.mesh, camera, samples=4), made.mesh, camera)
+    triangle = np.asarray(pixels.triangle)
+    face, region = np.asarray(made.mesh.face), np.asarray(made.mesh.region)
+    local, counts = _local(region)
+    owner = np.where(triangle >= 0, region[face[np.maximum(triangle, 0), 0]], -1)
+    own = [np.flatnonzero(owner == number) for number in range(len(counts))]
+    blocks = max(1, -(-sum(map(len, own)) // CHUNK))
+    size = [_rounded(-(-len(each) // blocks)) for each in own]
+    color = np.zeros((len(triangle), 3), np.float32)
+    corner, weight = local[face[np.maximum(triangle, 0)]], np.asarray(pixels.barycentric)
+    for block in range(blocks):
+        rows = [each[block * count : (block + 1) * count] for each, count in zip(own, size, strict=True)]
+        if not any(len(each) for each in rows):
+            break
+        points = [_points(corner, weight, each, count) for each, count in zip(rows, size, strict=True)]
+        placed = system.at(points)
+        radiance = np.asarray(placed.combine(arrived, placed.view(camera.eye, materials)))
+        first = np.cumsum([0, *size[:-1]])
+        for each, start in zip(rows, first, strict=True):
+            color[each] = radiance[start : start + len(each)]
+    return np.asarray(image.resolve(pixels, jnp.asarray(color), background=_background(camera)))
+
+
+def _local(region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The number of each vertex in its region, and how many these have."""
+    counts = np.bincount(region)
+    local = np.zeros(len(region), np.int32)
+    for number, count in enumerate(counts):
+        local[region == number] = np.arange(count)
+    return local, counts
+
+
+def _rounded(count: int) -> int:
+    """A number of points from few numbers, so that programs serve many pictures."""
+    step = max(1, 1 << max(count - 1, 0).bit_length() >> 3)
+    return max(16, -(-count // step) * step)
+
+
+def _points(corner: np.ndarray, weight: np.ndarray, chosen: np.ndarray, count: int) -> Points:
+    """Some points, and then padding that lies on the region's first vertex."""
+    corners, weights = np.zeros((3, count), np.int32), np.zeros((3, count), np.float32)
+    weights[0] = 1
+    corners[:, : len(chosen)], weights[:, : len(chosen)] = corner[chosen].T, weight[chosen].T
+    return Points(jnp.asarray(corners), jnp.asarray(weights))
+
+
+def _background(camera: Camera) -> np.ndarray:
+    return np.full((camera.height, camera.width, 3), WHITE, np.float32)
+
+
+def direct(made: Made) -> Any:
+    """The system of direct light alone."""
+    return made.system.part[0]
+
+
+def models(made: Made, changed: Look | None = None) -> list[Any]:
+    """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
+    free = {**made.recipe.free, **(changed or {})}
+    result: list[Any] = []
+    for number in range(len(made.system.part[0].brdf)):
+        if number not in free:
+            result.append(Lambert(made.recipe.fixed[number]))
+            continue
+        diffuse, specular, place = free[number]
+        if made.recipe.space == "BP":
+            result.append(BlinnPhong(diffuse, specular, place))
+        else:
+            result.append(CookTorrance(diffuse, specular, place[1], place[0]))
+    return result
+
+
+def traced(
+    made: Made, changed: Look | None = None, *, camera: Camera, bounces: int = 2, samples: int = SAMPLES, seed: int = 0
+) -> np.ndarray:
+    """Mitsuba's picture of a scene with so many bounces, in front of the same background."""
+    found = path_tracing.picture(
+        made.mesh,
+        models(made, changed),
+        paper_scenes.light_of(made),
+        camera,
+        depth=2 + bounces,
+        samples=samples,
+        seed=seed,
+    )
+    ones = jnp.zeros((len(made.mesh.position), 3), jnp.float32)
+    return found + np.asarray(image.render(made.mesh, ones, camera, background=jnp.asarray(_background(camera))))
+
+
+def off(mine: np.ndarray, exact: np.ndarray) -> float:
+    """Relative L2 of a picture against another, noise included, over the pixels that the scene fills."""
+    inside = np.all(exact != WHITE, -1) & np.all(mine != WHITE, -1)
+    return float(np.linalg.norm((mine - exact)[inside]) / np.linalg.norm(exact[inside]))
+
+
+class Figures:
+    """The figures of the paper; `quick` makes small ones of small scenes, `store` keeps what is precomputed."""
+
+    def __init__(self, *, quick: bool = False, store: pathlib.Path | None = None):
+        """Nothing is computed yet."""
+        self.quick, self.store, self.made = quick, store, {}
+        self.edge = 16 if quick else paper_scenes.EDGE
+
+    def scene(self, name: str, **options: Any) -> Made:
+        """A scene that is ready, made once."""
+        key = name, tuple(options.items())
+        if key not in self.made:
+            self.made[key] = paper_scenes.prepare(name, quick=self.quick, store=self.store, **options)
+        return self.made[key]
+
+    def camera(self, made: Made, **options: Any) -> Camera:
+        """The camera of a scene."""
+        return paper_scenes.camera_of(made, edge=self.edge, **options)
+
+    def drawn(
+        self, made: Made, changed: Look | None = None, *, turn: float = 0.0, lit: float = 0.0, system: Any = None
+    ) -> np.ndarray:
+        """A picture with the view or the light turned, other materials, or a part of the light."""
+        light = paper_scenes.turned(paper_scenes.light_of(made), lit)
+        return picture(
+            made, camera=self.camera(made, turn=turn), light=light, materials=made.materials(changed), system=system
+        )
+
+    def figure_1(self) -> dict[str, np.ndarray]:
+        """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness."""
+        made, color = self.scene("bust"), RECIPES["bust"].free[0][0]
+        curve = [(0.05, 0.8), (0.2, 0.4), (0.6, 0.2), (1.0, 0.1)]
+        shares = [(1.5, 0.3), (1.0, 0.5), (0.5, 0.7), (0.1, 0.85)]
+        return {
+            f"F0 {f0:g}, m {m:g}": self.drawn(made, {0: (base * np.asarray(color), gloss, [f0, m])})
+            for (f0, m), (base, gloss) in zip(curve, shares, strict=True)
+        }
+
+    def figure_8(self) -> dict[str, np.ndarray]:
+        """One bounce off a ring, by the resolution of the light."""
+        found = {}
+        for edge in (2, 4) if self.quick else (4, 8, 16):
+            # The directory of the finest has two bounces; these are one bounce each.
+            made = self.scene("ring", edge=edge, bounces=1)
+            found[f"6 x {edge} x {edge}"] = self.drawn(made, system=made.system.part[1])
+        return found
+
+    def figure_11(self) -> dict[str, np.ndarray]:
+        """Direct light, and interreflection; `traced` has the first picture of the paper's."""
+        made = self.scene("bird")
+        return {"direct light": self.drawn(made, system=direct(made)), "two bounces": self.drawn(made)}
+
+    def figure_12(self) -> dict[str, np.ndarray]:
+        """A room: direct light, with bounces, and after adjusting floor, sofa and walls."""
+        made = self.scene("room")
+        shiny = {0: ([0.1, 0.1, 0.12], 0.6, 200.0)}
+        green = {1: ([0.1, 0.45, 0.12], 0.1, 20.0), 0: ([0.5, 0.12, 0.08], 0.2, 60.0)}
+        walls = {2: ([0.15, 0.3, 0.6], 0.05, 6.0)}
+        return {
+            "direct light": self.drawn(made, system=direct(made)),
+            "two bounces": self.drawn(made),
+            "shiny dark floor": self.drawn(made, shiny),
+            "red floor, green sofa": self.drawn(made, green),
+            "blue walls": self.drawn(made, walls),
+            "light turned": self.drawn(made, lit=-0.5),
+        }
+
+    def figure_13(self) -> dict[str, np.ndarray]:
+        """Shininess of a base, above, and of what stands on it, below."""
+        made = self.scene("airplane")
+        (color, gloss, _), (ground, base, _) = (RECIPES["airplane"].free[number] for number in (0, 1))
+        found = {f"base, exponent {n:g}": self.drawn(made, {1: (ground, base, n)}) for n in (6.0, 60.0, 200.0)}
+        for n in (6.0, 60.0, 200.0):
+            found[f"object, exponent {n:g}"] = self.drawn(made, {0: (color, gloss, n)})
+        return found
+
+    def ring(self) -> dict[str, np.ndarray]:
+        """Shininess of the ring, with its bounces: direct light and both bounces."""
+        made = self.scene("ring")
+        color = RECIPES["ring"].free[0][1]
+        exponents = (20.0, 60.0, 200.0)
+        return {f"exponent {n:g}": self.drawn(made, {0: (0.02, color, n)}) for n in exponents}
+
+    def figure_15(self) -> dict[str, np.ndarray]:
+        """Chess with the light behind the board: direct light, and with bounces; then another view and material."""
+        made = self.scene("chess")
+        gold = {0: ([0.02, 0.02, 0.02], [1.0, 0.76, 0.33], [0.8, 0.2])}
+        return {
+            "direct light": self.drawn(made, system=direct(made)),
+            "two bounces": self.drawn(made),
+            "another view": self.drawn(made, turn=0.5),
+            "one side of gold": self.drawn(made, gold),
+        }
+
+
+FIGURES: dict[str, Callable[[Figures], dict[str, np.ndarray]]] = {
+    "1": Figures.figure_1,
+    "8": Figures.figure_8,
+    "11": Figures.figure_11,
+    "12": Figures.figure_12,
+    "13": Figures.figure_13,
+    "ring": Figures.ring,
+    "15": Figures.figure_15,
+}
+
+
+def exposed(pictures: dict[str, np.ndarray], *, brighter: float = 0.0) -> dict[str, np.ndarray]:
+    """The pictures of a figure for the screen, all with the exposure that the last one asks for."""
+    *_, last = pictures.values()
+    inside = np.where(last == WHITE, 0, last)
+    stops = image.automatic_exposure(jnp.asarray(inside)) + brighter
+    return {
+        title: np.where(each == WHITE, 1, np.asarray(image.display(image.expose(jnp.asarray(each), stops=stops))))
+        for title, each in pictures.items()
+    }
+
+
+def main(options: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("folder", type=pathlib.Path, help="where to write the pictures")
+    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what is precomputed, and go on")
+    parser.add_argument("--only", nargs="+", choices=list(FIGURES), metavar="FIGURE", help=", ".join(FIGURES))
+    parser.add_argument("--quick", action="store_true", help="small pictures of small scenes")
+    arguments = parser.parse_args(options)
+    figures = Figures(quick=arguments.quick, store=arguments.store)
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    for name in arguments.only or FIGURES:
+        row = np.concatenate(list(exposed(FIGURES[name](figures)).values()), 1)
+        files.write_png(arguments.folder / f"figure_{name}.png", row.astype(np.float32))
+        print(f"figure {name}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

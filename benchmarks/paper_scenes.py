@@ -1,0 +1,444 @@
+"""What do scenes like those of Sun et al. 2007 cost, with two bounces? The columns of their Table 1.
+
+    python -m benchmarks.paper_scenes [--quick] [--only SCENE...] [--most VERTICES] [--store FOLDER]
+        [--output FILE]
+
+Scenes have several regions whose materials change while all of them light each other. Room, chess, walls and ring are
+made by formula (`jaxprt.scene.interiors`). The others stand in for the paper's meshes, which are not public: scans of
+JAXPRT_DATA, simplified so that each scene has the paper's number of vertices. Without the data spheres replace them.
+
+Lines `precompute` have the time of transport and bounces, the bytes of the bounces' tensor and of the direct light, and
+the peak of the process's memory. Where a run was stopped, a `--store` goes on from there, and the seconds of all runs
+are added up. `--most` leaves out the scenes whose counterpart in the paper has more vertices.
+
+Lines `frame` are of a picture of 512 x 512 pixels with 4 samples of coverage each: all vertices are relit and then
+drawn, as in the paper. `view` has a new view in each frame, `material` a new view and new materials, `light` a new
+light too. `peer_seconds` are the paper's, on two Xeons of 3.2 GHz and a GeForce 7800 in 2007: Table 1 of the paper,
+columns V, V&B and V,B&L, and for `precompute` the sum of its columns Precomp and Compress.
+
+`error` is what the tensor of the first bounce leaves out of what arrives, rms over clusters.
+"""
+
+import itertools
+import json
+import pathlib
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxprt as prt
+from benchmarks import harness
+from benchmarks.interreflection import rms
+from jaxprt import bounces, dynamic, separable
+from jaxprt.brdf import Lambert, navigation
+from jaxprt.image import render
+from jaxprt.scene import Camera, Environment, Mesh, builtin, interiors, load_environment, load_mesh
+from jaxprt.scene.environment import rotate
+from jaxprt.scene.mesh import bounds, ground_plane, join, make_mesh
+from jaxprt.scene.occluder import simplify
+
+EDGE = 512  # pixels
+LOBES = 6
+SIZES = {"direct": 32, "edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2}
+COOK_TORRANCE = tuple(itertools.product((0.0, 1.0), (0.05, 0.1, 0.2, 0.4, 0.8)))  # F0 and roughness
+BLINN_PHONG = (2.0, 6.0, 20.0, 60.0, 200.0)
+PATHS = {
+    "functions": 3,
+    "terms": 16,
+}  # of sets along light paths, besides the diffuse one; the paper has four functions
+SHARP = (20.0, 200.0)  # exponents where caustics are looked at
+SHARP_TERMS = 40
+ROOM = (0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9)  # its walls are one region
+
+
+Look = Mapping[int, tuple[Any, Any, Any]]  # of some regions: diffuse color, specular weight, place in the set
+
+
+class Published(NamedTuple):
+    """A row of the paper's Table 1.
+
+    Attributes:
+        name: Its name, with the figure.
+        adjustable: Number of BRDFs that change.
+        vertices: Number of vertices.
+        megabytes: Storage.
+        hours: Precomputation and compression.
+        fps: Frames a second with a new view, new view and BRDFs, and new view, BRDFs and light.
+    """
+
+    name: str
+    adjustable: int
+    vertices: int
+    megabytes: float
+    hours: tuple[float, float]
+    fps: tuple[float, float, float]
+
+
+TWEETY = Published("Tweety (Fig. 11)", 2, 13_000, 148, (2.6, 4.0), (121.58, 28.73, 5.82))
+AIRPLANE = Published("Airplane (Fig. 13)", 2, 13_100, 144, (2.5, 6.4), (139.50, 30.79, 5.91))
+INDOOR = Published("Indoor (Fig. 12)", 2, 35_700, 311, (4.2, 15.1), (74.52, 12.57, 3.40))
+VENUS = Published("Venus (Fig. 1)", 1, 39_700, 389, (5.0, 7.3), (57.09, 10.94, 2.62))
+CHESS = Published("Chess (Fig. 15)", 2, 53_900, 539, (13.7, 10.5), (48.30, 8.23, 1.67))
+WATCH = Published("Watch (Fig. 14)", 2, 62_100, 603, (15.7, 14.3), (43.06, 7.23, 1.53))
+
+
+class Recipe(NamedTuple):
+    """How a scene is made.
+
+    Attributes:
+        mesh: Makes its mesh.
+        space: "CT" or "BP": the set of BRDFs that its free regions move in.
+        free: Its free regions, each with diffuse color, specular weight and place in the set.
+        fixed: Albedos of the other regions, by number.
+        light: Name of its light: a file of the data folder, or "daylight".
+        camera: Eye and target over the diagonal of the scene, from its middle, and the angle of view.
+        published: The paper's row; None where there is none.
+        options: Of the bounces, where they are not the usual ones; and "direct", the edge of the faces of direct light.
+    """
+
+    mesh: Callable[[bool], Mesh]
+    space: str
+    free: Look
+    fixed: dict[int, Any]
+    light: str
+    camera: tuple[Sequence[float], Sequence[float], float]
+    published: Published | None
+    options: Mapping[str, Any] = MappingProxyType({})
+
+
+class Made(NamedTuple):
+    """A scene that is ready to be relit.
+
+    Attributes:
+        name: Its name.
+        recipe: How it was made.
+        mesh: Its mesh.
+        system: Direct light and bounces.
+        navigation: From coordinates to weights of the set.
+        seconds: What precomputation took, over all runs.
+        peak: The most memory that a process of it had.
+    """
+
+    name: str
+    recipe: Recipe
+    mesh: Mesh
+    system: Any
+    navigation: Any
+    seconds: float
+    peak: int
+
+    @property
+    def tensor(self) -> bounces.TransferTensor:
+        """The tensor of the bounces."""
+        return self.system.part[1].tensor
+
+    def materials(self, changed: Look | None = None) -> list[dynamic.Material | None]:
+        """Materials of all regions; `changed` has those of some free regions, as `Recipe.free` has them."""
+        free = {**self.recipe.free, **(changed or {})}
+        return [self._material(*free[number]) if number in free else None for number in range(_regions(self.mesh))]
+
+    def _material(self, diffuse: Any, specular: Any, coordinate: Any) -> dynamic.Material:
+        colors = (jnp.broadcast_to(jnp.asarray(each, jnp.float32), 3) for each in (diffuse, specular))
+        return dynamic.Material(self.navigation.weight(jnp.asarray(coordinate, jnp.float32)), *colors)
+
+
+def main(options: Sequence[str] | None = None) -> None:
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what is precomputed, and go on")
+    parser.add_argument("--only", nargs="+", choices=list(RECIPES), metavar="SCENE", help=", ".join(RECIPES))
+    parser.add_argument("--most", type=int, metavar="VERTICES", help="leave larger scenes out")
+    arguments = parser.parse_args(options)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
+    for name in arguments.only or (["walls"] if arguments.quick else RECIPES):
+        published = RECIPES[name].published
+        if arguments.most and published and published.vertices > arguments.most:
+            continue
+        for line in measure(prepare(name, quick=arguments.quick, store=arguments.store), arguments.quick):
+            harness.report(line, arguments.output)
+
+
+def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None, **options: Any) -> Made:
+    """Makes a scene ready.
+
+    Args:
+        name: One of `RECIPES`.
+        quick: A small scene of the same regions.
+        store: Folder that keeps what is finished.
+        options: Of the bounces, in place of the recipe's.
+    """
+    recipe = RECIPES[name]
+    mesh = recipe.mesh(quick)
+    sharp = "edge" in recipe.options  # finer light than that of the paper's scenes
+    seen, met, family = sets(recipe.space, quick=quick, sharp=sharp)
+    regions: list[Any] = [seen] * _regions(mesh)
+    paths: list[Any] = [met] * len(regions)
+    for number, albedo in recipe.fixed.items():
+        fixed = separable.factor(Lambert(albedo), terms=1, resolution=8)
+        regions[number], paths[number] = fixed, fixed
+    folder = store and store / name
+    given: dict[str, Any] = {**SIZES, **recipe.options, **options}
+    size = given.pop("direct")
+    if quick:
+        size, given = 16, given | {"edge": 4, "size": 8, "components": 8, "modes": 16}
+    marks = "_".join(f"{key}{value}" for key, value in given.items() if key != "bounces")
+    start = time.perf_counter()
+    try:
+        path = folder and folder / f"direct{size}"
+        transport = dynamic.precompute(mesh, regions, size=size, path=path, progress=False)
+        tensor = bounces.precompute(mesh, paths, path=folder and folder / marks, progress=False, **given)
+    finally:
+        kept = folder and folder / f"{marks}_bounces{given['bounces']}.json"
+        seconds, peak = _spent(kept, time.perf_counter() - start)
+    direct = dynamic.DynamicSystem(transport, regions, samples=1 if quick else 2)
+    system = prt.total(direct, bounces.BouncesSystem(tensor, direct))
+    return Made(name, recipe, mesh, system, family.navigation, seconds, peak)
+
+
+def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:
+    """Seconds of all runs until everything was there, and the most memory of any; a run that found it adds none."""
+    peak, before = harness.peak_memory(), {"seconds": 0.0, "peak": 0, "done": False}
+    if path is not None and path.is_file():
+        before = json.loads(path.read_text())
+    if before["done"]:
+        return before["seconds"], before["peak"]
+    done = sys.exc_info()[0] is None
+    found = {"seconds": before["seconds"] + seconds, "peak": max(before["peak"], peak), "done": done}
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found))
+    return found["seconds"], found["peak"]
+
+
+def sets(space: str, *, quick: bool, sharp: bool) -> tuple[dynamic.DynamicBrdf, dynamic.DynamicBrdf, navigation.Family]:
+    """What is seen of a set of BRDFs, by lobes, what light meets on its way, by terms, and the way through the set.
+
+    Usual light paths have 16 terms and views smoothed to degree 5. Sharp ones, for caustics, have a tensor of the
+    BRDFs themselves with more terms, which keeps lobes narrower.
+    """
+    if space == "BP":
+        knots = SHARP if sharp else BLINN_PHONG
+        family = navigation.blinn_phong(exponents=(knots[0], knots[-1]) if quick else knots)
+    else:
+        family = navigation.cook_torrance(
+            point=np.array([each for each in COOK_TORRANCE if not quick or each[1] in (0.05, 0.8)])
+        )
+    seen = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
+    sizes: dict[str, Any] = {"functions": 2, "terms": 4, "resolution": 8} if quick else PATHS
+    if not sharp:
+        return seen, bounces.factor(family.brdf, navigation=family.navigation, **sizes), family
+    ranks = (2, 4, 4) if quick else (len(family.brdf), SHARP_TERMS, SHARP_TERMS)
+    return seen, dynamic.factor(family.brdf, None, ranks=ranks, resolution=8 if quick else 32), family
+
+
+def measure(made: Made, quick: bool) -> Iterator[dict[str, Any]]:
+    """Lines of one scene."""
+    tensor, row = made.tensor, made.recipe.published
+    direct = prt.memory(made.system.part[0])
+    common = {
+        **{"benchmark": "paper_scenes", "scene": made.name, "space": made.recipe.space},
+        **{"vertices": len(made.mesh.position), "regions": _regions(made.mesh), "adjustable": len(made.recipe.free)},
+        **{"bytes": tensor.nbytes, "direct_bytes": direct, "error": rms(tensor.error)},
+        "worth": [round(float(each), 4) for each in tensor.worth],
+    }
+    peer: dict[str, Any] = {}
+    if row is not None:
+        peer = {"peer": f"Sun et al. 2007, {row.name}", "peer_error": None, "peer_vertices": row.vertices}
+        peer |= {"peer_adjustable": row.adjustable, "peer_bytes": 1e6 * row.megabytes}
+    spent = {"seconds": made.seconds, "compile_seconds": 0.0, "peak_bytes": made.peak}
+    theirs = {"peer_seconds": 3600 * sum(row.hours)} if row else {}
+    yield {**common, "case": f"{made.name}, precompute", **spent, **peer, **theirs}
+    for number, (kind, frame) in enumerate(frames(made, quick)):
+        timing = harness.measure(frame, repeats=2 if quick else 9)
+        theirs = {"peer_seconds": 1 / row.fps[number], "peer_fps": row.fps[number]} if row else {}
+        yield {
+            **{**common, "case": f"{made.name}, frame, new {kind}", **timing.line(), "fps": 1 / timing.seconds},
+            **{**peer, **theirs},
+        }
+
+
+def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Array]]]:
+    """Kind and function of each frame: every call has another view, other materials, another light."""
+    edge = 32 if quick else EDGE
+    cameras = [camera_of(made, edge=edge, turn=turn) for turn in (0.0, 0.15, 0.3)]
+    lights = [turned(light_of(made), turn) for turn in (0.0, 0.7, 1.4)]
+    materials = [made.materials(_darker(made, amount)) for amount in (1.0, 0.8, 0.6)]
+    system, count = made.system, itertools.count()
+    lit = system.light(lights[0])
+    shaded = system.shade(lit, materials[0])
+
+    def frame(matter: bool, light: bool) -> jax.Array:
+        number = next(count) % 3
+        now = materials[number if matter else 0]
+        arrived = shaded
+        if matter:
+            arrived = system.shade(system.light(lights[number]) if light else lit, now)
+        color = system.combine(arrived, system.view(cameras[number].eye, now))
+        return render(made.mesh, color, cameras[number], background=None)
+
+    yield "view", lambda: frame(False, False)
+    yield "material", lambda: frame(True, False)
+    yield "light", lambda: frame(True, True)
+
+
+def _darker(made: Made, amount: float) -> Look:
+    """Materials of all free regions with other colors, and in other places of the set."""
+    free = made.recipe.free.items()
+    return {number: tuple(amount * np.asarray(each, float) for each in look) for number, look in free}  # pyright: ignore
+
+
+def light_of(made: Made) -> Environment:
+    """The light of a scene."""
+    size, name = made.system.part[0].transport.size, made.recipe.light
+    path = harness.data() / "env" / name
+    return load_environment(path, size=size) if path.is_file() else builtin.daylight(size=size)
+
+
+def turned(light: Environment, turn: float) -> Environment:
+    """A light turned about the vertical axis."""
+    cosine, sine = np.cos(turn), np.sin(turn)
+    about = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], np.float32)
+    return rotate(light, jnp.asarray(about)) if turn else light
+
+
+def camera_of(made: Made, *, edge: int = EDGE, turn: float = 0.0) -> Camera:
+    """The camera of a scene, turned about the vertical axis through what it looks at."""
+    low, high = bounds(made.mesh)
+    diagonal, (eye, target, angle) = float(np.linalg.norm(high - low)), made.recipe.camera
+    middle = (low + high) / 2 + diagonal * np.asarray(target)
+    away = diagonal * (np.asarray(eye) - np.asarray(target))
+    cosine, sine = np.cos(turn), np.sin(turn)
+    away = away @ np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
+    return Camera(middle + away, middle, [0.0, 1.0, 0.0], angle, edge, edge)
+
+
+def _regions(mesh: Mesh) -> int:
+    return int(np.max(np.asarray(mesh.region))) + 1
+
+
+def _scan(file: str, faces: int, quick: bool, axes: str = "xyz") -> Mesh:
+    """A scan of the data folder, simplified; a sphere where there is none. Its axes become x, y and z in this order."""
+    path = harness.data() / "meshes" / file
+    if quick or not path.is_file():
+        return builtin.sphere(rings=6, sectors=9)
+    mesh = simplify(load_mesh(path), faces=faces)
+    position = np.asarray(mesh.position, np.float64)
+    columns = [{"x": 0, "y": 1, "z": 2}[each.lower()] for each in axes]
+    sign = [-1.0 if each.isupper() else 1.0 for each in axes]
+    return make_mesh(position[:, columns] * sign, mesh.face, name=file)
+
+
+def _room(quick: bool) -> Mesh:
+    """The room with its three walls as one region; a quick one is as many balls."""
+    if quick:
+        ball = builtin.sphere(rings=4, sectors=6)
+        place = np.stack(np.divmod(np.arange(max(ROOM) + 1), 4), -1) @ np.array([[0, 3.0, 0], [3.0, 0, 0]])
+        return join([make_mesh(np.asarray(ball.position) + each, ball.face) for each in place])
+    mesh = interiors.room()
+    region = jnp.asarray(ROOM, jnp.int32)[mesh.region]
+    return eqx.tree_at(lambda each: each.region, mesh, region)
+
+
+def _grounded(mesh: Mesh, quick: bool, vertices: int, extent: float = 3.0) -> Mesh:
+    """A scan as one region on a ground."""
+    return join([mesh, ground_plane(mesh, vertices=25 if quick else vertices, extent=extent)])
+
+
+_GRAY = np.array([0.3, 0.28, 0.25])
+_RED = np.array([0.7, 0.08, 0.06])
+_ABOVE = (0.0, 0.0, 0.0)
+RECIPES = {
+    "room": Recipe(
+        _room,
+        "BP",
+        {
+            0: ([0.45, 0.3, 0.18], 0.2, 60.0),
+            1: ([0.55, 0.08, 0.06], 0.1, 20.0),
+            2: ([0.7, 0.7, 0.65], 0.05, 6.0),
+        },
+        {
+            **{3: 0.8, 4: [0.2, 0.3, 0.6], 5: [0.4, 0.25, 0.15], 6: [0.8, 0.75, 0.6], 7: [0.5, 0.5, 0.55]},
+            **{8: [0.3, 0.4, 0.3], 9: [0.7, 0.6, 0.2]},
+        },
+        "daylight",
+        ([0.05, 0.03, 0.72], [0.0, -0.06, 0.0], 0.75),
+        INDOOR,
+    ),
+    "walls": Recipe(
+        lambda quick: interiors.corner(_scan("spot.obj", 6000, quick, "XyZ"), cells=4 if quick else 66),
+        "CT",
+        {0: (_GRAY, 0.6, [0.15, 0.2]), 3: (_RED, 0.3, [0.05, 0.4])},
+        {1: 0.6, 2: 0.6},
+        "grace_cross.hdr",
+        ([-0.4, 0.2, 0.75], [0.05, -0.1, -0.05], 0.75),
+        None,
+    ),
+    "ring": Recipe(
+        lambda quick: interiors.ring(spacing=4.0 if quick else 1.5),
+        "BP",
+        {0: (0.02, [0.9, 0.7, 0.35], 200.0)},
+        {1: 0.4},
+        "daylight",
+        ([0.1, 0.66, 0.56], _ABOVE, 0.6),
+        None,
+        {"direct": 64, "edge": 16, "modes": 96},
+    ),
+    "chess": Recipe(
+        lambda quick: interiors.corner(_scan("", 0, quick), cells=4) if quick else interiors.chess_sides(),
+        "CT",
+        {0: ([0.35, 0.05, 0.04], 0.6, [0.1, 0.2]), 1: ([0.6, 0.55, 0.4], 0.6, [0.1, 0.2])},
+        {2: [0.65, 0.55, 0.4], 3: [0.12, 0.08, 0.06]},
+        "grace_cross.hdr",
+        ([0.2, 0.38, 0.75], _ABOVE, 0.6),
+        CHESS,
+    ),
+    "bust": Recipe(
+        lambda quick: interiors.corner(_scan("nefertiti.ply", 50_000, quick, "xzY"), cells=4 if quick else 79),
+        "CT",
+        {0: ([0.25, 0.18, 0.1], 0.7, [0.5, 0.2])},
+        {1: 0.6, 2: 0.6, 3: 0.6},
+        "grace_cross.hdr",
+        ([-0.4, 0.2, 0.75], [0.05, -0.05, -0.05], 0.75),
+        VENUS,
+        {"components": 16},
+    ),
+    "bird": Recipe(
+        lambda quick: _grounded(_scan("stanford_bunny.ply", 19_200, quick), quick, 3364),
+        "CT",
+        {0: ([0.7, 0.55, 0.1], 0.3, [0.05, 0.4]), 1: ([0.1, 0.2, 0.6], 0.5, [0.1, 0.2])},
+        {},
+        "grace_cross.hdr",
+        ([0.15, 0.2, 0.5], _ABOVE, 0.6),
+        TWEETY,
+    ),
+    "airplane": Recipe(
+        lambda quick: _grounded(_scan("dragon_100k.ply", 19_400, quick), quick, 3364),
+        "BP",
+        {0: (_RED, 0.3, 20.0), 1: (0.3, 0.5, 20.0)},
+        {},
+        "grace_cross.hdr",
+        ([0.15, 0.2, 0.5], _ABOVE, 0.6),
+        AIRPLANE,
+    ),
+    "watch": Recipe(
+        lambda quick: _grounded(_scan("happy_buddha_100k.ply", 100_000, quick), quick, 12_100),
+        "CT",
+        {0: (0.02, [0.95, 0.75, 0.4], [0.8, 0.2]), 1: (0.3, 0.5, [0.1, 0.4])},
+        {},
+        "grace_cross.hdr",
+        ([0.25, 0.35, 0.95], _ABOVE, 0.6),
+        WATCH,
+        {"components": 16},
+    ),
+}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Fits of analytic models to the measured materials of MERL, in the text files of the BSDF benchmark BBM."""
+
+import ast
+import pathlib
+import re
+from typing import Any
+
+import numpy as np
+
+from jaxprt.brdf import measured, models
+from jaxprt.brdf.models import Model
+
+_SCALE = (1.0, 1.15, 1.66)  # of MERL's colors, which the data that was fitted lacked
+_LINE = re.compile(
+    r"(?P<name>[\w-]+) *= *Aggregate\(Lambertian\(albedo = (?P<diffuse>\[[^\]]*\])\), *(?P<model>\w+)\((?P<rest>.*)\)\)"
+)
+_FIELD = re.compile(r"(\w+) = (\[[^\]]*\]|[-+\w.]+)")
+_MODELS = ("NganBlinnPhong", "NganCookTorrance", "NganLafortune", "NganWardDuer")
+
+
+def load_ngan(path: str | pathlib.Path, material: str) -> Model:
+    """Loads one material from a file of fits by Ngan, Durand and Matusik, in the form of the BSDF benchmark BBM.
+
+    Each line of the file is a material, `name = Aggregate(Lambertian(albedo = [..]), NganWardDuer(albedo = [..], ..))`.
+    Models are Blinn-Phong, Cook-Torrance, Lafortune and Ward-Duer. The fits are to data without MERL's scale of colors,
+    (1, 1.15, 1.66), by which all reflectances are multiplied here.
+
+    Args:
+        path: The file, such as `ngan_cooktorrance.fit`.
+        material: Name of the material, such as "blue-acrylic".
+
+    Returns:
+        The BRDF in linear RGB.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file has no such lines, the material is unknown, its model is another one, or a number is out of
+            its range.
+
+    Reference: Ngan, Durand, Matusik 2005, "Experimental analysis of BRDF models"; BBM, include/bsdfmodel/ngan.h.
+    """
+    text = pathlib.Path(path).read_text(encoding="utf-8", errors="replace")
+    lines = {found["name"]: found for found in map(_LINE.fullmatch, map(str.strip, text.splitlines())) if found}
+    if not lines:
+        raise ValueError(f"{path}: lines must be like `name = Aggregate(Lambertian(..), NganWardDuer(..))`, got none")
+    found = lines[measured.one_of(material, list(lines), path)]
+    if found["model"] not in _MODELS:
+        raise ValueError(f"{path}: the model of {material} must be one of {', '.join(_MODELS)}, got {found['model']}")
+    try:
+        field = {name: np.array(ast.literal_eval(value), float) for name, value in _FIELD.findall(found["rest"])}
+        return _model(found["model"], np.array(ast.literal_eval(found["diffuse"]), float) * _SCALE, field)
+    except (ValueError, KeyError, SyntaxError, TypeError) as error:
+        raise ValueError(f"{path}: {material} must have the numbers of {found['model']}: {error}") from error
+
+
+def _model(name: str, diffuse: np.ndarray, field: dict[str, Any]) -> Model:
+    """The model with the parameters of a fit."""
+    specular = field["albedo"] * _SCALE
+    if name == "NganCookTorrance":  # its eta is the reflectance at normal incidence
+        return models.CookTorrance(diffuse=diffuse, specular=specular, roughness=field["roughness"], f0=field["eta"])
+    if name == "NganWardDuer":
+        m = field["roughness"]
+        return models.WardDuer(diffuse=diffuse, specular=specular, along=m, across=m)
+    n = field["sharpness"]
+    if name == "NganBlinnPhong":  # ks (n + 2) / (2 pi) (n.h)^n in the paper
+        return models.BlinnPhong(diffuse=diffuse, specular=specular * 4 * (2 ** (-n / 2) + n) / (n + 4), exponent=n)
+    # The lobe is divided by the larger coefficient and normalized as Phong's; heights belong into the coefficients.
+    size = max(abs(field["Cxy"]), abs(field["Cz"]))
+    height = (specular * (n + 2) / (2 * np.pi)) ** (1 / n) / size
+    cxy, cz = ((height * field[key])[None] for key in ("Cxy", "Cz"))
+    return models.Lafortune(diffuse=diffuse, cx=cxy, cy=cxy, cz=cz, exponent=np.full((1, 3), n))

@@ -1,0 +1,132 @@
+"""Writes scenes and lights for other programs: `jaxprt export`."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import numpy as np
+
+from jaxprt.cli import inputs, options, play, sizes
+from jaxprt.cli.options import option
+from jaxprt.scene import Environment, light_probe
+from jaxprt.scene.light_probes import TOOLS
+from jaxprt.view import export, export_baked
+
+_KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
+
+
+@click.command(cls=options.Command, short_help="Pages, baked glTF, and light probes for other programs.")
+@options.scene
+@options.light
+@option(
+    "--output",
+    "-o",
+    group="Output",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    required=True,
+    metavar="FILE",
+    help="What to write, by its suffix: *.html, *.glb or *.json. May be given several times.",
+)
+@options.systems(("lobe", "harmonic"), default="lobe", words="Of the page and the baked scene.  [default: lobe]")
+@option(
+    "--bounces",
+    group="System",
+    type=options.Bounces(),
+    default="0",
+    help='How often parts reflect light onto each other, or "all", in *.glb; pages have none.  [default: 0]',
+)
+@options.few_sizes
+@option(
+    "--most",
+    group="Output",
+    type=click.IntRange(1),
+    metavar="BYTES",
+    default=32_000_000,
+    show_default=True,
+    help="Largest size of the page in bytes.",
+)
+@option(
+    "--tool",
+    group="Output",
+    type=options.Several(click.Choice(TOOLS, case_sensitive=False)),
+    default=",".join(TOOLS),
+    help="Tools that *.json is for.  [default: all]",
+)
+@option(
+    "--store",
+    group="Output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder that keeps what was precomputed, for later runs.",
+)
+@options.as_json
+def command(**given: Any) -> None:
+    """Write a scene or its lights for other programs.
+
+    \b
+    *.html  a page that relights the scene in any browser, without Python and without a network
+    *.glb   the scene as glTF with the radiance of the first light in the colors of its vertices
+    *.json  light probes: the first nine harmonics of each light, in the scaling and axes of other tools
+
+    \b
+    Examples:
+      jaxprt export scene.glb grace.hdr --output piece.html
+      jaxprt export scene.glb grace.hdr --output piece.html --output baked.glb --system harmonic --store kept
+      jaxprt export grace.hdr uffizi.hdr --output probes.json --tool three.js
+    """  # noqa: D301
+    chosen = SimpleNamespace(**given)
+    _check(chosen)
+    with options.telling(chosen.as_json):
+        found = _write(chosen)
+    rows = [f"jaxprt: {row['path']}, {row['bytes']:,} bytes{row.pop('words')}" for row in found]
+    options.tell(found, "\n".join(rows), as_json=chosen.as_json)
+
+
+def _check(chosen: SimpleNamespace) -> None:
+    """Refuses files that cannot be written before anything is computed."""
+    for path in chosen.output:
+        if path.suffix.lower() not in _KINDS:
+            raise click.UsageError(f"--output must end in {', '.join(_KINDS)}, got {path}")
+        if not path.parent.is_dir():
+            raise click.UsageError(f"--output must be in a folder that exists, got {path}: there is no {path.parent}")
+        if path.is_dir():
+            raise click.UsageError(f"--output must be a file, got the folder {path}")
+    if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
+        raise click.UsageError("an export has one system, and one number of lobes, got several")
+
+
+def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
+    """Writes all files; what each is."""
+    lights, ready, rows = inputs.lights(chosen), None, []
+    for path in chosen.output:
+        kind = _KINDS[path.suffix.lower()]
+        if kind == "probes":
+            rows.append(probes(path, lights, chosen.tool))
+            continue
+        if ready is None:
+            (recipe,) = sizes.recipes(chosen.system[0], chosen, lobes=play.LOBES).values()
+            scene = inputs.scene(chosen, playable=True)
+            ready = play.prepared(scene, lights, recipe, chosen.bounces, chosen.store)
+        if kind == "page":
+            piece = export(ready, path, environments=lights, most=chosen.most)
+            row = {"error": piece.error, "visibility_edge": piece.edge, "degree": piece.degree}
+            words = f", {100 * piece.error:.1f} % off the whole scene"
+        else:
+            name, light = next(iter(lights.items()))
+            row = {"light": name, "exposure": export_baked(ready, path, light)}
+            words = f", in the light of {name}; its colors times {row['exposure']:.4g} are radiance"
+        rows.append({"path": str(path), "kind": kind, "bytes": path.stat().st_size, **row, "words": words})
+    return rows
+
+
+def probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -> dict[str, Any]:
+    """Writes light probes; what the file is."""
+    found = {
+        tool: {name: np.asarray(light_probe(light, tool=tool), float).tolist() for name, light in lights.items()}
+        for tool in tools
+    }
+    path.write_text(json.dumps(found, indent=2) + "\n")
+    words = f", nine colors of each of {', '.join(lights)} for {', '.join(tools)}"
+    return {"path": str(path), "kind": "probes", "bytes": path.stat().st_size, "words": words}

@@ -1,0 +1,274 @@
+"""Says what files hold: `jaxprt info`."""
+
+import json
+import math
+import re
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import numpy as np
+
+from jaxprt import brdf
+from jaxprt.cli import inputs, materials, options
+from jaxprt.cli.options import option
+from jaxprt.files import read_image
+from jaxprt.scene import TexturedMaterial, load_environment, load_scene
+from jaxprt.scene.mesh import bounds
+from jaxprt.sphere import cubemap
+
+_BRIGHTEST = (1, 10, 100)  # texels whose share of the light is told
+_MERL = np.array([90, 90, 180], "<i4").tobytes()
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+_NAMES = 6  # of the materials in a file that text lists
+
+
+@click.command(cls=options.Command, short_help="What meshes, environments, BRDFs and stores hold.")
+@click.argument("files", metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1, required=True)
+@option(
+    "--light-size",
+    group="Light",
+    type=click.IntRange(1, 1024),
+    default=64,
+    show_default=True,
+    metavar="N",
+    help="Texels along the edge of the cubemap faces whose brightest texels are counted.",
+)
+@options.as_json
+def command(**given: Any) -> None:
+    """Say what files hold: meshes and scenes, environments, BRDFs, and folders that jaxprt wrote.
+
+    \b
+    Examples:
+      jaxprt info scene.glb grace.hdr
+      jaxprt info lafortune.json ngan2005_wardduer.fit gold-paint.binary
+      jaxprt info kept out/ --json
+    """  # noqa: D301
+    chosen = SimpleNamespace(**given)
+    found = [about(path, chosen.light_size) for path in chosen.files]
+    options.tell(found, "\n".join(map(_text, found)), as_json=chosen.as_json)
+
+
+def about(path: Path, light_size: int) -> dict[str, Any]:
+    """What a file or folder holds, as JSON.
+
+    Raises:
+        ValueError: It is of no known kind, or damaged.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = {"path": str(path), **_about(path, light_size)}
+    if caught:
+        found["left_out"] = [str(each.message) for each in caught]
+    return found
+
+
+def _about(path: Path, light_size: int) -> dict[str, Any]:
+    if path.is_dir():
+        return _folder(path)
+    kind = inputs.kind(path)
+    if kind == "mesh":
+        return _scene(path)
+    if kind == "light":
+        return _light(path, light_size)
+    return _brdf(path)
+
+
+def _scene(path: Path) -> dict[str, Any]:
+    scene = load_scene(path)
+    low, high = (np.asarray(each, float).tolist() for each in bounds(scene.mesh))
+    parts = [
+        {
+            "name": part.name,
+            "vertices": len(part.mesh.position),
+            "triangles": len(part.mesh.face),
+            "texture_coordinates": part.mesh.texture is not None,
+            "vertex_colors": part.color is not None,
+            "material": materials.describe(part.material),
+        }
+        for part in scene.parts
+    ]
+    cameras = [
+        {
+            "eye": np.asarray(each.eye, float).tolist(),
+            "target": np.asarray(each.target, float).tolist(),
+            "field_of_view_degrees": float(np.degrees(each.field_of_view)),
+        }
+        for each in scene.cameras
+    ]
+    total = {name: sum(part[name] for part in parts) for name in ("vertices", "triangles")}
+    return {"kind": "scene", **total, "bounds": [low, high], "parts": parts, "cameras": cameras}
+
+
+def _light(path: Path, size: int) -> dict[str, Any]:
+    image, attributes = read_image(path)
+    light = np.asarray(load_environment(path, size=size).radiance, float)
+    solid = np.asarray(cubemap.solid_angle(size=size), float)
+    power = np.sort((light @ _LUMINANCE * solid).ravel())[::-1]
+    total = power.sum()
+    colors = image[..., : 3 if image.shape[-1] > 2 else 1]
+    return {
+        "kind": "environment",
+        "pixels": [image.shape[1], image.shape[0]],
+        "channels": image.shape[2],
+        "layout": attributes.get("envmap", "by its shape"),
+        "radiance": {"least": float(colors.min()), "most": float(colors.max())},
+        "negative_pixels": int((colors < 0).any(-1).sum()),
+        "mean_radiance": (np.einsum("fijc,fij->c", light, solid) / (4 * math.pi)).tolist(),
+        "texels": [6, size, size],
+        "brightest_share": {str(n): float(power[:n].sum() / total) if total else 0.0 for n in _BRIGHTEST},
+    }
+
+
+def _brdf(path: Path) -> dict[str, Any]:
+    """A file of BRDFs, told by its content."""
+    with path.open("rb") as file:
+        start = file.read(4096)
+    if start.startswith(_MERL):
+        table = brdf.load_merl(path)
+        return {"kind": "brdf", "form": "merl", "brdf": materials.describe(table), "use": f"merl:{path}"}
+    if path.suffix.lower() == ".bin" and path.with_name("merl_npf_materials.txt").exists():
+        names = path.with_name("merl_npf_materials.txt").read_text(encoding="utf-8").split()
+        brdf.load_npf(path, names[0])
+        return _named("npf", path, names)
+    text = start.decode("utf-8", errors="replace")
+    if path.suffix.lower() == ".json":
+        try:
+            names = list(json.loads(path.read_text())["materials"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} must be JSON with materials, got {error!r}") from error
+        brdf.load_lafortune(path, names[0])
+        return _named("lafortune", path, names)
+    if "Aggregate(Lambertian(" in text:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        names = [found[1] for found in (re.match(r"([\w-]+) *= *Aggregate", each) for each in lines) if found]
+        found = _named("ngan", path, names)
+        try:
+            return {**found, "model": type(brdf.load_ngan(path, names[0])).__name__}
+        except ValueError as error:
+            return {**found, "use": None, "model": str(error)}
+    if path.suffix.lower() == ".brdf":
+        samples = len(brdf.scattered.read_scattered(path)[0])
+        return {"kind": "brdf", "form": "scattered", "samples": samples, "use": f"scattered:{path}"}
+    known = ", ".join((*inputs.SUFFIXES, *inputs.LIGHTS))
+    raise ValueError(
+        f"{path} must be a mesh or an environment ({known}), a BRDF (MERL, NPF beside merl_npf_materials.txt, JSON of "
+        "Lafortune's model, fits of BBM, scattered .brdf), or a folder of jaxprt; got another file"
+    )
+
+
+def _named(form: str, path: Path, names: list[str]) -> dict[str, Any]:
+    return {"kind": "brdf", "form": form, "materials": names, "use": f"{form}:{path},material={names[0]}"}
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    """A saved object, a store of blocks, or a folder that has some of either."""
+    nbytes = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+    if (path / "object.json").exists():
+        header = _json(path / "object.json")
+        tree = json.loads(header["content"])["tree"]
+        what = tree.get("class", next(iter(tree), "value")).rpartition(":")[2]
+        return {"kind": "object", "holds": what, "bytes": nbytes}
+    if (path / "store.json").exists():
+        header = _json(path / "store.json")
+        done = np.load(path / "checksum.npy", mmap_mode="r")[: header["blocks"]]
+        finished = int(np.count_nonzero(done))
+        shapes = {name: each[:-1] for name, each in header["shapes"].items()}
+        system = header.get("system", "blocks")
+        return {
+            "kind": "store",
+            "holds": system,
+            "bytes": nbytes,
+            "blocks": header["blocks"],
+            "finished": finished,
+            "blocks_of": shapes,
+        }
+    inside = sorted({each.parent for name in ("object.json", "store.json") for each in path.rglob(name)})
+    if not inside:
+        raise ValueError(f"{path} must be a folder that jaxprt wrote, got one without saved objects and stores")
+    return {"kind": "folder", "bytes": nbytes, "inside": [{"path": str(each), **_folder(each)} for each in inside]}
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: it must be JSON, got {error}") from error
+
+
+def _text(found: dict[str, Any], indent: str = "") -> str:
+    """What was found, in words."""
+    rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(found["kind"], _folder_rows)(
+        found
+    )
+    rows = [f"{indent}{found['path']}: {rows[0]}", *(f"{indent}  {row}" for row in rows[1:])]
+    rows += [f"{indent}  left out: {each}" for each in found.get("left_out", [])]
+    return "\n".join([*rows, *(_text(each, f"{indent}  ") for each in found.get("inside", []))])
+
+
+def _scene_rows(found: dict[str, Any]) -> list[str]:
+    (low, high), cameras = found["bounds"], len(found["cameras"])
+    size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
+    rows = [
+        f"scene of {len(found['parts'])} parts, {found['vertices']} vertices, {found['triangles']} triangles, "
+        f"{size} units, {cameras} cameras"
+    ]
+    for number, part in enumerate(found["parts"]):
+        own = part["material"]
+        values = [f"{name} {_value(value)}" for name, value in own.items() if name != "model" and _matters(name, value)]
+        rows.append(
+            f"{number} {part['name']!r}: {part['vertices']} vertices, {part['triangles']} triangles, "
+            f"{own['model']}({', '.join(values)})"
+        )
+    for number, camera in enumerate(found["cameras"]):
+        eye = _value(camera["eye"])
+        rows.append(f"camera {number}: at {eye}, {camera['field_of_view_degrees']:.4g} degrees high")
+    return rows
+
+
+def _matters(name: str, value: Any) -> bool:
+    """Whether a number of a material is not the default one of glTF."""
+    default = {key: each for key, each in materials.describe(TexturedMaterial()).items() if key != "model"}
+    return name not in default or not np.array_equal(value, default[name])
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return "/".join(map(_value, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _light_rows(found: dict[str, Any]) -> list[str]:
+    width, height = found["pixels"]
+    least, most = found["radiance"].values()
+    shares = ", ".join(f"{n}: {100 * share:.1f} %" for n, share in found["brightest_share"].items())
+    size = found["texels"][1]
+    return [
+        f"environment of {width} x {height} pixels, {found['channels']} channels, layout {found['layout']}",
+        f"radiance from {least:.4g} to {most:.4g}, mean over the sphere {_value(found['mean_radiance'])}",
+        f"share of the light in the brightest of 6 x {size} x {size} texels: {shares}",
+    ]
+
+
+def _brdf_rows(found: dict[str, Any]) -> list[str]:
+    names, rows = found.get("materials", []), []
+    if found["form"] == "scattered":
+        rows.append(f"scattered measurements, {found['samples']} samples")
+    elif names:
+        rows.append(
+            f"BRDFs ({found['form']}) of {len(names)} materials: {', '.join(names[:_NAMES])}"
+            f"{', ..' if len(names) > _NAMES else ''}"
+        )
+        rows += [f"model: {found['model']}"] if "model" in found else []
+    else:
+        rows.append(f"BRDF (MERL), {100 * found['brdf']['filled']:.1f} % of its cells above the horizon filled")
+    return [*rows, f"use: --brdf {found['use']}"] if found["use"] else rows
+
+
+def _folder_rows(found: dict[str, Any]) -> list[str]:
+    if found["kind"] == "folder":
+        return [f"folder of {len(found['inside'])} objects and stores, {found['bytes']:,} bytes"]
+    rows = f"{found['kind']} of {found['holds']}, {found['bytes']:,} bytes"
+    return [f"{rows}, {found['finished']} of {found['blocks']} blocks are finished" if "blocks" in found else rows]

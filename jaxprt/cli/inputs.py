@@ -1,0 +1,189 @@
+"""What commands are given: files told apart, scenes, lights and cameras made of them."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.cli.report import View
+from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
+from jaxprt.scene import mesh as meshes
+from jaxprt.scene.camera import orbit
+from jaxprt.scene.environment import rotate
+from jaxprt.scene.formats.mesh_file import SUFFIXES
+from jaxprt.scene.scene import numbered
+
+# Turns that bring an axis of the file to +y.
+UPRIGHT = {
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+}
+LIGHTS = (".exr", ".hdr", ".pic")
+_LIGHT_STARTS = (b"\x76\x2f\x31\x01", b"#?RADIANCE", b"#?RGBE")
+_SIZE = 64
+_PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
+
+
+def kind(path: Path) -> str:
+    """Whether a file is a "mesh" or a "light", by its suffix or else by its first bytes; "" for neither."""
+    suffix = path.suffix.lower()
+    if suffix in LIGHTS:
+        return "light"
+    if suffix in SUFFIXES:
+        return "mesh"
+    if path.is_file():
+        with path.open("rb") as file:
+            return "light" if file.read(16).startswith(_LIGHT_STARTS) else ""
+    return ""
+
+
+def told_apart(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Meshes and environments among files.
+
+    Raises:
+        ValueError: A file is neither.
+    """
+    found = [(kind(path), path) for path in files]
+    for each, path in found:
+        if not each:
+            known = ", ".join((*SUFFIXES, *LIGHTS))
+            raise ValueError(f"files must be meshes and environments, which end in one of {known}; got {path}")
+    return [path for each, path in found if each == "mesh"], [path for each, path in found if each == "light"]
+
+
+def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
+    """The scene of the files, upright, with the materials that are asked for; the embedded one without meshes.
+
+    Args:
+        options: With `files`, `up`, `ground`, `brdf` and `material`.
+        playable: Whether parts without a material of their own are plastic, and others have materials that can change.
+
+    Raises:
+        ValueError: A file is none of a scene, a ground is asked for without a mesh, or there is no such part.
+    """
+    paths, _ = told_apart(options.files)
+    if not paths and options.ground:
+        raise ValueError("--ground needs a mesh: the embedded scene has a board")
+    made = _loaded(paths, options, playable) if paths else embedded(options.brdf, playable=playable)
+    parts = list(made.parts)
+    for name, material in options.material:
+        number = _number([part.name for part in parts], name)
+        parts[number] = dataclasses.replace(parts[number], material=material)
+    return Scene(parts, cameras=made.cameras)
+
+
+def embedded(brdf: Any = None, *, playable: bool = False) -> Scene:
+    """Chess pieces on a board."""
+    pieces, light, dark = meshes.split(builtin.chess())
+    matte = _matte if playable else Lambert
+    return Scene(
+        [
+            Part("pieces", pieces, brdf or (_PLASTIC if playable else AshikhminShirley())),
+            Part("light squares", light, matte((0.6, 0.55, 0.45))),
+            Part("dark squares", dark, matte((0.12, 0.08, 0.06))),
+        ]
+    )
+
+
+def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environment]:
+    """Lights by the names of their files, or the two embedded ones, turned.
+
+    Args:
+        options: With `files`, `turn` and `light_size`.
+        size: Texels along the edge of their faces where none is asked for.
+
+    Raises:
+        ValueError: The size is no power of two, or a file is no environment.
+    """
+    _, paths = told_apart(options.files)
+    size = options.light_size or size
+    if size & (size - 1):
+        raise ValueError(f"--light-size must be a power of two, got {size}")
+    if paths:
+        names = unique([path.stem for path in paths])
+        found = {name: load_environment(path, size=size) for name, path in zip(names, paths, strict=True)}
+    else:
+        found = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
+    angles = options.turn
+    if len(angles) == 1:
+        return {name: turned(light, angles[0]) for name, light in found.items()}
+    return {f"{name}_{angle:g}": turned(light, angle) for name, light in found.items() for angle in angles}
+
+
+def unique(names: Sequence[str]) -> list[str]:
+    """Names with numbers where they are the same."""
+    result: list[str] = []
+    for name in names:
+        every = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+        result.append(next(each for each in every if each not in result))
+    return result
+
+
+def turned(light: Environment, degrees: float) -> Environment:
+    """A light turned about the vertical, counterclockwise as seen from above."""
+    if degrees % 360 == 0:
+        return light
+    return rotate(light, about(float(np.radians(degrees))))
+
+
+def about(angle: float) -> Any:
+    """The turn about the vertical by an angle in radians, from +z towards +x."""
+    c, s = np.cos(angle), np.sin(angle)
+    return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
+
+
+def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
+    """The scene, its lights, and a camera around what is not ground."""
+    looked, lit = scene(options), lights(options, size=size)
+    azimuth, elevation = np.radians([options.azimuth, options.elevation])
+    # The board of the embedded scene, and the ground, may reach beyond the picture.
+    alone = not told_apart(options.files)[0]
+    shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
+    edge = {"width": options.size, "height": options.size}
+    return View(looked, lit, orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge))
+
+
+def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
+    """The files' scenes as one, upright, on a ground if one is asked for."""
+    turn, every = np.array(UPRIGHT[options.up]), [load_scene(path) for path in paths]
+    parts = [part for each in every for part in each.parts]
+    names = numbered([part.name for part in parts])
+    if options.up != "y":
+        parts = [eqx.tree_at(lambda each: each.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
+    if playable:
+        parts = [_playable(part) for part in parts]
+    if options.brdf is not None:  # colors of vertices are of the material that the file has
+        parts = [Part(part.name, part.mesh, options.brdf) for part in parts]
+    parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
+    if options.ground:
+        matte: Callable = _matte if playable else Lambert
+        name = numbered([*names, "ground"])[-1]
+        parts.append(Part(name, meshes.ground_plane(Scene(parts).mesh), matte(0.5)))
+    return Scene(parts, cameras=every[0].cameras if options.up == "y" else ())
+
+
+def _number(names: Sequence[str], name: str) -> int:
+    """The number of the part of a name, or of a number."""
+    if name in names:
+        return names.index(name)
+    if name.isdecimal() and int(name) < len(names):
+        return int(name)
+    known = ", ".join(f"{number} {each!r}" for number, each in enumerate(names))
+    raise ValueError(f"--material must name a part, which are {known}; got {name!r}")
+
+
+def _playable(part: Part) -> Part:
+    """A part without a material of its own is plastic, so that there is something to play with."""
+    return dataclasses.replace(part, material=_PLASTIC) if eqx.tree_equal(part.material, _matte(0.5)) else part
+
+
+def _matte(color: float | tuple[float, ...]) -> TexturedMaterial:
+    return TexturedMaterial(base_color=color, metallic=0.0, specular=0.0)

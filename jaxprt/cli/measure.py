@@ -1,0 +1,129 @@
+"""Measures scenes, and fits of BRDFs: `jaxprt measure`."""
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import click
+
+from jaxprt.cli import inputs, materials, options, report, sizes
+from jaxprt.cli.options import option
+from jaxprt.cli.report import View
+from jaxprt.relit import RelitScene
+from jaxprt.relit.build import precompute
+from jaxprt.relit.measuring import Report
+from jaxprt.scene import Part, Scene, builtin
+from jaxprt.scene.camera import orbit
+
+_SYSTEMS = ("planned", *sizes.NAMES)
+_RINGS, _SECTORS = 24, 36
+_VERTICES = 300
+
+
+@click.command(cls=options.Command, short_help="Errors, times and bytes of a scene or of a BRDF's fit.")
+@options.scene
+@options.light
+@options.systems(_SYSTEMS, default=None, words="One or several.  [default: lobe]")
+@option(
+    "--error",
+    group="System",
+    type=options.Finite(0.0, 1.0, open=True),
+    metavar="E",
+    default=0.05,
+    show_default=True,
+    help="Relative error that the planned system must meet.",
+)
+@options.bounces
+@options.recipe
+@option(
+    "--fit",
+    type=options.Material(),
+    group="Fit",
+    metavar="MATERIAL",
+    help="Measure how well lobe, harmonic and separable hold this BRDF by their sizes, on a sphere, without meshes.",
+)
+@options.folder("Folder that keeps what was precomputed, for later runs.")
+@options.as_json
+def command(**given: Any) -> None:
+    """Measure errors, times and bytes of a scene by each system, or of the fit of a BRDF.
+
+    Errors are relative L2 errors of direct light against the exact sum: of pixels of pictures from three sides, and of
+    vertices from eight. Times and bytes are those of all light.
+
+    \b
+    Examples:
+      jaxprt measure scene.glb grace.hdr --system lobe,harmonic
+      jaxprt measure scene.glb grace.hdr --system planned --error 0.03 --output kept --json
+      jaxprt measure --fit merl:gold-metallic-paint.binary grace.hdr
+      jaxprt measure --fit ward:along=.1,across=.3 --system lobe
+    """  # noqa: D301
+    chosen = SimpleNamespace(**given)
+    with options.telling(chosen.as_json):
+        found, text = _scene(chosen) if chosen.fit is None else _fit(chosen)
+    options.tell(found, text, as_json=chosen.as_json)
+
+
+def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
+    """The reports of a scene by each system."""
+    scene, lights = inputs.scene(chosen), inputs.lights(chosen)
+    sizes.check(chosen, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
+    made, texts = {}, []
+    for system in chosen.system or ("lobe",):
+        recipes = {"planned": None} if system == "planned" else sizes.recipes(system, chosen)
+        for name, recipe in recipes.items():
+            ready = prepared(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)
+            found = ready.report(list(lights.values()))
+            made[name] = described(found, list(lights))
+            texts.append(f"{name}, in the light of {', '.join(lights)}:\n{found}")
+    return {"lights": list(lights), "systems": made}, "\n".join(texts)
+
+
+def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNamespace, path: Any) -> RelitScene:
+    """The scene, made ready by a recipe, or by a plan for None."""
+    more: dict[str, Any] = {"system": recipe, "size": next(iter(lights.values())).radiance.shape[-2]}
+    if recipe is None:
+        more = {"error": chosen.error, "environments": list(lights.values())}
+    return precompute(scene, bounces=chosen.bounces, path=path, progress=sys.stderr.isatty(), **more)
+
+
+def described(found: Report, lights: list[str]) -> dict[str, Any]:
+    """A report as JSON."""
+
+    def errors(values: Any) -> dict[str, float]:
+        return {name: float(value) for name, value in zip(lights, values, strict=True)}
+
+    return {
+        "parts": [
+            {
+                "name": part.name,
+                "vertices": part.vertices,
+                "pixel_error": errors(part.errors),
+                "vertex_error": errors(part.vertex_errors),
+                "bytes": int(part.nbytes),
+            }
+            for part in found.part
+        ],
+        "pixel_error": errors(found.errors),
+        "pixel_uncertainty": errors(found.uncertainty),
+        "light_seconds": float(found.light_seconds),
+        "view_seconds": float(found.view_seconds),
+        "bytes": int(found.nbytes),
+    }
+
+
+def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
+    """Errors, times and bytes of a BRDF on a sphere, by each system's sizes."""
+    if inputs.told_apart(chosen.files)[0]:
+        raise click.UsageError("--fit takes environments alone, got a mesh: give it --brdf in place of --fit")
+    systems = chosen.system or tuple(report.TABLES)
+    unknown = [system for system in systems if system not in report.TABLES]
+    if unknown:
+        raise click.UsageError(f"--fit needs --system {', '.join(report.TABLES)}, got {unknown[0]}")
+    lights = inputs.lights(chosen)
+    scene = Scene([Part("sphere", builtin.sphere(rings=_RINGS, sectors=_SECTORS), chosen.fit)])
+    view = View(scene, lights, orbit(scene.mesh, azimuth=0.5, elevation=0.3))
+    vertex = report.sample(view, _VERTICES)
+    right = report.exact_vertices(view, [vertex])[0]
+    rows = [row for system in systems for row in report.table(system, view, vertex, right)]
+    found = {"material": materials.describe(chosen.fit), "vertices": len(vertex), "rows": rows}
+    return found, "\n".join(map(report.row_text, rows))

@@ -1,0 +1,354 @@
+"""Options that several commands share, in groups, and how their results are told."""
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from jaxprt.cli import inputs, materials, sizes
+
+_PATH: Any = click.Path(path_type=Path)
+
+
+class Command(click.Command):
+    """A command whose help has its options in groups."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Writes a section for each group, in the order of the options."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for each in self.get_params(ctx):
+            record = each.get_help_record(ctx) if isinstance(each, click.Option) else None
+            if record is not None:
+                groups.setdefault(getattr(each, "group", "Options"), []).append(record)
+        for name, records in groups.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+
+
+class Option(click.Option):
+    """An option of a group."""
+
+    def __init__(self, *names: Any, group: str = "Options", **more: Any):
+        """Takes the group beside what click takes."""
+        super().__init__(*names, **more)
+        self.group = group
+
+
+class Finite(click.ParamType):
+    """A number in a range, which NaN and infinity are not."""
+
+    name = "number"
+
+    def __init__(self, least: float | None = None, most: float | None = None, *, open: bool = False):
+        """Takes the ends of the range, which `open` leaves out."""
+        self._range = click.FloatRange(least, most, min_open=open, max_open=open)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number.
+
+        Raises:
+            click.UsageError: It is none, or out of the range.
+        """
+        number = self._range.convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
+
+class Several(click.ParamType):
+    """Values with commas between them."""
+
+    def __init__(self, each: click.ParamType):
+        """Takes the type of each value."""
+        self.each, self.name = each, each.name
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """What help and usage call the values."""
+        choices = getattr(self.each, "choices", None)
+        return f"[{'|'.join(choices)}],.." if choices else "N,.."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple:
+        """The values, each once."""
+        if isinstance(value, tuple):
+            return value
+        return tuple(dict.fromkeys(self.each(each.strip(), param, ctx) for each in str(value).split(",")))
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Completes the last of the values."""
+        before, comma, last = incomplete.rpartition(",")
+        return [
+            CompletionItem(f"{before}{comma}{each.value}", each.type, each.help)
+            for each in self.each.shell_complete(ctx, param, last)
+        ]
+
+
+class Bounces(click.ParamType):
+    """How many times light is reflected: a whole number, or "all"."""
+
+    name = "N|all"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """The number, or the word.
+
+        Raises:
+            click.UsageError: It is neither.
+        """
+        if value != "all" and not str(value).isdecimal():
+            self.fail(f'must be a whole number of at least 0, or "all", got {value!r}', param, ctx)
+        return value if value == "all" else int(value)
+
+
+class Material(click.ParamType):
+    """A material by its name and numbers, or by a file."""
+
+    name = "material"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The material.
+
+        Raises:
+            click.UsageError: There is none of this kind.
+        """
+        try:
+            return materials.parse(value) if isinstance(value, str) else value
+        except (ValueError, OSError) as error:
+            self.fail(said(error), param, ctx)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Completes the name, then its parameters."""
+        name, colon, rest = incomplete.partition(":")
+        if not colon:
+            names = dict.fromkeys([*materials.MODELS, *materials.FILES])
+            return [CompletionItem(f"{each}:") for each in names if each.startswith(name)]
+        before, comma, last = rest.rpartition(",")
+        known = materials.parameters(name) if name in materials.MODELS else {}
+        return [CompletionItem(f"{name}:{before}{comma}{each}=") for each in known if each.startswith(last)]
+
+
+class OfPart(Material):
+    """A material for a part: PART=MATERIAL."""
+
+    name = "part=material"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The part and its material.
+
+        Raises:
+            click.UsageError: It is not of this form, or there is no such material.
+        """
+        if not isinstance(value, str):
+            return value
+        try:
+            part, material = materials.of_part(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+        return part, super().convert(material, param, ctx)
+
+
+def said(error: Exception) -> str:
+    """What an error says, without numbers of the operating system."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def option(*names: str, group: str, **more: Any) -> Callable:
+    """A decorator that adds an option of a group."""
+    return click.option(*names, cls=Option, group=group, **more)
+
+
+def together(*decorators: Callable) -> Callable:
+    """Several decorators as one, the first on top."""
+
+    def decorate(function: Callable) -> Callable:
+        for each in reversed(decorators):
+            function = each(function)
+        return function
+
+    return decorate
+
+
+scene = together(
+    click.argument("files", metavar="[FILE]...", type=click.Path(exists=True, path_type=Path), nargs=-1),
+    option(
+        "--up",
+        group="Scene",
+        type=click.Choice(list(inputs.UPRIGHT)),
+        default="y",
+        show_default=True,
+        help="Axis of the meshes that points up.",
+    ),
+    option("--ground", group="Scene", is_flag=True, help="Stand the meshes on a diffuse ground plane."),
+    option(
+        "--brdf",
+        group="Scene",
+        type=Material(),
+        metavar="MATERIAL",
+        help="For all meshes, in place of the files' materials, such as ward:along=.1,across=.3 or merl:FILE.",
+    ),
+    option(
+        "--material",
+        group="Scene",
+        type=OfPart(),
+        multiple=True,
+        metavar="PART=MATERIAL",
+        help="For one part, by its name or by its number from 0.",
+    ),
+)
+light = together(
+    option(
+        "--turn",
+        group="Light",
+        type=Several(Finite()),
+        default="0",
+        metavar="DEGREES,..",
+        help="Turn the lights about the vertical, counterclockwise as seen from above; each light at each angle.",
+    ),
+    option(
+        "--light-size",
+        group="Light",
+        type=click.IntRange(1, 1024),
+        metavar="N",
+        help="Texels along the edge of the light's cubemap faces, a power of two.  [default: 64]",
+    ),
+)
+camera = together(
+    option(
+        "--azimuth",
+        group="Camera",
+        type=Finite(),
+        default=20.0,
+        metavar="DEGREES",
+        show_default=True,
+        help="Degrees from +z towards +x.",
+    ),
+    option(
+        "--elevation",
+        group="Camera",
+        type=Finite(-90.0, 90.0),
+        default=15.0,
+        metavar="DEGREES",
+        show_default=True,
+        help="Degrees above the horizon, from -90 to 90.",
+    ),
+    option(
+        "--size",
+        group="Camera",
+        type=click.IntRange(1, 8192),
+        metavar="N",
+        default=512,
+        show_default=True,
+        help="Edge of the pictures in pixels.",
+    ),
+)
+few_sizes = together(
+    option(
+        "--lobes",
+        group="Sizes",
+        type=Several(click.IntRange(1, 64)),
+        metavar="N,..",
+        help="Lobes of each BRDF of lobe; several systems if several.  [default: 12]",
+    ),
+    option(
+        "--texels",
+        group="Sizes",
+        type=click.IntRange(0),
+        metavar="N",
+        help="Brightest texels that lobe and clusters sum (16).",
+    ),
+    option(
+        "--order",
+        group="Sizes",
+        type=click.IntRange(1, 15),
+        metavar="N",
+        default=5,
+        show_default=True,
+        help="Bands of harmonic; its coefficients are the square.",
+    ),
+    option(
+        "--window",
+        group="Sizes",
+        type=click.Choice(list(sizes.LAPLACIAN)),
+        default="laplacian",
+        show_default=True,
+        help="Of harmonic, against ringing on glossy parts.",
+    ),
+)
+_more_sizes = together(
+    option(
+        "--terms",
+        group="Sizes",
+        type=click.IntRange(1),
+        metavar="N",
+        help="BRDF terms of separable (default 4) and clusters (32).",
+    ),
+    option(
+        "--keep",
+        group="Sizes",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Wavelet coefficients of each vertex and term of separable (96), or each cluster of clusters (768).",
+    ),
+    option(
+        "--components",
+        group="Sizes",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Principal components along the vertices of each cluster of clusters (16).",
+    ),
+    option(
+        "--modes",
+        group="Sizes",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Principal components along the light of each cluster of clusters (80).",
+    ),
+)
+recipe = together(few_sizes, _more_sizes)
+bounces = option(
+    "--bounces", group="System", type=Bounces(), help='How often parts reflect light onto each other, or "all".'
+)
+as_json = option("--json", "as_json", group="Output", is_flag=True, help="Print the result as JSON on stdout.")
+
+
+def systems(names: Sequence[str], *, default: str | None, words: str) -> Callable:
+    """The option that names systems."""
+    return option("--system", group="System", type=Several(click.Choice(list(names))), default=default, help=words)
+
+
+def folder(words: str, *, default: str | None = None) -> Callable:
+    """The option that names a folder to make."""
+    shown: Any = default is not None
+    return option("--output", group="Output", type=_PATH, default=default, show_default=shown, help=words)
+
+
+@contextlib.contextmanager
+def telling(result: bool) -> Iterator[None]:
+    """Sends all that is said meanwhile to stderr where stdout is for the result as JSON."""
+    if not result:
+        yield
+        return
+    with contextlib.redirect_stdout(sys.stderr):
+        yield
+
+
+def tell(result: Any, text: str, *, as_json: bool) -> None:
+    """Prints a result: as JSON, or as text."""
+    click.echo(json.dumps(finite(result), indent=2, allow_nan=False) if as_json else text)
+
+
+def finite(value: Any) -> Any:
+    """A value as JSON has it: null for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

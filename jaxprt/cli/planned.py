@@ -1,0 +1,102 @@
+"""Plans scenes: `jaxprt plan`."""
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import click
+
+from jaxprt.cli import inputs, options, relight
+from jaxprt.cli.options import option
+from jaxprt.files import objects
+from jaxprt.relit.planning import Plan, key_of, plan
+
+
+@click.command(cls=options.Command, short_help="The smallest system that meets an error.")
+@options.scene
+@options.light
+@option(
+    "--error",
+    group="Plan",
+    type=options.Finite(0.0, 1.0, open=True),
+    metavar="E",
+    default=0.05,
+    show_default=True,
+    help="Relative L2 error of the radiance of each part.",
+)
+@option(
+    "--rate",
+    group="Plan",
+    type=options.Finite(0.0, open=True),
+    metavar="FPS",
+    default=30.0,
+    show_default=True,
+    help="Frames per second with new light and new view, without drawing.",
+)
+@options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and what was measured.")
+@options.as_json
+def command(**given: Any) -> None:
+    """Choose for each part of a scene the system and the sizes that meet an error with the fewest bytes.
+
+    The table has a row for each candidate that was measured on a sample of the vertices: error, time of a frame, bytes,
+    time of precomputation. A star marks the choice.
+
+    \b
+    Examples:
+      jaxprt plan scene.glb grace.hdr --error 0.02
+      jaxprt plan scene.glb grace.hdr uffizi.hdr --error 0.05 --rate 60 --output kept
+      jaxprt relight scene.glb grace.hdr --plan kept
+      jaxprt plan bunny.ply --brdf ggx:roughness=.2 --json > plan.json
+    """  # noqa: D301
+    chosen = SimpleNamespace(**given)
+    with options.telling(chosen.as_json):
+        found = _plan(chosen)
+    options.tell(described(found), str(found), as_json=chosen.as_json)
+
+
+def _plan(chosen: SimpleNamespace) -> Plan:
+    scene, lights = inputs.scene(chosen), list(inputs.lights(chosen).values())
+    kept = None
+    if chosen.output is not None:
+        relight.make_folder(chosen.output)
+        kept = chosen.output / "plan"
+        if kept.exists():
+            found = relight.saved(chosen.output)
+            if (found.key, found.asked, found.rate) == (key_of(scene, lights), chosen.error, chosen.rate):
+                return found
+            raise ValueError(f"{kept} was made for another scene, lights, error or rate: name another --output")
+    candidates = None if chosen.output is None else chosen.output / "candidates"
+    options_ = {"error": chosen.error, "rate": chosen.rate, "path": candidates, "progress": sys.stderr.isatty()}
+    made = plan(scene, environments=lights, **options_)
+    if kept is not None:
+        objects.save(kept, made)
+    return made
+
+
+def described(found: Plan) -> dict[str, Any]:
+    """A plan as JSON."""
+
+    def candidate(each: Any) -> dict[str, Any]:
+        sizes = {"system": type(each.recipe).__name__, **vars(each.recipe)}
+        numbers = {"error": each.error, "seconds": each.seconds, "bytes": each.nbytes}
+        numbers["precompute_seconds"] = each.precompute_seconds
+        return {"recipe": sizes, **{name: float(value) for name, value in numbers.items()}}
+
+    return {
+        "asked": {"error": found.asked, "rate": found.rate, "light_size": found.size},
+        "parts": [
+            {
+                "name": each.name,
+                "vertices": each.vertices,
+                "mesh_error": float(each.mesh_error),
+                "reflected": [float(share) for share in found.reflected[:, number]],
+                "chosen": candidate(each.chosen),
+                "considered": [candidate(one) for one in each.considered],
+            }
+            for number, each in enumerate(found.part)
+        ],
+        "bounces": found.bounces,
+        "error": float(found.error),
+        "seconds": float(found.seconds),
+        "bytes": float(found.nbytes),
+    }

@@ -1,0 +1,294 @@
+"""Relights scenes and measures the pictures: `jaxprt relight`."""
+
+import json
+import os
+import platform
+import resource
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import jax
+import numpy as np
+
+import jaxprt
+from jaxprt.cli import animation, inputs, materials, options, report, sizes
+from jaxprt.cli.options import option
+from jaxprt.cli.report import Made, View
+from jaxprt.relit.planning import Plan
+from jaxprt.visibility import blocks
+
+SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
+_ERROR = 0.05
+
+
+@click.command(cls=options.Command, short_help="Pictures of a scene in lights, with their errors.")
+@options.scene
+@options.light
+@options.camera
+@options.systems(SYSTEMS, default=None, words="One or several, which stand side by side. [default: planned]")
+@option(
+    "--error",
+    group="System",
+    type=options.Finite(0.0, 1.0, open=True),
+    metavar="E",
+    help="Relative error that the planned system must meet.  [default: 0.05]",
+)
+@option(
+    "--plan",
+    "saved",
+    group="System",
+    type=click.Path(exists=True, path_type=Path, file_okay=False),
+    help="Folder of `jaxprt plan`: relight by its plan.",
+)
+@options.bounces
+@options.recipe
+@option(
+    "--animate",
+    group="Output",
+    type=click.IntRange(2),
+    metavar="N",
+    help="Write N pictures while light, view and materials change (dynamic).",
+)
+@option(
+    "--table",
+    group="Output",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Add errors of each system by its sizes, on N vertices of the first part.",
+)
+@option("--part", group="Output", metavar="K/N", help="Only precompute the K-th of N parts into a shared --output.")
+@options.folder("For pictures, report.json and what was precomputed.", default="output")
+@options.as_json
+def command(**given: Any) -> None:
+    """Relight a scene in one or several lights, and measure the pictures.
+
+    FILEs are meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR), in any order. Without
+    meshes there are chess pieces, without environments daylight and a studio.
+
+    The output folder gets a picture for each light and system, the exact picture, differences, and report.json.
+    What is precomputed is kept there: the same command goes on where it was stopped.
+
+    \b
+    Examples:
+      jaxprt relight scene.glb grace.hdr --error 0.05 --output out/
+      jaxprt relight bunny.ply grace.hdr uffizi.hdr --ground --brdf ashikhmin-shirley:nu=10,nv=100
+      jaxprt relight bunny.ply grace.hdr --system lobe,harmonic --bounces all --turn 0,120,240
+      jaxprt relight bunny.ply grace.hdr --ground --system dynamic --material 0=cook-torrance:roughness=.2 --animate 60
+      jaxprt relight scene.glb --system lobe --output shared --part 3/16
+    """  # noqa: D301
+    chosen = SimpleNamespace(**given)
+    with options.telling(chosen.as_json):
+        found = _run(chosen)
+    if found is not None:
+        options.tell(found, _text(found, chosen.output / "report.json"), as_json=chosen.as_json)
+
+
+def _run(chosen: SimpleNamespace) -> dict[str, Any] | None:
+    """Draws and measures everything; None where only a part is computed."""
+    systems, part = _systems(chosen), _part(chosen.part)
+    plan = saved(chosen.saved) if chosen.saved is not None else None
+    view = inputs.view(chosen, size=64 if plan is None else plan.size)
+    sizes.check(chosen, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
+    make_folder(chosen.output)
+    if part is not None:
+        _share(view, chosen, systems, plan, part)
+        return None
+    found = _describe(view, chosen)
+    names = ", ".join(f"{each.name} {len(each.mesh.position)}" for each in view.scene.parts)
+    click.echo(f"jaxprt {found['machine']['jaxprt']}: {names} vertices")
+    _warn_of_backs(view)
+    made, changing = {}, None
+    for system in systems:
+        if system == "dynamic":
+            count = 2 if chosen.bounces is None else chosen.bounces
+            terms = chosen.terms or 4
+            changing = animation.prepare(view, chosen.output, terms=terms, reflections=count)
+            made[system] = animation.made(changing, view)
+        else:
+            made |= _made(system, view, chosen, plan)
+    found["precompute"] = {system: each.cost for system, each in made.items()}
+    _draw(found, view, made, chosen.output)
+    if changing is not None and chosen.animate:
+        animation.animate(changing, view, chosen.output, frames=chosen.animate)
+    found["times"] = {system: report.times(view, each) for system, each in made.items()}
+    if chosen.table:
+        vertex = report.sample(view, chosen.table)
+        right = report.exact_vertices(view, [vertex])[0]
+        tabled = [system for system in systems if system in report.TABLES]
+        found["table"] = [row for system in tabled for row in report.table(system, view, vertex, right)]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
+    (chosen.output / "report.json").write_text(json.dumps(options.finite(found), indent=2) + "\n")
+    return found
+
+
+def _draw(found: dict[str, Any], view: View, made: dict[str, Made], output: Path) -> None:
+    """Writes all pictures, and adds their errors to the report."""
+    drawn = report.draw(view, made)
+    truth = report.exact(view, drawn)
+    found["exact"] = {
+        "seconds": truth.seconds,
+        "pixels": len(truth.pixels.pixel),
+        "picture_width": truth.picture.camera.width,
+        "vertices": {part.name: len(each) for part, each in zip(view.scene.parts, truth.vertex, strict=True)},
+    }
+    found["lights"] = report.compare(view, made, drawn, truth, output)
+    stops = {name: light["exposure_stops"] for name, light in found["lights"].items()}
+    for system, each in made.items():
+        if each.system is not each.direct:
+            for name, fraction in report.reflect(view, system, each, stops, output).items():
+                found["lights"][name][system]["reflected_fraction"] = fraction
+
+
+def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
+    """The systems that are asked for, if the other options fit them."""
+    embedded = not inputs.told_apart(chosen.files)[0]
+    plain = ("separable", "harmonic", "lobe") if embedded and chosen.error is chosen.saved is None else ("planned",)
+    systems = chosen.system or plain
+    for name, value, system in (
+        ("--error", chosen.error, "planned"),
+        ("--plan", chosen.saved, "planned"),
+        ("--animate", chosen.animate, "dynamic"),
+    ):
+        if value is not None and system not in systems:
+            raise click.UsageError(f"{name} needs --system {system}, got {','.join(systems)}")
+    if chosen.error is not None and chosen.saved is not None:
+        raise click.UsageError("--plan has its own error: give --error or --plan, got both")
+    if chosen.part is not None and "dynamic" in systems:
+        raise click.UsageError("--part needs systems other than dynamic")
+    return systems
+
+
+def _part(text: str | None) -> blocks.Part | None:
+    """The part K/N of all blocks that is asked for; None for all of them."""
+    number, _, count = ("1/1" if text is None else text).partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise click.UsageError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
+    return None if text is None else blocks.Part(int(number), int(count))
+
+
+def saved(folder: Path) -> Plan:
+    """The plan in a folder that `jaxprt plan` or a planned run wrote.
+
+    Raises:
+        ValueError: There is none.
+    """
+    inside = folder / "plan"
+    path = inside if inside.is_dir() else folder
+    try:
+        found = report.objects.load(path)
+    except ValueError as error:
+        raise ValueError(f"--plan must be a folder of `jaxprt plan`: {error}") from error
+    if not isinstance(found, Plan):
+        raise ValueError(f"--plan must be a folder of `jaxprt plan`, got a {type(found).__name__} in {path}")
+    return found
+
+
+def make_folder(path: Path) -> None:
+    """Makes the folder of the output, or says what is wrong with it before anything is computed.
+
+    Raises:
+        ValueError: The folder cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--output must be a folder that can be made, got {path}: {error.strerror}") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ValueError(f"--output must be a folder that can be written to, got {path}")
+
+
+def _share(view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Part) -> None:
+    """Computes one part of the blocks, and says what is left to do."""
+    left = []
+    for system in systems:
+        try:
+            _made(system, view, chosen, plan, part)
+        except blocks.UnfinishedError as error:
+            left.append(str(error))
+    click.echo("\n".join(left or ["all parts are done: the same command without --part draws the pictures"]))
+
+
+def _made(
+    system: str, view: View, chosen: SimpleNamespace, plan: Plan | None, part: blocks.Part | None = None
+) -> dict[str, Made]:
+    """The scene, made ready by one system, or by several sizes of it."""
+    output, more = chosen.output, {"executor": part}
+    if system == "planned" and plan is not None:
+        bounces = plan.bounces if chosen.bounces is None else chosen.bounces
+        return {system: report.make(view, plan.recipes, output / system, bounces=bounces, **more)}
+    if system == "planned":
+        error = _ERROR if chosen.error is None else chosen.error
+        return {system: report.plan(view, output / system, error=error, bounces=chosen.bounces, **more)}
+    made = sizes.recipes(system, chosen)
+    # What lobes of any number share is in one folder.
+    return {
+        name: report.make(view, recipe, output / system, bounces=chosen.bounces, **more)
+        for name, recipe in made.items()
+    }
+
+
+def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
+    """What is relit, where and by what: the head of the report."""
+    paths, lights = inputs.told_apart(chosen.files)
+    names = inputs.unique([path.stem for path in lights])
+    return {
+        "machine": {
+            "processor": platform.processor() or platform.machine(),
+            "devices": [str(device) for device in jax.devices()],
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "jaxprt": jaxprt.__version__,
+        },
+        "meshes": [str(path) for path in paths] or ["embedded"],
+        "up": chosen.up,
+        "ground": chosen.ground,
+        "environments": dict(zip(names, map(str, lights), strict=True)) or "embedded",
+        "turn": list(chosen.turn),
+        "light_size": next(iter(view.lights.values())).radiance.shape[-2],
+        "vertices": {part.name: len(part.mesh.position) for part in view.scene.parts},
+        "brdf": {part.name: materials.describe(part.material) for part in view.scene.parts},
+        "camera": {
+            name: np.asarray(value).tolist()
+            for name, value in vars(view.camera).items()
+            if isinstance(value, jax.Array | float | int)
+        },
+    }
+
+
+def _warn_of_backs(view: View) -> None:
+    """Tells on stderr where the normals of most triangles in the picture point away, as in an inside-out mesh."""
+    mesh, triangle = view.scene.parts[0].mesh, report.visible(view)
+    corner = np.asarray(mesh.face)[triangle[triangle < len(mesh.face)]]
+    normal, position = (np.asarray(field)[corner].mean(1) for field in (mesh.normal, mesh.position))
+    away = np.sum(normal * (np.asarray(view.camera.eye) - position), 1) < 0
+    if 2 * np.sum(away) > len(away):
+        message = f"{np.sum(away)} of {len(away)} triangles in the picture face away and will be black"
+        click.echo(f"Warning: {message}: is the mesh inside out, with clockwise faces?", err=True)
+
+
+def _text(found: dict[str, Any], path: Path) -> str:
+    """The report in words."""
+    exact, rows = found["exact"], []
+    for name, light in found["lights"].items():
+        least = light["exact_pixels_error"]
+        rows.append(f"{name}: errors of pictures are measured by {exact['pixels']} exact pixels, {least:.1%} off")
+        for system in found["times"]:
+            parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
+            error, spread = (100 * light[system][key] for key in ("picture_error", "picture_error_spread"))
+            rows.append(
+                f"{name}, {system}: relative L2 error of the picture {error:.1f} ± {spread:.1f} %; of vertices: {parts}"
+            )
+            if "reflected_fraction" in light[system]:
+                fraction = light[system]["reflected_fraction"]
+                rows.append(f"{name}, {system}: {fraction:.1%} of the picture's light comes from other surfaces")
+    for system, times in found["times"].items():
+        milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
+        rows.append(f"{system}: a picture after a {milliseconds.replace('_', ' ')}")
+    rows += map(report.row_text, found.get("table", []))
+    if exact["picture_width"] < found["camera"]["width"]:
+        rows.append(f"the exact picture and the differences are {exact['picture_width']} pixels wide")
+    return "\n".join([*rows, f"pictures and {path.name} are in {path.parent}"])

@@ -1,0 +1,34 @@
+"""Systems by their names and sizes."""
+
+from types import SimpleNamespace
+
+from jaxprt.relit import Clusters, Harmonics, Lobes, Terms
+from jaxprt.relit.recipes import Recipe
+
+LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # share of the squared Laplacian that each window leaves
+NAMES = ("lobe", "harmonic", "separable", "clusters")
+_COUNT = 12  # lobes
+
+
+def check(options: SimpleNamespace, texels: int) -> None:
+    """Refuses sizes that the light does not have.
+
+    Raises:
+        ValueError: There are more wavelet coefficients than texels.
+    """
+    if options.keep is not None and options.keep > texels:
+        raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
+
+
+def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> dict[str, Recipe]:
+    """The recipes that a system's name and the options stand for, by names for folders and files."""
+    if system == "lobe":
+        counts = options.lobes or (lobes,)
+        more = {} if options.texels is None else {"texels": options.texels}
+        names = [system] if len(counts) == 1 else [f"lobe_{count}" for count in counts]
+        return {name: Lobes(count, **more) for name, count in zip(names, counts, strict=True)}
+    if system == "harmonic":
+        return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
+    names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    return {system: Terms(**given) if system == "separable" else Clusters(**given)}

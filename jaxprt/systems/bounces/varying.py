@@ -1,0 +1,72 @@
+"""What a part whose roughness varies sends to others: weights of path functions by channel and roughness.
+
+    H_p = sum_k w_k A(k, p, r)
+
+w_k are the weights of the channels of a `Blend`, r is the roughness or another parameter, and A is tabulated at knots
+of r. So light that is sent to other surfaces has the roughness that is seen, at each vertex.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import grid
+from jaxprt.compile import jit
+from jaxprt.systems.protocol import Blend
+
+
+class Sent(eqx.Module):
+    """Weights of path functions for channels of a BRDF.
+
+    Attributes:
+        knot: Increasing values of the parameter; empty for a BRDF without one.
+        factor: Weight of each function p for each channel k at each knot; one row without knots.
+    """
+
+    knot: tuple[Float[Array, " _"], ...]
+    factor: Float[Array, "n k p"]
+
+    def __check_init__(self):
+        """Refuses factors of another number of knots."""
+        knots = len(self.knot[0]) if self.knot else 1
+        if len(self.knot) > 1 or len(self.factor) != knots:
+            raise ValueError(
+                f"the factors must be along one parameter or none, got {len(self.factor)} for {len(self.knot)}"
+            )
+
+    def mean(self, blend: Blend, area: Float[Array, " v"]) -> Float[Array, "p c"]:
+        """Weights of the functions in the mean over a surface, given the area of each vertex."""
+        return _mean(self, blend, area)
+
+    def values(self, blend: Blend, value: Float[Array, " p"]) -> Float[Array, "v c"]:
+        """What the material of each vertex has of something that each function has, such as albedo."""
+        return _values(self, blend, value)
+
+
+def _neighbors(sent: Sent, blend: Blend) -> tuple[Array, Array]:
+    """The lower knot of each vertex, and the weight of the upper one."""
+    (knot,), (parameter,) = sent.knot, blend.parameter
+    return grid.neighbors(grid.place(knot, parameter), size=len(knot))
+
+
+@jit
+def _mean(sent: Sent, blend: Blend, area: Array) -> Array:
+    whole = jnp.sum(area)
+    share = area / jnp.where(whole > 0, whole, 1)
+    if not sent.knot:
+        return jnp.einsum("kp,v,vkc->pc", sent.factor[0], share, blend.weight, precision="highest")
+    low, upper = _neighbors(sent, blend)
+    total = jnp.zeros((len(sent.factor), *blend.weight.shape[1:]), blend.weight.dtype)
+    weight = blend.weight * share[:, None, None]
+    total = total.at[low].add(weight * (1 - upper)[:, None, None]).at[low + 1].add(weight * upper[:, None, None])
+    return jnp.einsum("nkp,nkc->pc", sent.factor, total, precision="highest")
+
+
+@jit
+def _values(sent: Sent, blend: Blend, value: Array) -> Array:
+    channel = jnp.matmul(sent.factor, value, precision="highest")
+    if not sent.knot:
+        return jnp.einsum("k,vkc->vc", channel[0], blend.weight, precision="highest")
+    low, upper = _neighbors(sent, blend)
+    each = channel[low] * (1 - upper)[:, None] + channel[low + 1] * upper[:, None]
+    return jnp.einsum("vk,vkc->vc", each, blend.weight, precision="highest")

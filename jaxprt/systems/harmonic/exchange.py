@@ -1,0 +1,232 @@
+"""Transfer in files that other tools write and read, in the conventions that they have.
+
+    file        what it holds                                                   arrays
+    .npz        vectors or matrices, with convention, positions and frames      `coefficient` and others
+    .npy        vectors or matrices alone; reading needs the convention         one
+    .ply        vectors of vertices, with convention, positions and faces       properties `sh_<index>_<color>`
+
+Vectors are [v, lm, c] of vertices or [f, 3, lm, c] of the corners of triangles; matrices are [v, c, o, i], from the
+light's coefficients i in the world to the arriving ones o in the vertex's frame.
+"""
+
+import dataclasses
+import json
+import os
+import pathlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt import require
+from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import directions, harmonics
+from jaxprt.sphere.conventions import Convention
+from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
+
+_AGREE = 1e-4  # of the largest coefficient, or of the mesh's size
+_COMMENT = "jaxprt convention "
+
+
+def export_transfer(
+    path: str | os.PathLike,
+    transport: TransferVector | TransferMatrix,
+    mesh: Mesh,
+    *,
+    convention: Convention = Convention(),  # noqa: B008
+    corners: bool = False,
+) -> None:
+    """Writes transfer vectors or matrices as another tool has them.
+
+    Args:
+        path: A file that ends in .npz, .npy or .ply; PLY holds vectors of vertices.
+        transport: Transfer of all vertices of the mesh.
+        mesh: Its mesh, whose positions and faces are written in the tool's axes.
+        convention: The tool's convention, such as `jaxprt.sphere.conventions.TOOLS["Mitsuba 3"]`; ours if left out.
+        corners: Whether vectors are written for each corner of each triangle instead of for each vertex.
+
+    Raises:
+        TypeError: The transport is neither.
+        ValueError: The file's name ends otherwise, the mesh has another number of vertices, or the file cannot hold it.
+    """
+    kind = _suffix(path)
+    require.kind("the transport", transport, TransferVector, TransferMatrix, source="jaxprt.harmonic.precompute")
+    if len(transport.position) != len(mesh.position):
+        raise ValueError(
+            f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {len(transport.position)}"
+        )
+    matrix = isinstance(transport, TransferMatrix)
+    if (matrix and corners) or (kind == ".ply" and (matrix or corners)):
+        raise ValueError(
+            "corners hold vectors, and PLY files vectors of vertices; write matrices to .npz or .npy files, got "
+            f"{'matrices' if matrix else 'vectors'} of {'corners' if corners else 'vertices'} for {kind}"
+        )
+    if isinstance(transport, TransferMatrix):
+        inner = convention.written(np.asarray(transport.matrix), axis=3)
+        value = convention.written(inner, axis=2, world=False)
+    else:
+        value = convention.written(np.asarray(transport.vector), axis=0).transpose(2, 0, 1)
+        value = value if convention.over_pi else value * np.asarray(np.pi, value.dtype)
+        value = value[np.asarray(mesh.face)] if corners else value
+    position = np.asarray(mesh.position) @ convention.turn.T.astype(np.float32)
+    name = json.dumps(dataclasses.asdict(convention))
+    if kind == ".npy":
+        np.save(path, value)
+    elif kind == ".npz":
+        arrays: dict[str, Any] = {"coefficient": value, "position": position, "face": np.asarray(mesh.face)}
+        arrays["what"] = "matrices" if matrix else "vectors of corners" if corners else "vectors"
+        arrays["convention"] = name
+        if isinstance(transport, TransferMatrix):
+            arrays["frame"] = np.asarray(transport.frame) @ convention.turn.T.astype(np.float32)
+        np.savez(path, **arrays)
+    else:
+        _write_ply(path, position, np.asarray(mesh.face), value, name)
+
+
+def import_transfer(
+    path: str | os.PathLike,
+    mesh: Mesh,
+    *,
+    convention: Convention | None = None,
+    what: str | None = None,
+) -> TransferVector | TransferMatrix:
+    """Reads transfer that another tool, or `export_transfer`, has written for a mesh.
+
+    Args:
+        path: A .npz, .npy or .ply file; see the top of this module for its arrays.
+        mesh: The mesh, in our world, with the vertices in the file's order.
+        convention: The tool's convention. What the file says if None, and a file that says nothing is refused.
+        what: "vectors", "vectors of corners" or "matrices"; what the file says, or "vectors", if None.
+
+    Returns:
+        Transfer for `DiffuseSystem` or `HarmonicSystem`; matrices have the frames of the mesh.
+
+    Raises:
+        ValueError: The convention is not known, arrays have other axes or another number of vertices, values are not
+            finite, positions or frames in the file are others than the mesh's, or corners at a vertex disagree.
+    """
+    kind, source = _suffix(path), str(path)
+    held = (
+        dict(np.load(path)) if kind == ".npz" else _read_ply(path) if kind == ".ply" else {"coefficient": np.load(path)}
+    )
+    if "coefficient" not in held:
+        raise ValueError(f"{source} must hold an array `coefficient`, got {', '.join(sorted(held)) or 'none'}")
+    if convention is None:
+        if "convention" not in held:
+            raise ValueError(
+                f"{source} does not say its convention: give convention=jaxprt.sphere.conventions.Convention(..)"
+            )
+        convention = _said(source, str(held["convention"]))
+    what = str(held.get("what", "vectors")) if what is None else what
+    value = np.asarray(held["coefficient"], np.float32)
+    require.finite(f"the coefficients of {source}", value)
+    turn = convention.turn.astype(np.float32)
+    if "position" in held:
+        _same(f"positions of {source}", held["position"] @ turn, np.asarray(mesh.position))
+    if what == "matrices":
+        frame = directions.frame(mesh.normal, mesh.tangent)
+        if "frame" in held:
+            _same(f"frames of {source}", held["frame"] @ turn, np.asarray(frame))
+        return TransferMatrix(jnp.asarray(_matrices(source, value, mesh, convention)), mesh.position, frame)
+    if what not in ("vectors", "vectors of corners"):
+        raise ValueError(f'what must be "vectors", "vectors of corners" or "matrices", got {what!r}')
+    rows = (len(mesh.face), 3) if what == "vectors of corners" else (len(mesh.position),)
+    value = value[..., None] if value.ndim == len(rows) + 1 else value
+    if value.ndim != len(rows) + 2 or value.shape[: len(rows)] != rows:
+        axes = ", ".join(map(str, rows))
+        raise ValueError(f"{what} of {source} must be [{axes}, lm] or [{axes}, lm, c], got {list(value.shape)}")
+    if what == "vectors of corners":
+        value = _joined(source, value, np.asarray(mesh.face), len(mesh.position))
+    value = convention.read(value, axis=1) / np.float32(1 if convention.over_pi else np.pi)
+    return TransferVector(jnp.asarray(value.transpose(1, 2, 0)), mesh.position)
+
+
+def _said(source: str, text: str) -> Convention:
+    """The convention that a file says."""
+    try:
+        return Convention(**json.loads(text))
+    except (TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"the convention in {source} must be one that export_transfer writes, got {text}") from error
+
+
+def _matrices(source: str, value: np.ndarray, mesh: Mesh, convention: Convention) -> Float[np.ndarray, "v c o i"]:
+    value = value[:, None] if value.ndim == 3 else value
+    if value.ndim != 4 or len(value) != len(mesh.position) or value.shape[2] != value.shape[3]:
+        count = len(mesh.position)
+        raise ValueError(
+            f"matrices of {source} must be [{count}, lm, lm] or [{count}, c, lm, lm], got {list(value.shape)}"
+        )
+    harmonics.degree_of(value.shape[2])
+    return convention.read(convention.read(value, axis=3), axis=2, world=False)
+
+
+def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.ndarray:
+    """Coefficients of vertices from those of corners, which must agree."""
+    result = np.full((count, *value.shape[2:]), np.nan, value.dtype)
+    result[face] = value
+    wrong = np.abs(result[face] - value).max((2, 3)) > _AGREE * np.abs(value).max()
+    if wrong.any():
+        first = face[wrong][0]
+        raise ValueError(
+            f"corners of {source} must agree where they share a vertex, got {len(np.unique(face[wrong]))} vertices "
+            f"where they do not, first {first}: give a mesh that has a vertex of its own for each corner"
+        )
+    unread = np.flatnonzero(np.isnan(result).any((1, 2)))
+    if len(unread):
+        raise ValueError(f"each vertex must be in a triangle, got {len(unread)} that are in none, first {unread[0]}")
+    return result
+
+
+def _same(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
+    """Refuses vertices that are not those of the mesh."""
+    if found.shape != wanted.shape:
+        raise ValueError(f"{name} must be those of the mesh, {list(wanted.shape)}, got {list(found.shape)}")
+    off = np.abs(found - wanted).reshape(len(found), -1).max(1)
+    wrong = np.flatnonzero(~(off <= _AGREE * max(float(np.abs(wanted).max()), 1e-30)))
+    if len(wrong):
+        raise ValueError(
+            f"{name} must be those of the mesh, in our axes, got {len(wrong)} of {len(off)} that are not, first "
+            f"{wrong[0]}: {found[wrong[0]].tolist()} for {wanted[wrong[0]].tolist()}"
+        )
+
+
+def _suffix(path: str | os.PathLike) -> str:
+    suffix = pathlib.Path(path).suffix.lower()
+    if suffix not in (".npz", ".npy", ".ply"):
+        raise ValueError(f"the file must end in .npz, .npy or .ply, got {os.fspath(path)!r}")
+    return suffix
+
+
+def _write_ply(path, position: np.ndarray, face: np.ndarray, value: np.ndarray, convention: str) -> None:
+    """Binary PLY, with a property for each coefficient and color."""
+    count, terms, colors = value.shape
+    names = [f"sh_{i}_{c}" for i in range(terms) for c in range(colors)]
+    properties = [f"property float {name}" for name in (*"xyz", *names)]
+    head = ["ply", "format binary_little_endian 1.0", f"comment {_COMMENT}{convention}", f"element vertex {count}"]
+    head += [*properties, f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
+    corner = np.zeros(len(face), [("count", "u1"), ("vertex", "<i4", (3,))])
+    corner["count"], corner["vertex"] = 3, face
+    rows = np.concatenate([position, value.reshape(count, -1)], 1).astype("<f4")
+    pathlib.Path(path).write_bytes("\n".join(head).encode() + rows.tobytes() + corner.tobytes())
+
+
+def _read_ply(path) -> dict[str, np.ndarray]:
+    """Positions, coefficients, and the convention where a comment has it."""
+    import trimesh  # Here, since it takes a second.
+
+    loaded = trimesh.load(path, process=False)
+    elements = loaded.metadata["_ply_raw"]
+    data = elements["vertex"]["data"]
+    place = sorted(tuple(map(int, name.split("_")[1:])) for name in data.dtype.names if name.startswith("sh_"))
+    if not place:
+        return {}
+    terms, colors = place[-1][0] + 1, 1 + max(color for _, color in place)
+    value = np.stack([np.asarray(data[f"sh_{i}_{c}"], np.float32) for i in range(terms) for c in range(colors)], 1)
+    held = {
+        "coefficient": value.reshape(-1, terms, colors),
+        "position": np.stack([np.asarray(data[axis], np.float32) for axis in "xyz"], 1),
+    }
+    head = pathlib.Path(path).read_bytes().split(b"end_header")[0].decode("ascii", "replace").splitlines()
+    said = [line.partition(_COMMENT)[2] for line in head if line.startswith(f"comment {_COMMENT}")]
+    return {**held, **({"convention": np.array(said[0])} if said else {})}

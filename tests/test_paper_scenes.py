@@ -1,0 +1,54 @@
+"""The scenes of Sun et al. 2007: each region has a material, stopped runs count, points keep their places."""
+
+import numpy as np
+import pytest
+
+from benchmarks import paper_figures, paper_scenes
+
+
+@pytest.mark.parametrize("name", paper_scenes.RECIPES)
+def test_every_region_is_free_or_has_an_albedo(name):
+    recipe = paper_scenes.RECIPES[name]
+    regions = np.unique(np.asarray(recipe.mesh(True).region)).tolist()
+    assert sorted([*recipe.free, *recipe.fixed]) == regions
+    if recipe.published is not None:
+        assert len(recipe.free) >= recipe.published.adjustable
+
+
+def test_seconds_of_runs_add_up_until_all_is_there(tmp_path):
+    path = tmp_path / "scene" / "seconds.json"
+    try:
+        raise SystemExit(143)  # What main makes of a signal.
+    except SystemExit:
+        paper_scenes._spent(path, 5.0)
+    done, peak = paper_scenes._spent(path, 2.0)
+    assert (done, peak > 0) == (7.0, True)
+    assert paper_scenes._spent(path, 100.0) == (done, peak)
+
+
+def test_points_are_numbered_in_their_region_and_padded_on_its_first_vertex():
+    region = np.array([1, 0, 1, 1, 0])
+    local, counts = paper_figures._local(region)
+    np.testing.assert_array_equal(local, [0, 0, 1, 2, 1])
+    np.testing.assert_array_equal(counts, [2, 3])
+    corner, weight = local[np.array([[0, 2, 3], [3, 0, 2]])], np.array([[0.2, 0.3, 0.5], [0.6, 0.3, 0.1]])
+    points = paper_figures._points(corner, weight, np.array([1]), 3)
+    points.check(3)
+    np.testing.assert_array_equal(points.corner, np.array([[2, 0, 1], [0, 0, 0], [0, 0, 0]]).T)
+    np.testing.assert_allclose(points.weight, np.array([[0.6, 0.3, 0.1], [1, 0, 0], [1, 0, 0]]).T, rtol=1e-6)
+
+
+def test_few_numbers_of_points_serve_all():
+    sizes = [paper_figures._rounded(count) for count in range(1, 5000)]
+    assert all(size >= count for count, size in enumerate(sizes, 1))
+    assert max(size / count for count, size in enumerate(sizes, 1) if count > 64) <= 1.26
+    assert len(set(sizes)) < 60
+
+
+def test_the_background_does_not_count_in_what_a_picture_is_off():
+    exact = np.full((4, 4, 3), paper_figures.WHITE)
+    exact[1:3] = 0.5
+    mine = exact.copy()
+    mine[1, :2] = 0.6
+    expected = np.linalg.norm(mine - exact) / np.linalg.norm(exact[1:3])
+    assert paper_figures.off(mine, exact) == pytest.approx(expected)
