@@ -116,7 +116,8 @@ class Plan(eqx.Module):
         rows = [f"error asked {100 * self.asked:g} %, {self.rate:g} frames per second"]
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
-            rows += [f"  {'*' if each is part.chosen else ' '} {each}" for each in part.considered]
+            chosen = repr(part.chosen.recipe)  # A plan that was saved has a copy of it among those considered.
+            rows += [f"  {'*' if repr(each.recipe) == chosen else ' '} {each}" for each in part.considered]
             advice = "; `jaxprt.refine` divides its triangles" if part.mesh_error > self.asked else ""
             rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
         for part, (once, twice, often) in zip(self.part, 100 * self.reflected.T, strict=True):

@@ -111,8 +111,10 @@ def test_what_is_matte_is_lit_by_transfer_vectors(planned, ready):
     assert isinstance(ready.direct.part[1], prt.harmonic.DiffuseSystem)
 
 
-def test_the_table_names_every_part_and_marks_one_choice_of_each(planned):
+def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_path):
     table = str(planned)
+    prt.files.save(tmp_path / "plan", planned)
+    assert str(prt.files.load(tmp_path / "plan")) == table
     assert table.count("*") == 3
     assert all(f"{name}: " in table for name in ("ball", "ground", "paint"))
     assert f"in all: {100 * planned.error:.1f} %" in table
