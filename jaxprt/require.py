@@ -6,6 +6,7 @@ NaN reaches every vertex that reads it.
 
 import functools
 import inspect
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -125,7 +126,7 @@ def length(name: str, value: Any, count: int) -> None:
         raise ValueError(f"{name} must be {count}, got {value.shape[0]}")
 
 
-def memory(what: str, needed: int, advice: str) -> None:
+def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> None:
     """Refuses work whose result does not fit into the memory of the device, or of this machine, before it begins.
 
     What is free on this machine is Linux's MemAvailable, and what a limit of the process's group leaves; elsewhere
@@ -135,13 +136,18 @@ def memory(what: str, needed: int, advice: str) -> None:
         what: What takes the memory, for the message: "transfer matrices of degree 14 for 36,000 vertices".
         needed: Its bytes.
         advice: What takes less.
+        in_files: Whether it stays in files that are mapped. Where JAX computes on the processor that is a warning.
 
     Raises:
         MemoryError: It does not fit; says how much is needed, how much is free, and what to do.
     """
     free = available_memory()
-    if free is not None and needed > free:
-        raise MemoryError(f"{what} take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; {advice}")
+    if free is None or needed <= free:
+        return
+    size = f"{what} take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
+    if not in_files or jax.devices()[0].platform != "cpu":
+        raise MemoryError(f"{size}; {advice}")
+    warnings.warn(f"{size}: they stay in files, and each new light reads all of these; or {advice}", stacklevel=4)
 
 
 def available_memory() -> int | None:

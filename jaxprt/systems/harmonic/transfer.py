@@ -91,14 +91,15 @@ def precompute(
 
     Raises:
         ValueError: Sizes out of range, positions or normals that are not finite, or a store made from something else.
-        MemoryError: The matrices do not fit into memory, which is known before any ray is traced.
+        MemoryError: The matrices do not fit into memory, which is known before any ray is traced. With a path they stay
+            in files on processors, which is a warning.
         BlockingIOError: The store is being written by another process.
         RuntimeError: A worker of the executor died.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
-    check_memory(len(visibility.rays.chosen(mesh, vertex)), degree)
+    check_memory(len(visibility.rays.chosen(mesh, vertex)), degree, in_files=path is not None)
     job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)
@@ -276,7 +277,7 @@ class _Job(visibility.rays.VisibilityJob):
         return {name: np.asarray(made)[:, None]}, count.rays
 
 
-def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1) -> None:
+def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1, in_files: bool = False) -> None:
     """Refuses matrices that do not fit into memory.
 
     Args:
@@ -284,6 +285,7 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
         degree: Highest degree of the harmonics.
         copies: How many of them are held at once.
         colors: Number of colors of each.
+        in_files: Whether they stay in files that are mapped, which is a warning where JAX computes on the processor.
 
     Raises:
         MemoryError: They do not fit.
@@ -293,6 +295,7 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
         f"transfer matrices of degree {degree} for {vertices:,} vertices, {each:,} bytes each,",
         copies * vertices * each,
         "take jaxprt.harmonic.precompute_clustered, a lower degree, or fewer vertices (vertex=)",
+        in_files=in_files,
     )
 
 

@@ -147,12 +147,16 @@ def test_some_vertices_are_theirs_in_the_whole_and_a_store_resumes(tmp_path, clo
         harmonic.precompute_clustered(mesh(), path=tmp_path / "store", **{**options, "components": 2})
 
 
-def test_matrices_that_do_not_fit_are_refused_with_their_bytes(monkeypatch):
+def test_matrices_that_do_not_fit_are_refused_with_their_bytes(monkeypatch, tmp_path):
+    exact = np.asarray(whole().matrix)
     monkeypatch.setattr(require, "_host_memory", lambda: 50_000)
     words = rf"degree 3 for {len(mesh().position)} vertices, 1,024 bytes each, take .*; take .*precompute_clustered"
     with pytest.raises(MemoryError, match=words):
         harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, progress=False)
     harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, vertex=np.arange(20), progress=False)
+    with pytest.warns(UserWarning, match="they stay in files, and each new light reads all of these; or take"):
+        mapped = harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, path=tmp_path / "store", progress=False)
+    np.testing.assert_array_equal(mapped.matrix, exact)
     monkeypatch.setattr(require, "_host_memory", lambda: 7_000_000_000)
     with pytest.raises(MemoryError, match=r"36,000 vertices, 202,500 bytes each, take 7\.3 GB, and 7\.0 GB are free"):
         harmonic.transfer.check_memory(36_000, 14)
