@@ -225,7 +225,7 @@ def figure_4(run: Run) -> Iterator[dict[str, Any]]:
             axis.plot(counts, each, ".-", label=f"{resolution} x {resolution}")
             if resolution == 48 or run.quick:
                 rows.append([light_map(factored.light_map[k]) for k in range(min(8, max(counts)))])
-                captions.append([f"{name}, term {k + 1}" if k == 0 else f"{k + 1}" for k in range(len(rows[-1]))])
+                captions.append([name if k == 0 else f"{k + 1}" for k in range(len(rows[-1]))])
         axis.set(title=name, xlabel="terms", ylabel="cosine-weighted rms error in 1/sr", ylim=(0, None))
     axes[0].legend(fontsize=7)
     figure.tight_layout()
