@@ -27,6 +27,7 @@ SETS = (1, 2, 3, 4, 5, 6)  # n_h
 TERMS = (4, 8, 12, 16, 20, 24, 28, 32)  # n_wi = n_wo
 ANGLES = (0, 7, 14, 21)
 RESOLUTION = 24  # of maps, in texels
+MEMBERS = 20  # of the set of Figure 6, at equal steps of their order by roughness
 NODES = 16  # of tables of lobes over the view angle
 # What the paper prints: no lobes at the finest ranks, and five functions of the two sets.
 FINEST, PRINCIPAL = 0.952465, {"Cook-Torrance": 6.23e-4, "Blinn-Phong": 1.61e-7}
@@ -216,19 +217,21 @@ def figure_7(run: Run) -> Iterator[dict[str, Any]]:
 
 def figure_6(run: Run) -> Iterator[dict[str, Any]]:
     """Balls of four measured materials by the tensor alone, and with one to four published lobes."""
-    family, light = measured(run), run.light("grace")
+    family, light = measured(run), run.light("grace", size=32)
     chosen = shininess(family, 2 if run.quick else 4)
+    members = sorted({*chosen, *shininess(family, 4 if run.quick else MEMBERS)})
+    brdfs = [family.brdf[number] for number in members]
     resolution, edge = (8, 16) if run.quick else (RESOLUTION, 384)
-    rings = 8 if run.quick else 112
+    rings = 8 if run.quick else 80
     ball = builtin.sphere(rings=rings, sectors=2 * rings)
     view = camera.orbit(ball, elevation=0.2, width=edge, height=edge)
     number = np.flatnonzero(np.sum(np.asarray(ball.normal) * (np.asarray(view.eye) - np.asarray(ball.position)), 1) > 0)
     sets: dict[str, Any] = {"no lobes": None}
     for count in (1, 4) if run.quick else (1, 2, 3, 4):
-        sets[" ".join(f"{k}°" for k in ANGLES[:count])] = separated(run, family.brdf, ANGLES[:count])
+        sets[" ".join(f"{k}°" for k in ANGLES[:count])] = separated(run, brdfs, ANGLES[:count])
     made = {
         name: dynamic.factor(
-            family.brdf,
+            brdfs,
             each,
             ranks=(2, 4, 4) if run.quick else (4, 8, 8),
             resolution=resolution,
@@ -240,8 +243,8 @@ def figure_6(run: Run) -> Iterator[dict[str, Any]]:
         exact = drawing.unshadowed(ball, family.brdf[material], light, view.eye, number)
         name = f"{family.name[material]}, m = {place_of(family.brdf[material])[1]:.3g}"
         radiance, row, titles = {"exact": exact}, [], []
-        for lobes, members in made.items():
-            mixed = members.at(jnp.zeros(len(family.brdf)).at[material].set(1))
+        for lobes, factored in made.items():
+            mixed = factored.at(jnp.zeros(len(brdfs)).at[members.index(material)].set(1))
             radiance[lobes] = drawing.unshadowed(ball, mixed, light, view.eye, number)
         for lobes, color in radiance.items():
             wrong = float(np.linalg.norm(color - exact) / np.linalg.norm(exact))
