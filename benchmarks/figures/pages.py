@@ -152,9 +152,10 @@ def kautz_table(lines: Lines) -> str:
     for name in dict.fromkeys(line["row"] for line in lines):
         own = [line for line in lines if line["row"] == name and "fixed view, transfer" not in line["case"]]
         mine = {line["case"].split(",")[0]: line for line in own}
-        paper = PAPER[name]
+        paper = PAPER.get(name)
         rows.append([name, f"{mine['general']['vertices']:,}", *(fps(mine[case]) for case in cases)])
-        rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames)])
+        if paper is not None:
+            rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames)])
     return markdown(["row", "vertices", "no transfer", "transfer", "fixed light", "fixed view"], rows)
 
 
