@@ -77,3 +77,14 @@ def test_a_sheet_has_its_pictures_side_by_side_under_their_captions(tmp_path):
         assert picture.size == (112, 40 + 2 * 22 + 6)
         row = np.asarray(picture)[64]
     np.testing.assert_allclose(row[[25, 81]], [[254, 0, 0], [0, 0, 254]], atol=4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", program.FIGURES)
+def test_the_small_case_of_every_figure_runs_to_its_end(name, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"<!-- lines: {name} -->\n<!-- end -->\n")
+    program.main([name, "--quick", "--docs", str(tmp_path), "--store", str(tmp_path / "store")])
+    for file in pages.PICTURES.get(name, {}):
+        assert (tmp_path / "pictures" / file).stat().st_size < 300_000
+        assert f"pictures/{file}" in page.read_text()

@@ -17,7 +17,7 @@ from benchmarks.figures.run import LIGHTS, Clock, Run
 from jaxprt import harmonic, image, reference
 from jaxprt.brdf import AshikhminShirley, Phong, PoulinFournier, load_scattered
 from jaxprt.scene import Camera, Environment, Mesh, camera
-from jaxprt.scene.mesh import brush
+from jaxprt.scene.mesh import brush, rotate
 from jaxprt.scene.points import on_triangles
 from jaxprt.sphere import directions, rotation
 from jaxprt.systems.harmonic import HarmonicBrdf, HarmonicSystem
@@ -107,9 +107,15 @@ def gray(value: np.ndarray, times: int) -> np.ndarray:
     return np.kron(color, np.ones((times, times, 1)))
 
 
+def bust(run: Run) -> Mesh:
+    """Nefertiti, whose file has +z up, upright and brushed upwards."""
+    upright = rotate(run.mesh("nefertiti.ply"), np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    return brush(upright, UPWARDS)
+
+
 def figure_3(run: Run) -> Iterator[dict[str, Any]]:
     """A brushed head in four environments."""
-    mesh = brush(run.mesh("nefertiti.ply"), UPWARDS)
+    mesh = bust(run)
     view, table = view_of(run, mesh, 0.4), tabulated(run, BRUSHED)
     pictures, captions = [], []
     for name in ("grace",) if run.quick else LIGHTS:
@@ -177,36 +183,40 @@ def turned_to(transport, mesh: Mesh):
     return eqx.tree_at(lambda t: (t.matrix, t.frame), transport, (jnp.moveaxis(matrix, 2, 0)[:, None], frame))
 
 
-def measured_brdfs(run: Run) -> Iterator[tuple[str, Callable, float]]:
-    """Names, BRDFs and seconds of Figure 8's columns: two models, and three files of scattered measurements."""
-    yield "Ashikhmin-Shirley", BRUSHED, 0.0
-    yield "Poulin-Fournier", PoulinFournier(diffuse=0.1, specular=0.5, exponent=60), 0.0
-    for name in () if run.quick else ("acryl_blue", "cayman", "mystique"):
-        clock = Clock()
-        made = load_scattered(harness.data() / "brdf" / f"{name}.brdf")
-        yield f"measured: {name}", made, clock.seconds
+MEASURED = ("acryl_blue", "cayman", "mystique")
+MODELS = {"Ashikhmin-Shirley": BRUSHED, "Poulin-Fournier": PoulinFournier(diffuse=0.1, specular=0.5, exponent=60)}
+MESHES = {"nefertiti.ply": "grace", "teapot.obj": "st_peters", "dragon_100k.ply": "uffizi"}
+
+
+def column(run: Run, name: str) -> dict[str, Any]:
+    """Pictures of one BRDF on all meshes, each in a light of its own, and what is measured of them."""
+    clock, brdf = Clock(), MODELS.get(name)
+    if brdf is None:
+        brdf = load_scattered(harness.data() / "brdf" / f"{name}.brdf")
+    times = {"interpolated_seconds": 0.0 if name in MODELS else clock.seconds}
+    clock = Clock()
+    table = harmonic.tabulate(brdf, degree=DEGREE, error=0.1 if run.quick else 0.01)
+    times["projected_seconds"] = clock.seconds
+    result: dict[str, Any] = {}
+    for file, light in list(MESHES.items())[: 1 if run.quick else None]:
+        mesh = bust(run) if file == "nefertiti.ply" else brush(run.mesh(file), UPWARDS)
+        view = view_of(run, mesh, 0.5)
+        picture, found = unshadowed(run, mesh, brdf, run.light(light, size=32), view, table)
+        result[file] = {"picture": picture, "line": {"mesh": file, "light": light, "brdf": name, **times, **found}}
+    return result
 
 
 def figure_8(run: Run) -> Iterator[dict[str, Any]]:
     """Models and measured BRDFs on three meshes, in a light each."""
-    meshes = {"nefertiti.ply": "grace", "teapot.obj": "st_peters", "dragon_100k.ply": "uffizi"}
-    scenes = {}
-    for file, light in list(meshes.items())[: 1 if run.quick else 3]:
-        mesh = brush(run.mesh(file), UPWARDS)
-        scenes[file] = (mesh, run.light(light), view_of(run, mesh, 0.5), light)
-    pictures: dict[str, list] = {file: [] for file in scenes}
-    captions: dict[str, list] = {file: [] for file in scenes}
-    for name, brdf, seconds in measured_brdfs(run):
-        clock = Clock()
-        table = tabulated(run, brdf)
-        times = {"interpolated_seconds": seconds, "projected_seconds": clock.seconds}
-        for file, (mesh, light, view, sky) in scenes.items():
-            picture, found = unshadowed(run, mesh, brdf, light, view, table)
-            pictures[file].append(picture)
-            captions[file].append(f"{name}\n{100 * found['error']:.0f} % off, {100 * found['negative']:.0f} % < 0")
-            yield {"mesh": file, "light": sky, "brdf": name, **times, **found}
-    rows = [[each for one in pictures[file] for each in row([one])] for file in scenes]
-    drawing.sheet(run.picture("kautz2002_figure_8.jpg"), rows, list(captions.values()))
+    names = [*MODELS, *(() if run.quick else MEASURED)]
+    made = [run.kept(f"kautz_8_{name}", lambda name=name: column(run, name)) for name in names]
+    rows, captions = [], []
+    for file in made[0]:
+        lines = [each[file]["line"] for each in made]
+        yield from lines
+        rows.append([each for one in made for each in row([np.asarray(one[file]["picture"])])])
+        captions.append([f"{x['brdf']}\n{100 * x['error']:.0f} % off, {100 * x['negative']:.0f} % < 0" for x in lines])
+    drawing.sheet(run.picture("kautz2002_figure_8.jpg"), rows, captions)
 
 
 def figure_1(run: Run) -> Iterator[dict[str, Any]]:
@@ -242,5 +252,5 @@ def table_1(run: Run) -> Iterator[dict[str, Any]]:
     light = harmonic.project(run.light("grace"), degree=DEGREE)
     rows = relight_harmonic.meshes(run.quick)
     for name, mesh in rows.items():
-        lines = relight_harmonic.frame(name, mesh, table, light, 3 if run.quick else 7)
+        lines = relight_harmonic.frame(name, mesh, table, light, 3)
         yield from ({"row": name, "vertices": len(mesh.position), **line} for line in lines)

@@ -65,6 +65,7 @@ def sun_5(lines: Lines) -> str:
     for norm in dict.fromkeys(line["norm"] for line in lines):
         for kind in dict.fromkeys(line["lobes"] for line in lines):
             mine = [line for line in lines if (line["norm"], line["lobes"]) == (norm, kind)]
+            mine = [line for line in mine if "resolution" not in line]
             grid = {(line["n_h"], line["n_w"]): line["squared_error"] for line in mine if "n_h" in line}
             terms = sorted({n for _, n in grid})
             rows = [[h, *(f"{grid[h, n]:.4g}" for n in terms)] for h in sorted({h for h, _ in grid})]
@@ -75,6 +76,13 @@ def sun_5(lines: Lines) -> str:
                 markdown(["n_h", *(f"n_w = {n}" for n in terms)], rows),
                 f"Two sweeps of the iteration change the error at {ranks} to {swept['iterated_squared_error']:.4g}.",
             ]
+    alone = [line for line in lines if "resolution" in line]
+    rows = [[x["resolution"], x["texels"], f"{x['squared_error']:.4g}", percent(x["beyond_70_degrees"])] for x in alone]
+    head = ["resolution", "texels inside", f"squared error by {alone[0]['terms']} terms", "squares of views beyond 70°"]
+    parts += [
+        "The sharpest material of the set alone, norm of the disk, by resolution of the maps.",
+        markdown(head, rows),
+    ]
     return "\n\n".join(parts)
 
 
@@ -144,9 +152,10 @@ def kautz_table(lines: Lines) -> str:
     for name in dict.fromkeys(line["row"] for line in lines):
         own = [line for line in lines if line["row"] == name and "fixed view, transfer" not in line["case"]]
         mine = {line["case"].split(",")[0]: line for line in own}
-        paper = PAPER[name]
+        paper = PAPER.get(name)
         rows.append([name, f"{mine['general']['vertices']:,}", *(fps(mine[case]) for case in cases)])
-        rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames)])
+        if paper is not None:
+            rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames)])
     return markdown(["row", "vertices", "no transfer", "transfer", "fixed light", "fixed view"], rows)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from benchmarks import harness
+from jaxprt import files
 from jaxprt.scene import Environment, Mesh, builtin, load_environment, load_mesh
 
 LIGHTS = {
@@ -41,6 +42,16 @@ class Run(NamedTuple):
         self.store.mkdir(parents=True, exist_ok=True)
         return self.store / name
 
+    def kept(self, name: str, make: Callable[[], Any]) -> Any:
+        """What is in the store by a name; made and put there where it is not. Quick runs keep nothing."""
+        path = self.keep(f"{name}.prt")
+        if self.quick or not path.exists():
+            made = make()
+            if not self.quick:
+                files.save(path, made)
+            return made
+        return files.load(path)
+
     def mesh(self, name: str) -> Mesh:
         """A mesh of JAXPRT_DATA; a sphere in a quick run."""
         return builtin.sphere(rings=8, sectors=16) if self.quick else load_mesh(harness.data() / "meshes" / name)
@@ -53,11 +64,15 @@ class Run(NamedTuple):
 
 
 def record(run: Run, name: str, figure: Callable[[Run], Iterator[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Runs a figure, and replaces its lines once all of them are there."""
+    """Runs a figure, and replaces its lines once all of them are there.
+
+    Raises:
+        ValueError: A number is NaN or infinite.
+    """
     lines = []
     for line in figure(run):
         lines.append({"figure": name, **line})
-        print(json.dumps(lines[-1]), flush=True)
+        print(json.dumps(lines[-1], allow_nan=False), flush=True)
     path = run.docs / "lines" / f"{name}.jsonl"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")

@@ -5,7 +5,6 @@ is Frobenius' norm of the samples on the orthographic disk. Ours is that of the 
 BRDFs reflect. Errors are squared and relative, as the paper prints them.
 """
 
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -28,6 +27,8 @@ SETS = (1, 2, 3, 4, 5, 6)  # n_h
 TERMS = (4, 8, 12, 16, 20, 24, 28, 32)  # n_wi = n_wo
 ANGLES = (0, 7, 14, 21)
 RESOLUTION = 24  # of maps, in texels
+MEMBERS = 20  # of the set of Figure 6, at equal steps of their order by roughness
+NODES = 16  # of tables of lobes over the view angle
 # What the paper prints: no lobes at the finest ranks, and five functions of the two sets.
 FINEST, PRINCIPAL = 0.952465, {"Cook-Torrance": 6.23e-4, "Blinn-Phong": 1.61e-7}
 
@@ -50,7 +51,7 @@ def figure_5(run: Run) -> Iterator[dict[str, Any]]:
     brdfs = measured(run).brdf
     sets, terms = ((1, 2), (4, 8)) if run.quick else (SETS, TERMS)
     resolution = 8 if run.quick else RESOLUTION
-    lobes = dynamic.separate(brdfs, separator=functools.partial(lobe.published.mirror_lobes, resolution=resolution))
+    lobes = separated(run, brdfs, ANGLES)
     lines = []
     for name, table in (("none", None), ("published", lobes)):
         for norm, make in (("disk", samples), ("natural light", reflected)):
@@ -64,6 +65,37 @@ def figure_5(run: Run) -> Iterator[dict[str, Any]]:
                 yield {**lines[-1], "brdfs": len(brdfs), "seconds": clock.seconds}
             yield {"lobes": name, "norm": norm, "ranks": list(most), "iterated_squared_error": swept}
     plot_5(lines, run)
+    for edge in (8,) if run.quick else (16, 24, 32, 48):
+        yield {"norm": "disk", "lobes": "none", "resolution": edge, **sharpest(brdfs, edge, max(terms))}
+
+
+def sharpest(brdfs: Sequence, resolution: int, terms: int) -> dict[str, float]:
+    """Squared relative error of the sharpest BRDF alone by some terms, and the share of squares at grazing views."""
+    brdf = min(brdfs, key=lambda each: place_of(each)[1])
+    table, whole = samples([brdf], None, resolution=resolution)
+    matrix = np.asarray(table[0], np.float64)
+    square = np.linalg.svd(matrix, compute_uv=False)[:terms] ** 2
+    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    grazing = np.asarray(direction)[inside, 2] < np.cos(np.radians(70))
+    return {
+        "terms": terms,
+        "texels": len(matrix),
+        "squared_error": float(1 - np.sum(square) / whole),
+        "beyond_70_degrees": float(np.sum(matrix[grazing] ** 2) / whole),
+    }
+
+
+def separated(run: Run, brdfs: Sequence, angles: tuple[int, ...]) -> LobeBrdf:
+    """The published lobes of a set; those of each BRDF are kept in the store."""
+    nodes = 8 if run.quick else NODES
+
+    def one(brdf):
+        f0, roughness = place_of(brdf)
+        name = f"mirror_{len(angles)}_{nodes}_{f0:.4g}_{roughness:.4g}"
+        return run.kept(name, lambda: lobe.published.mirror_lobes(brdf, angles=angles, resolution=nodes))
+
+    return dynamic.separate(brdfs, separator=one)
 
 
 def samples(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tuple[jax.Array, float]:
@@ -98,7 +130,8 @@ def sampled_lobes(tensor: jax.Array, direction: jax.Array) -> jax.Array:
         total = jnp.sum(rows, 1, keepdims=True)
 
         def step(weight, _):
-            return weight * ((rows / (weight @ density.T)) @ density), None
+            whole = weight @ density.T  # Zero where a BRDF is: then it has no mass.
+            return weight * (jnp.where(whole > 0, rows / jnp.where(whole > 0, whole, 1), 0) @ density), None
 
         start = jnp.broadcast_to(total / density.shape[1], (len(rows), density.shape[1]))
         weight = jax.lax.scan(step, start, None, length=100)[0]
@@ -135,27 +168,26 @@ def squared_norm(tensor: jax.Array) -> float:
 
 
 def principal(run: Run) -> Iterator[dict[str, Any]]:
-    """What four specular functions leave of both sets, in three norms; the fifth function is the diffuse part."""
+    """What four specular functions leave of both sets, in four norms; the fifth function is the diffuse part."""
     resolution = 8 if run.quick else RESOLUTION
     exponents = (1, 5, 20, 100) if run.quick else range(1, 201)
     families = {"Cook-Torrance": measured(run), "Blinn-Phong": navigation.blinn_phong(exponents=exponents)}
     for name, family in families.items():
-        most = min(6, len(family.brdf))
-        for norm, table in (
-            ("disk", samples(family.brdf, None, resolution=resolution)[0]),
-            ("disk, BRDFs of equal norm", None),
-            ("natural light", reflected(family.brdf, None, resolution=resolution)[0]),
-        ):
-            table = samples(family.brdf, None, resolution=resolution)[0] if table is None else table
-            rows = np.asarray(table).reshape(len(table), -1)
-            product = np.asarray(jnp.asarray(rows) @ jnp.asarray(rows).T, np.float64)
-            if norm.endswith("equal norm"):
-                product /= np.sqrt(np.diag(product) * np.diag(product)[:, None])
+        disk = samples(family.brdf, None, resolution=resolution)[0].reshape(len(family.brdf), -1)
+        light = reflected(family.brdf, None, resolution=resolution)[0].reshape(len(family.brdf), -1)
+        of_disk, of_light = (np.asarray(each @ each.T, np.float64) for each in (disk, light))
+        norm, peak = np.sqrt(np.diag(of_disk)), np.asarray(jnp.max(disk, 1), np.float64)
+        for what, product in {
+            "disk": of_disk,
+            "disk, BRDFs of equal norm": of_disk / norm / norm[:, None],
+            "disk, BRDFs of equal peak": of_disk / peak / peak[:, None],
+            "natural light": of_light,
+        }.items():
             value = np.maximum(np.linalg.eigvalsh(product)[::-1], 0)
             left = 1 - np.cumsum(value) / np.sum(value)
             yield {
-                **{"set": name, "norm": norm, "brdfs": len(family.brdf)},
-                **{"squared_error": left[:most].tolist(), "paper": PRINCIPAL[name]},
+                **{"set": name, "norm": what, "brdfs": len(family.brdf)},
+                **{"squared_error": left[:6].tolist(), "paper": PRINCIPAL[name]},
             }
 
 
@@ -185,22 +217,22 @@ def figure_7(run: Run) -> Iterator[dict[str, Any]]:
 
 def figure_6(run: Run) -> Iterator[dict[str, Any]]:
     """Balls of four measured materials by the tensor alone, and with one to four published lobes."""
-    family, light = measured(run), run.light("grace")
+    family, light = measured(run), run.light("grace", size=32)
     chosen = shininess(family, 2 if run.quick else 4)
+    members = sorted({*chosen, *shininess(family, 4 if run.quick else MEMBERS)})
+    brdfs = [family.brdf[number] for number in members]
     resolution, edge = (8, 16) if run.quick else (RESOLUTION, 384)
-    rings = 8 if run.quick else 112
+    rings = 8 if run.quick else 80
     ball = builtin.sphere(rings=rings, sectors=2 * rings)
     view = camera.orbit(ball, elevation=0.2, width=edge, height=edge)
     number = np.flatnonzero(np.sum(np.asarray(ball.normal) * (np.asarray(view.eye) - np.asarray(ball.position)), 1) > 0)
     sets: dict[str, Any] = {"no lobes": None}
     for count in (1, 4) if run.quick else (1, 2, 3, 4):
-        sets[" ".join(f"{k}°" for k in ANGLES[:count])] = functools.partial(
-            lobe.published.mirror_lobes, angles=ANGLES[:count], resolution=resolution
-        )
+        sets[" ".join(f"{k}°" for k in ANGLES[:count])] = separated(run, brdfs, ANGLES[:count])
     made = {
         name: dynamic.factor(
-            family.brdf,
-            None if each is None else dynamic.separate(family.brdf, separator=each),
+            brdfs,
+            each,
             ranks=(2, 4, 4) if run.quick else (4, 8, 8),
             resolution=resolution,
         )
@@ -211,8 +243,8 @@ def figure_6(run: Run) -> Iterator[dict[str, Any]]:
         exact = drawing.unshadowed(ball, family.brdf[material], light, view.eye, number)
         name = f"{family.name[material]}, m = {place_of(family.brdf[material])[1]:.3g}"
         radiance, row, titles = {"exact": exact}, [], []
-        for lobes, members in made.items():
-            mixed = members.at(jnp.zeros(len(family.brdf)).at[material].set(1))
+        for lobes, factored in made.items():
+            mixed = factored.at(jnp.zeros(len(brdfs)).at[members.index(material)].set(1))
             radiance[lobes] = drawing.unshadowed(ball, mixed, light, view.eye, number)
         for lobes, color in radiance.items():
             wrong = float(np.linalg.norm(color - exact) / np.linalg.norm(exact))

@@ -43,12 +43,15 @@ class Stage:
         seen: What these see.
     """
 
-    def __init__(self, run: Run, name: str, mesh: Mesh, *, ground: int, azimuth: float, part: str = "both"):
+    def __init__(
+        self, run: Run, name: str, mesh: Mesh, *, ground: int, azimuth: float, part: str = "both", wide: float = 1.0
+    ):
         """Traces what is not in the store."""
         below = ground_plane(mesh, vertices=100 if run.quick else ground)
         self.whole = join([mesh, below])
         edge = 16 if run.quick else EDGE
         self.view = camera.orbit(mesh, azimuth=azimuth, elevation=0.35, width=edge, height=edge)
+        self.view = dataclasses.replace(self.view, field_of_view=wide * self.view.field_of_view)
         fragments = image.rasterize(self.whole, self.view, samples=4)
         triangle = np.unique(np.asarray(fragments.triangle))
         vertex = np.unique(np.asarray(self.whole.face)[triangle[triangle >= 0]])
@@ -59,7 +62,7 @@ class Stage:
             self.whole,
             size=8 if run.quick else 64,
             vertex=self.shown,
-            path=run.keep(f"{name}_{part}.prt"),
+            path=run.keep(f"{name}_{part}_{wide:g}.prt"),
             progress=False,
         )
 
@@ -93,9 +96,9 @@ class Stage:
             result.append(np.asarray(color)[0, : len(number) - first])
         return np.concatenate(result)
 
-    def draw(self, color: np.ndarray) -> np.ndarray:
-        """A picture of the colors of the shown vertices, with its coverage. Other vertices are black."""
-        every = np.zeros((len(self.whole.position), 3), np.float32)
+    def draw(self, color: np.ndarray, *, other: Any = 0.0) -> np.ndarray:
+        """A picture of the colors of the shown vertices, with its coverage; others have colors of their own."""
+        every = np.zeros((len(self.whole.position), 3), np.float32) + np.asarray(other, np.float32)
         every[self.shown] = color
         fragments = image.rasterize(self.whole, self.view, samples=4)
         pixels = image.shading_points(fragments, self.whole, self.view)
@@ -149,16 +152,25 @@ def figure_1(run: Run) -> Iterator[dict[str, Any]]:
     drawing.sheet(run.picture("wang2004_figure_1.jpg"), [pictures], [captions])
 
 
+SUN, RADIUS, STRENGTH, SKY = np.array([-0.62, 0.62, -0.48]), 0.05, 400.0, 0.3
+TINT = np.array([1.0, 0.95, 0.9])
+
+
 def sun(size: int) -> Environment:
     """A sun of three degrees radius in a gray sky."""
-    towards = directions.normalize(jnp.array([-0.62, 0.62, 0.48]))
-    disk = cubemap.direction(size=size) @ towards > np.cos(0.05)
-    return Environment(jnp.where(disk[..., None], 400.0, 0.3) * jnp.array([1.0, 0.95, 0.9]))
+    disk = cubemap.direction(size=size) @ directions.normalize(jnp.asarray(SUN)) > np.cos(RADIUS)
+    return Environment(jnp.where(disk[..., None], STRENGTH, SKY) * TINT)
+
+
+def matte(mesh: Mesh) -> np.ndarray:
+    """Radiance of matte vertices in the same light without shadows."""
+    height = np.maximum(np.asarray(mesh.normal) @ (SUN / np.linalg.norm(SUN)), 0)
+    return 0.5 * (STRENGTH * np.sin(RADIUS) ** 2 * height + SKY)[:, None] * TINT
 
 
 def figure_3(run: Run) -> Iterator[dict[str, Any]]:
     """The bunny's shadow on the ground by the number of wavelet coefficients."""
-    stage = Stage(run, "bunny", run.mesh("stanford_bunny.ply"), ground=22_000, azimuth=0.2, part="ground")
+    stage = Stage(run, "bunny", run.mesh("stanford_bunny.ply"), ground=22_000, azimuth=0.2, part="ground", wide=1.5)
     size = stage.seen.size
     light, number = sun(size), np.arange(len(stage.shown))
     ground = separable.published.factor_normalized(Lambert(0.5), resolution=16)
@@ -177,7 +189,7 @@ def figure_3(run: Run) -> Iterator[dict[str, Any]]:
     lit = np.linalg.norm(exact, axis=-1)
     rim = (lit > 0.15 * lit.max()) & (lit < 0.85 * lit.max())
     for keep, color in [(0, exact), *radiance.items()]:
-        drawn = stage.draw(color)
+        drawn = stage.draw(color, other=matte(stage.whole))
         stops = image.automatic_exposure(jnp.asarray(drawn[..., :3])) if stops is None else stops
         pictures.append(drawing.on_white(drawn, stops=stops))
         share = keep / (6 * size**2)
@@ -225,7 +237,7 @@ def figure_4(run: Run) -> Iterator[dict[str, Any]]:
             axis.plot(counts, each, ".-", label=f"{resolution} x {resolution}")
             if resolution == 48 or run.quick:
                 rows.append([light_map(factored.light_map[k]) for k in range(min(8, max(counts)))])
-                captions.append([f"{name}, term {k + 1}" if k == 0 else f"{k + 1}" for k in range(len(rows[-1]))])
+                captions.append([name if k == 0 else f"{k + 1}" for k in range(len(rows[-1]))])
         axis.set(title=name, xlabel="terms", ylabel="cosine-weighted rms error in 1/sr", ylim=(0, None))
     axes[0].legend(fontsize=7)
     figure.tight_layout()
