@@ -105,7 +105,6 @@ def main(options: Sequence[str] | None = None) -> None:
     if arguments.table:
         print(table([json.loads(line) for line in arguments.table.read_text().splitlines()]))
         return
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
     for name in arguments.only or (["walls"] if arguments.quick else RECIPES):
         published = RECIPES[name].published
         if arguments.most and published and published.vertices > arguments.most:
@@ -311,4 +310,5 @@ def _regions(mesh: Mesh) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
     main()
