@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import paper_scenes, path_tracing
-from benchmarks.paper_scenes import RECIPES, Look, Made
+from benchmarks.paper_recipes import RECIPES, Look
+from benchmarks.paper_scenes import Made
 from jaxprt import files, image
 from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert
 from jaxprt.image import rasterize, shading_points

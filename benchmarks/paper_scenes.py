@@ -2,6 +2,7 @@
 
     python -m benchmarks.paper_scenes [--quick] [--only SCENE...] [--most VERTICES] [--store FOLDER]
         [--output FILE]
+    python -m benchmarks.paper_scenes --table FILE      prints the lines of a file as a table
 
 Scenes have several regions whose materials change while all of them light each other. Room, chess, walls and ring are
 made by formula (`jaxprt.scene.interiors`). The others stand in for the paper's meshes, which are not public: scans of
@@ -26,10 +27,9 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import MappingProxyType
+from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,16 +37,17 @@ import numpy as np
 import jaxprt as prt
 from benchmarks import harness
 from benchmarks.interreflection import rms
+from benchmarks.paper_recipes import RECIPES, Look, Published, Recipe
 from jaxprt import bounces, dynamic, separable
 from jaxprt.brdf import Lambert, navigation
 from jaxprt.image import render
-from jaxprt.scene import Camera, Environment, Mesh, builtin, interiors, load_environment, load_mesh
+from jaxprt.scene import Camera, Environment, Mesh, builtin, load_environment
 from jaxprt.scene.environment import rotate
-from jaxprt.scene.mesh import bounds, ground_plane, join, make_mesh
-from jaxprt.scene.occluder import simplify
+from jaxprt.scene.mesh import bounds
 
 EDGE = 512  # pixels
 LOBES = 6
+KINDS = ("view", "material", "light")  # of frames
 SIZES = {"direct": 32, "edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2}
 COOK_TORRANCE = tuple(itertools.product((0.0, 1.0), (0.05, 0.1, 0.2, 0.4, 0.8)))  # F0 and roughness
 BLINN_PHONG = (2.0, 6.0, 20.0, 60.0, 200.0)
@@ -56,62 +57,6 @@ PATHS = {
 }  # of sets along light paths, besides the diffuse one; the paper has four functions
 SHARP = (20.0, 200.0)  # exponents where caustics are looked at
 SHARP_TERMS = 40
-ROOM = (0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9)  # its walls are one region
-
-
-Look = Mapping[int, tuple[Any, Any, Any]]  # of some regions: diffuse color, specular weight, place in the set
-
-
-class Published(NamedTuple):
-    """A row of the paper's Table 1.
-
-    Attributes:
-        name: Its name, with the figure.
-        adjustable: Number of BRDFs that change.
-        vertices: Number of vertices.
-        megabytes: Storage.
-        hours: Precomputation and compression.
-        fps: Frames a second with a new view, new view and BRDFs, and new view, BRDFs and light.
-    """
-
-    name: str
-    adjustable: int
-    vertices: int
-    megabytes: float
-    hours: tuple[float, float]
-    fps: tuple[float, float, float]
-
-
-TWEETY = Published("Tweety (Fig. 11)", 2, 13_000, 148, (2.6, 4.0), (121.58, 28.73, 5.82))
-AIRPLANE = Published("Airplane (Fig. 13)", 2, 13_100, 144, (2.5, 6.4), (139.50, 30.79, 5.91))
-INDOOR = Published("Indoor (Fig. 12)", 2, 35_700, 311, (4.2, 15.1), (74.52, 12.57, 3.40))
-VENUS = Published("Venus (Fig. 1)", 1, 39_700, 389, (5.0, 7.3), (57.09, 10.94, 2.62))
-CHESS = Published("Chess (Fig. 15)", 2, 53_900, 539, (13.7, 10.5), (48.30, 8.23, 1.67))
-WATCH = Published("Watch (Fig. 14)", 2, 62_100, 603, (15.7, 14.3), (43.06, 7.23, 1.53))
-
-
-class Recipe(NamedTuple):
-    """How a scene is made.
-
-    Attributes:
-        mesh: Makes its mesh.
-        space: "CT" or "BP": the set of BRDFs that its free regions move in.
-        free: Its free regions, each with diffuse color, specular weight and place in the set.
-        fixed: Albedos of the other regions, by number.
-        light: Name of its light: a file of the data folder, or "daylight".
-        camera: Eye and target over the diagonal of the scene, from its middle, and the angle of view.
-        published: The paper's row; None where there is none.
-        options: Of the bounces, where they are not the usual ones; and "direct", the edge of the faces of direct light.
-    """
-
-    mesh: Callable[[bool], Mesh]
-    space: str
-    free: Look
-    fixed: dict[int, Any]
-    light: str
-    camera: tuple[Sequence[float], Sequence[float], float]
-    published: Published | None
-    options: Mapping[str, Any] = MappingProxyType({})
 
 
 class Made(NamedTuple):
@@ -155,8 +100,11 @@ def main(options: Sequence[str] | None = None) -> None:
     parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what is precomputed, and go on")
     parser.add_argument("--only", nargs="+", choices=list(RECIPES), metavar="SCENE", help=", ".join(RECIPES))
     parser.add_argument("--most", type=int, metavar="VERTICES", help="leave larger scenes out")
+    parser.add_argument("--table", type=pathlib.Path, metavar="FILE", help="print lines of that file as a table")
     arguments = parser.parse_args(options)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
+    if arguments.table:
+        print(table([json.loads(line) for line in arguments.table.read_text().splitlines()]))
+        return
     for name in arguments.only or (["walls"] if arguments.quick else RECIPES):
         published = RECIPES[name].published
         if arguments.most and published and published.vertices > arguments.most:
@@ -264,6 +212,44 @@ def measure(made: Made, quick: bool) -> Iterator[dict[str, Any]]:
         }
 
 
+def table(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The columns of the paper's Table 1 in Markdown, the paper's figures in parentheses; of a case the last line.
+
+    Args:
+        lines: What was reported, of any scenes; those whose frames are not all there are left out.
+    """
+    rows = [
+        "| scene (the paper's) | vertices | regions, free | precomputation, minutes | tensor, MB | peak, GB "
+        "| new view, fps | new material, fps | new light, fps |",
+        "|---" * 9 + "|",
+    ]
+    found = {line["case"]: line for line in lines}
+    for name in RECIPES:
+        cases = [f"{name}, precompute", *(f"{name}, frame, new {kind}" for kind in KINDS)]
+        if not all(case in found for case in cases):
+            continue
+        first, *each = (found[case] for case in cases)
+        row = RECIPES[name].published
+        theirs = [""] * 6 if row is None else [f" ({value})" for value in _figures(row)]
+        title = name if row is None else f"{name} ({row.name})"
+        cells = [
+            f"{first['vertices']:,}{theirs[0]}",
+            f"{first['regions']}, {first['adjustable']}" + ("" if row is None else f" ({row.adjustable} free)"),
+            f"{first['seconds'] / 60:.1f}{theirs[1]}",
+            f"{first['bytes'] / 1e6:.0f}{theirs[2]}",
+            f"{first['peak_bytes'] / 1e9:.1f}",
+            *(f"{line['fps']:.1f}{fps}" for line, fps in zip(each, theirs[3:], strict=True)),
+        ]
+        rows.append(f"| {title} | " + " | ".join(cells) + " |")
+    return "\n".join(rows)
+
+
+def _figures(row: Published) -> list[str]:
+    """Figures of the paper as they are printed: vertices, minutes, MB, frames a second."""
+    minutes, megabytes = f"{60 * sum(row.hours):,.0f}", f"{row.megabytes:g}"
+    return [f"{row.vertices:,}", minutes, megabytes, *(f"{each:.2f}" for each in row.fps)]
+
+
 def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Array]]]:
     """Kind and function of each frame: every call has another view, other materials, another light."""
     edge = 32 if quick else EDGE
@@ -283,9 +269,9 @@ def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Arra
         color = system.combine(arrived, system.view(cameras[number].eye, now))
         return render(made.mesh, color, cameras[number], background=None)
 
-    yield "view", lambda: frame(False, False)
-    yield "material", lambda: frame(True, False)
-    yield "light", lambda: frame(True, True)
+    changes = ((False, False), (True, False), (True, True))
+    for kind, change in zip(KINDS, changes, strict=True):
+        yield kind, partial(frame, *change)
 
 
 def _darker(made: Made, amount: float) -> Look:
@@ -323,122 +309,6 @@ def _regions(mesh: Mesh) -> int:
     return int(np.max(np.asarray(mesh.region))) + 1
 
 
-def _scan(file: str, faces: int, quick: bool, axes: str = "xyz") -> Mesh:
-    """A scan of the data folder, simplified; a sphere where there is none. Its axes become x, y and z in this order."""
-    path = harness.data() / "meshes" / file
-    if quick or not path.is_file():
-        return builtin.sphere(rings=6, sectors=9)
-    mesh = simplify(load_mesh(path), faces=faces)
-    position = np.asarray(mesh.position, np.float64)
-    columns = [{"x": 0, "y": 1, "z": 2}[each.lower()] for each in axes]
-    sign = [-1.0 if each.isupper() else 1.0 for each in axes]
-    return make_mesh(position[:, columns] * sign, mesh.face, name=file)
-
-
-def _room(quick: bool) -> Mesh:
-    """The room with its three walls as one region; a quick one is as many balls."""
-    if quick:
-        ball = builtin.sphere(rings=4, sectors=6)
-        place = np.stack(np.divmod(np.arange(max(ROOM) + 1), 4), -1) @ np.array([[0, 3.0, 0], [3.0, 0, 0]])
-        return join([make_mesh(np.asarray(ball.position) + each, ball.face) for each in place])
-    mesh = interiors.room()
-    region = jnp.asarray(ROOM, jnp.int32)[mesh.region]
-    return eqx.tree_at(lambda each: each.region, mesh, region)
-
-
-def _grounded(mesh: Mesh, quick: bool, vertices: int, extent: float = 3.0) -> Mesh:
-    """A scan as one region on a ground."""
-    return join([mesh, ground_plane(mesh, vertices=25 if quick else vertices, extent=extent)])
-
-
-_GRAY = np.array([0.3, 0.28, 0.25])
-_RED = np.array([0.7, 0.08, 0.06])
-_ABOVE = (0.0, 0.0, 0.0)
-RECIPES = {
-    "room": Recipe(
-        _room,
-        "BP",
-        {
-            0: ([0.45, 0.3, 0.18], 0.2, 60.0),
-            1: ([0.55, 0.08, 0.06], 0.1, 20.0),
-            2: ([0.7, 0.7, 0.65], 0.05, 6.0),
-        },
-        {
-            **{3: 0.8, 4: [0.2, 0.3, 0.6], 5: [0.4, 0.25, 0.15], 6: [0.8, 0.75, 0.6], 7: [0.5, 0.5, 0.55]},
-            **{8: [0.3, 0.4, 0.3], 9: [0.7, 0.6, 0.2]},
-        },
-        "daylight",
-        ([0.05, 0.03, 0.72], [0.0, -0.06, 0.0], 0.75),
-        INDOOR,
-    ),
-    "walls": Recipe(
-        lambda quick: interiors.corner(_scan("spot.obj", 6000, quick, "XyZ"), cells=4 if quick else 66),
-        "CT",
-        {0: (_GRAY, 0.6, [0.15, 0.2]), 3: (_RED, 0.3, [0.05, 0.4])},
-        {1: 0.6, 2: 0.6},
-        "grace_cross.hdr",
-        ([-0.4, 0.2, 0.75], [0.05, -0.1, -0.05], 0.75),
-        None,
-    ),
-    "ring": Recipe(
-        lambda quick: interiors.ring(spacing=4.0 if quick else 1.5),
-        "BP",
-        {0: (0.02, [0.9, 0.7, 0.35], 200.0)},
-        {1: 0.4},
-        "daylight",
-        ([0.1, 0.66, 0.56], _ABOVE, 0.6),
-        None,
-        {"direct": 64, "edge": 16, "modes": 96},
-    ),
-    "chess": Recipe(
-        lambda quick: interiors.corner(_scan("", 0, quick), cells=4) if quick else interiors.chess_sides(),
-        "CT",
-        {0: ([0.35, 0.05, 0.04], 0.6, [0.1, 0.2]), 1: ([0.6, 0.55, 0.4], 0.6, [0.1, 0.2])},
-        {2: [0.65, 0.55, 0.4], 3: [0.12, 0.08, 0.06]},
-        "grace_cross.hdr",
-        ([0.2, 0.38, 0.75], _ABOVE, 0.6),
-        CHESS,
-    ),
-    "bust": Recipe(
-        lambda quick: interiors.corner(_scan("nefertiti.ply", 50_000, quick, "xzY"), cells=4 if quick else 79),
-        "CT",
-        {0: ([0.25, 0.18, 0.1], 0.7, [0.5, 0.2])},
-        {1: 0.6, 2: 0.6, 3: 0.6},
-        "grace_cross.hdr",
-        ([-0.4, 0.2, 0.75], [0.05, -0.05, -0.05], 0.75),
-        VENUS,
-        {"components": 16},
-    ),
-    "bird": Recipe(
-        lambda quick: _grounded(_scan("stanford_bunny.ply", 19_200, quick), quick, 3364),
-        "CT",
-        {0: ([0.7, 0.55, 0.1], 0.3, [0.05, 0.4]), 1: ([0.1, 0.2, 0.6], 0.5, [0.1, 0.2])},
-        {},
-        "grace_cross.hdr",
-        ([0.15, 0.2, 0.5], _ABOVE, 0.6),
-        TWEETY,
-    ),
-    "airplane": Recipe(
-        lambda quick: _grounded(_scan("dragon_100k.ply", 19_400, quick), quick, 3364),
-        "BP",
-        {0: (_RED, 0.3, 20.0), 1: (0.3, 0.5, 20.0)},
-        {},
-        "grace_cross.hdr",
-        ([0.15, 0.2, 0.5], _ABOVE, 0.6),
-        AIRPLANE,
-    ),
-    "watch": Recipe(
-        lambda quick: _grounded(_scan("happy_buddha_100k.ply", 100_000, quick), quick, 12_100),
-        "CT",
-        {0: (0.02, [0.95, 0.75, 0.4], [0.8, 0.2]), 1: (0.3, 0.5, [0.1, 0.4])},
-        {},
-        "grace_cross.hdr",
-        ([0.25, 0.35, 0.95], _ABOVE, 0.6),
-        WATCH,
-        {"components": 16},
-    ),
-}
-
-
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # So that the seconds of a run that is stopped are kept.
     main()

@@ -18,7 +18,17 @@ BENCHMARKS = sorted(
     path.stem
     for path in (ROOT / "benchmarks").glob("*.py")
     if path.stem
-    not in ("__init__", "cubemap_light", "denoised", "harness", "paper_figures", "path_tracing", "plugins", "prb")
+    not in (
+        "__init__",
+        "cubemap_light",
+        "denoised",
+        "harness",
+        "paper_figures",
+        "paper_recipes",
+        "path_tracing",
+        "plugins",
+        "prb",
+    )
 )
 # Small cases bound the error too: rounding, or thin features of coarse meshes.
 MOST_ERROR = {

@@ -52,3 +52,14 @@ def test_the_background_does_not_count_in_what_a_picture_is_off():
     mine[1, :2] = 0.6
     expected = np.linalg.norm(mine - exact) / np.linalg.norm(exact[1:3])
     assert paper_figures.off(mine, exact) == pytest.approx(expected)
+
+
+def test_the_table_has_the_last_line_of_each_case_beside_the_papers_figures():
+    size = {"vertices": 13072, "regions": 2, "adjustable": 2, "bytes": 100e6, "peak_bytes": 4e9}
+    lines = [{**size, "case": "bird, precompute", "seconds": seconds} for seconds in (1.0, 300.0)]
+    lines += [{**size, "case": f"bird, frame, new {kind}", "fps": 10.0} for kind in paper_scenes.KINDS]
+    _, _, *rows = paper_scenes.table([*lines, {**size, "case": "chess, precompute", "seconds": 1.0}]).splitlines()
+    cells = [each.strip() for each in rows[0].split("|")]
+    assert len(rows) == 1
+    assert cells[2:7] == ["13,072 (13,000)", "2, 2 (2 free)", "5.0 (396)", "100 (148)", "4.0"]
+    assert cells[7:10] == ["10.0 (121.58)", "10.0 (28.73)", "10.0 (5.82)"]
