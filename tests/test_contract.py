@@ -142,6 +142,7 @@ HOST = {
     "systems.dynamic.reflected.stacked": "looks at types",
     "systems.bounces.functions.basis": "counts colors by values",
     "systems.bounces.functions.factor": "checks values",
+    "systems.bounces.functions.shared": "checks values, and turns singular vectors on the host",
     "systems.bounces.functions.fixed_weights": "counts colors by values",
     "systems.bounces.gather.rays": "traces rays",
     "visibility.hits": "traces rays",

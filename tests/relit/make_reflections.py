@@ -17,5 +17,5 @@ if __name__ == "__main__":
     assert spec.loader is not None
     test = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(test)
-    kept = {name: test.rendered(triple) for name, triple in test.triples().items()}
+    kept = {str(roughness): test.rendered(triple) for roughness, triple in test.triples().items()}
     np.savez_compressed(test.KEPT, **{name: value.astype(np.float16) for name, value in kept.items()})

@@ -67,7 +67,7 @@ def precompute(
 
     Returns:
         The tensor of all vertices. Meanwhile the responses of all of them are held: 24 edge^2 bytes for each vertex and
-        light factor of its region, and for two bounces 96 for each function too.
+        light factor of its region, and after that for two bounces 96 bytes for each vertex, light factor and function.
 
     Raises:
         TypeError: A mesh or BRDFs of another kind.
@@ -103,10 +103,10 @@ def precompute(
     function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
     weight, core = found["weight"].reshape(*member.shape, -1), found["core"][..., function]
+    job, parts = job.without_response(), None
     second, brought_twice = None, np.zeros(0)
     if bounces != 1 and function.size:
-        count = min(twice(components), member.shape[1])
-        again = job.again(weight, core, found["mode"], function, components=count)
+        again = job.again(weight, core, found["mode"], function, components=min(twice(components), member.shape[1]))
         second, brought_twice = _second(again, member, job.white[function], least, run)
         worth.append(_rms(brought_twice))
     exchange = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import jax
@@ -167,6 +167,11 @@ class TransferJob(_PathJob):
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
         """What arrives at some vertices, before it is decomposed."""
         return np.moveaxis(self.arrived(part), 3, 1)
+
+    def without_response(self) -> "TransferJob":
+        """The job without what it needs no longer when its blocks are done, some 40 kB for each vertex."""
+        none = tuple(np.zeros((0, *each.shape[1:]), each.dtype) for each in self.response)
+        return replace(self, response=none)
 
     def again(
         self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int

@@ -43,30 +43,26 @@ class Sent(eqx.Module):
         return _values(self, blend, value)
 
 
-def _neighbors(sent: Sent, blend: Blend) -> tuple[Array, Array]:
-    """The lower knot of each vertex, and the weight of the upper one."""
+def _shares(sent: Sent, blend: Blend) -> Float[Array, "v n"]:
+    """Weight of each knot for each vertex: linear between two of them."""
+    if not sent.knot:
+        return jnp.ones((len(blend.weight), 1), blend.weight.dtype)
     (knot,), (parameter,) = sent.knot, blend.parameter
-    return grid.neighbors(grid.place(knot, parameter), size=len(knot))
+    low, upper = (each[:, None] for each in grid.neighbors(grid.place(knot, parameter), size=len(knot)))
+    number = jnp.arange(len(knot))
+    return jnp.where(number == low, 1 - upper, jnp.where(number == low + 1, upper, 0))
 
 
 @jit
 def _mean(sent: Sent, blend: Blend, area: Array) -> Array:
     whole = jnp.sum(area)
-    share = area / jnp.where(whole > 0, whole, 1)
-    if not sent.knot:
-        return jnp.einsum("kp,v,vkc->pc", sent.factor[0], share, blend.weight, precision="highest")
-    low, upper = _neighbors(sent, blend)
-    total = jnp.zeros((len(sent.factor), *blend.weight.shape[1:]), blend.weight.dtype)
-    weight = blend.weight * share[:, None, None]
-    total = total.at[low].add(weight * (1 - upper)[:, None, None]).at[low + 1].add(weight * upper[:, None, None])
+    share = (area / jnp.where(whole > 0, whole, 1))[:, None] * _shares(sent, blend)
+    total = jnp.tensordot(share, blend.weight, (0, 0), precision="highest")
     return jnp.einsum("nkp,nkc->pc", sent.factor, total, precision="highest")
 
 
 @jit
 def _values(sent: Sent, blend: Blend, value: Array) -> Array:
     channel = jnp.matmul(sent.factor, value, precision="highest")
-    if not sent.knot:
-        return jnp.einsum("k,vkc->vc", channel[0], blend.weight, precision="highest")
-    low, upper = _neighbors(sent, blend)
-    each = channel[low] * (1 - upper)[:, None] + channel[low + 1] * upper[:, None]
+    each = jnp.matmul(_shares(sent, blend), channel, precision="highest")
     return jnp.einsum("vk,vkc->vc", each, blend.weight, precision="highest")

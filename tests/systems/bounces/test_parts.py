@@ -8,6 +8,7 @@ one before.
 import functools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -86,6 +87,7 @@ def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
     shading = of_part(metal)
     path = paths.factored(shading)
     assert path.sent is not None
+    assert shading.blend is not None
     sent = path.sent.factor[0] @ bounces.functions.albedo(path.brdf)
     np.testing.assert_allclose(sent, paths.channels(paths.still(shading)), rtol=0.01, atol=1e-3)
     if roughness == 0.05:
@@ -97,19 +99,34 @@ def test_what_parts_send_to_others_follows_their_roughness():
     metal = prt.Part("metal", corner(), TexturedMaterial(0.8, metallic=1.0, roughness=0.4))
     shading = of_part(metal, roughness=(0.1, 0.9))
     path = paths.factored(shading)
-    assert path.sent is not None
+    sent = path.sent
+    assert sent is not None
     view = jnp.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.8, 0.6]])
     met = bounces.functions.project(path.brdf, degree=3) @ path.brdf.view(view)
     for roughness in (0.35, 0.6, 0.9):
         blend = prt.Blend(jnp.ones((4, 2, 1)), (jnp.full(4, np.log(roughness)),))
-        weight = path.sent.mean(blend, jnp.ones(4))[:, 0]
+        weight = sent.mean(blend, jnp.ones(4))[:, 0]
         true = paths.channels(shading.brdf(jnp.log(roughness)))
         albedo = bounces.functions.albedo(path.brdf)
         np.testing.assert_allclose(weight @ albedo, true.sum(), rtol=0.01)
-        np.testing.assert_allclose(path.sent.values(blend, albedo)[:, 0], true.sum(), rtol=0.01)
+        np.testing.assert_allclose(sent.values(blend, albedo)[:, 0], true.sum(), rtol=0.01)
         exact = harmonic.table.project(shading.brdf(jnp.log(roughness)), view, degree=3, rings=48, sectors=96)
         exact = np.moveaxis(np.sum(exact, 1), 1, 0)
         assert np.linalg.norm(met @ weight - exact) < MISSED * np.linalg.norm(exact)
+
+    # A surface of two kinds of roughness sends the mean of both, and follows each of them.
+    blends = [
+        prt.Blend(jnp.ones((2, 2, 1)), (jnp.log(jnp.array(each)),)) for each in ([0.3, 0.3], [0.7, 0.7], [0.3, 0.7])
+    ]
+    one, other, both = (sent.mean(each, jnp.array([1.0, 3.0])) for each in blends)
+    np.testing.assert_allclose(both, (one + 3 * other) / 4, rtol=1e-5, atol=1e-6)
+
+    def of_roughness(logarithm):
+        return jnp.sum(sent.mean(prt.Blend(jnp.ones((2, 2, 1)), (logarithm,)), jnp.array([1.0, 3.0])) ** 2)
+
+    place, step = jnp.log(jnp.array([0.35, 0.62])), jnp.array([0.01, 0.0])
+    numeric = (of_roughness(place + step) - of_roughness(place - step)) / 0.02
+    np.testing.assert_allclose(jax.jit(jax.grad(of_roughness))(place)[0], numeric, rtol=2e-3)
 
 
 def test_weighted_channels_reflect_as_the_brdf_that_they_add_up_to(close):
