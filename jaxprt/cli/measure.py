@@ -66,9 +66,10 @@ def command(**given: Any) -> None:
 def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     """The reports of a scene by each system."""
     scene, lights = inputs.scene(chosen), inputs.lights(chosen)
-    sizes.check(chosen, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
+    systems = chosen.system or ("lobe",)
+    sizes.check(chosen, systems, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
     made, texts = {}, []
-    for system in chosen.system or ("lobe",):
+    for system in systems:
         recipes = {"planned": None} if system == "planned" else sizes.recipes(system, chosen)
         for name, recipe in recipes.items():
             ready = prepared(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)

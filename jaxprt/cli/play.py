@@ -23,6 +23,7 @@ from jaxprt.view import serve
 
 ROUGHNESS = (0.25, 0.8)  # that materials can have; smoother ones take more time for each look
 LOBES = 6
+_PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads still compute
 
 
 @click.command(cls=options.Command, short_help="Play with a scene in the browser.")
@@ -77,7 +78,7 @@ def command(**given: Any) -> None:
     try:
         server.wait()
     except KeyboardInterrupt:
-        server.close()
+        server.close(patience=_PATIENCE)
 
 
 def chosen(arguments: Sequence[str]) -> SimpleNamespace:

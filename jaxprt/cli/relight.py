@@ -82,20 +82,23 @@ def command(**given: Any) -> None:
     chosen = SimpleNamespace(**given)
     with options.telling(chosen.as_json):
         found = _run(chosen)
-    if found is not None:
-        options.tell(found, _text(found, chosen.output / "report.json"), as_json=chosen.as_json)
+    if chosen.part is None:
+        text = _text(found, chosen.output / "report.json")
+    else:
+        done = ["all parts are done: the same command without --part draws the pictures"]
+        text = "\n".join(found["unfinished"] or done)
+    options.tell(found, text, as_json=chosen.as_json)
 
 
-def _run(chosen: SimpleNamespace) -> dict[str, Any] | None:
-    """Draws and measures everything; None where only a part is computed."""
+def _run(chosen: SimpleNamespace) -> dict[str, Any]:
+    """Draws and measures everything; where only a part is computed, what other parts owe."""
     systems, part = _systems(chosen), _part(chosen.part)
     plan = saved(chosen.saved) if chosen.saved is not None else None
     view = inputs.view(chosen, size=64 if plan is None else plan.size)
-    sizes.check(chosen, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
+    sizes.check(chosen, systems, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
     make_folder(chosen.output)
     if part is not None:
-        _share(view, chosen, systems, plan, part)
-        return None
+        return {"unfinished": _share(view, chosen, systems, plan, part)}
     found = _describe(view, chosen)
     names = ", ".join(f"{each.name} {len(each.mesh.position)}" for each in view.scene.parts)
     click.echo(f"jaxprt {found['machine']['jaxprt']}: {names} vertices")
@@ -201,15 +204,17 @@ def make_folder(path: Path) -> None:
         raise ValueError(f"--output must be a folder that can be written to, got {path}")
 
 
-def _share(view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Part) -> None:
-    """Computes one part of the blocks, and says what is left to do."""
+def _share(
+    view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Part
+) -> list[str]:
+    """Computes one part of the blocks; what is left to do."""
     left = []
     for system in systems:
         try:
             _made(system, view, chosen, plan, part)
         except blocks.UnfinishedError as error:
             left.append(str(error))
-    click.echo("\n".join(left or ["all parts are done: the same command without --part draws the pictures"]))
+    return left
 
 
 def _made(

@@ -1,5 +1,6 @@
 """Systems by their names and sizes."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 from jaxprt.relit import Clusters, Harmonics, Lobes, Terms
@@ -8,14 +9,25 @@ from jaxprt.relit.recipes import Recipe
 LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # share of the squared Laplacian that each window leaves
 NAMES = ("lobe", "harmonic", "separable", "clusters")
 _COUNT = 12  # lobes
+_TAKEN = {
+    "lobes": ("lobe",),
+    "texels": ("lobe", "clusters"),
+    "terms": ("separable", "clusters", "dynamic"),
+    "keep": ("separable", "clusters"),
+    "components": ("clusters",),
+    "modes": ("clusters",),
+}
 
 
-def check(options: SimpleNamespace, texels: int) -> None:
-    """Refuses sizes that the light does not have.
+def check(options: SimpleNamespace, systems: Sequence[str], texels: int) -> None:
+    """Refuses sizes that no system takes, or that the light does not have.
 
     Raises:
-        ValueError: There are more wavelet coefficients than texels.
+        ValueError: A size is of another system, or there are more wavelet coefficients than texels.
     """
+    for name, takers in _TAKEN.items():
+        if getattr(options, name) is not None and not set(takers) & set(systems):
+            raise ValueError(f"--{name} needs --system {' or '.join(takers)}, got {','.join(systems)}")
     if options.keep is not None and options.keep > texels:
         raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
 

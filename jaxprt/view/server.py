@@ -33,7 +33,6 @@ const close = mount(document.getElementById("viewer"), ask);
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
 </script></body></html>
 """
-_PATIENCE = 10.0  # seconds
 # Nothing from elsewhere is loaded, and no other page may show or read this one.
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -67,16 +66,18 @@ class Server:
         self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Stops to serve, gives the port back, and waits some seconds for answers that are being computed.
+    def close(self, *, patience: float = 10.0) -> None:
+        """Stops to serve, and gives the port back. Pictures that are being made are given up.
 
-        A thread that computes when the interpreter ends would take the process with it.
+        Args:
+            patience: Seconds to wait for answers that are being computed: a thread that computes when the interpreter
+                ends would end the process with an error.
         """
         self._server.session.end()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-        self._server.idle.wait(_PATIENCE)
+        self._server.idle.wait(patience)
 
     def wait(self) -> None:
         """Waits until the server is closed."""

@@ -84,9 +84,10 @@ def run(place, *more, mesh="mesh.obj", sky=("sky.exr",), output=None):
     """Exit status of the command on small pictures, in a folder of its own."""
     output = output or place / "out"
     files = [*[str(place / name) for name in sky], str(place / mesh)]
-    options = ["--size", "32", "--brdf", "lambert", "--keep", "8", "--output", str(output)]
+    options = ["--size", "32", "--brdf", "lambert", "--output", str(output)]
     system = [] if "--system" in more else ["--system", "separable"]
-    return main(["relight", *options, *system, *more, *files])
+    keep = ["--keep", "8"] if "separable" in ",".join([*system, *more]) else []
+    return main(["relight", *options, *keep, *system, *more, *files])
 
 
 def numbers(tree):
@@ -266,6 +267,8 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--keep", "0"], "'--keep': 0 is not in the range x>=1"),
         (["--keep", "30000"], "--keep must be at most 384, got 30000"),
         (["--terms", "0"], "'--terms': 0 is not"),
+        (["--lobes", "6"], "--lobes needs --system lobe, got separable"),
+        (["--modes", "6", "--system", "lobe,harmonic"], "--modes needs --system clusters, got lobe,harmonic"),
         (["--brdf", "ashikhmin-shirley", "--terms", "3000"], "terms must be between 1 and .* got 3000"),
         (["--brdf", "velvet"], "must be one of lambert, phong, .* got 'velvet'"),
         (["--brdf", "ward:along=nan"], "along of ward must be a finite number, got 'nan'"),
