@@ -252,5 +252,5 @@ def table_1(run: Run) -> Iterator[dict[str, Any]]:
     light = harmonic.project(run.light("grace"), degree=DEGREE)
     rows = relight_harmonic.meshes(run.quick)
     for name, mesh in rows.items():
-        lines = relight_harmonic.frame(name, mesh, table, light, 3)
+        lines = relight_harmonic.frame(name, mesh, table, light, 3 if run.quick else 15)
         yield from ({"row": name, "vertices": len(mesh.position), **line} for line in lines)

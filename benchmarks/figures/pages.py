@@ -218,7 +218,7 @@ PICTURES: dict[str, dict[str, str]] = {
         "kautz2002_figure_7.jpg": "The Buddha with a Phong lobe, and brushed in two directions",
     },
     "kautz2002_figure_8": {
-        "kautz2002_figure_8.jpg": "Two models and three measured paints on a bust, the teapot and the dragon",
+        "kautz2002_figure_8.jpg": "Measured paints on a bust, the teapot and the dragon",
     },
     "wang2004_figure_1": {
         "wang2004_figure_1.jpg": "The dragon in Uffizi and the bunny in Grace",
