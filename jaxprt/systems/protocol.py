@@ -1,9 +1,9 @@
-"""The four verbs that every system has, and what they give together: radiance, sums of systems, bytes.
+"""The four methods of every system, and functions of any system: radiance, sums of systems, bytes.
 
-L = system.light(environment)          redone when the light changes
-A = system.shade(L, materials)         redone when materials change what arrives; the light itself but for bounces
-V = system.view(eye, materials)        redone when the view or the materials change
-radiance = system.combine(A, V)        in the mesh's order of vertices
+L = system.light(environment)          call again when the light changes
+A = system.shade(L, materials)         call again when the light or, with bounces, the materials change; else A is L
+V = system.view(eye, materials)        call again when the eye or the materials change
+radiance = system.combine(A, V)        one row per vertex, in the order of the mesh
 """
 
 import abc
@@ -22,62 +22,63 @@ from jaxprt.scene.points import Points, placed
 
 
 class System(eqx.Module):
-    """Precomputed transport together with the form of the BRDF that it needs: a frozen pytree with four verbs.
+    """Precomputed transport and a BRDF in the form that it needs: an immutable pytree with four methods.
 
-    Subclasses say what `light` and `view` return. Each verb may be called inside `jax.jit`, and all are differentiable
-    in what they are given.
+    Subclasses document what `light` and `view` return. Each method may be called inside `jax.jit` and is differentiable
+    in its arguments.
     """
 
     @abc.abstractmethod
     def light(self, environment: Environment) -> PyTree:
-        """What a light is to this system. Redone when the light changes.
+        """Converts an environment to the form of light that this system uses. Call it again when the light changes.
 
         Raises:
-            TypeError: It is no Environment.
-            ValueError: It is a batch, has another size than the transport, or is not finite.
+            TypeError: The light is not an `Environment`.
+            ValueError: The light is a batch, has another cubemap size than the transport, or is not finite.
         """
 
     def shade(self, light: PyTree, materials: PyTree = None) -> PyTree:
-        """What arrives at the vertices. Redone when materials change that; without bounces it is the light itself."""
+        """Light that arrives at the vertices. With bounces it depends on the materials; otherwise it is `light`."""
         return light
 
     @abc.abstractmethod
     def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> PyTree:
-        """What a view and the materials are to this system. Redone when either changes.
+        """Evaluates the view and the materials in the form that this system uses. Call it again when either changes.
 
         Args:
             eye: Position of the viewer in world units.
-            materials: What the vertices are made of, where that is free: `Blend`, or as the system names it.
+            materials: Materials of the vertices, as a `Blend` or as the system documents; None for those of the BRDF.
 
         Raises:
-            TypeError: The materials are of another kind.
-            ValueError: The eye is not one position or not finite, or materials do not fit the vertices.
+            TypeError: The materials have a type that the system does not accept.
+            ValueError: The eye is not one finite position, or the materials do not fit the vertices.
         """
 
     @abc.abstractmethod
     def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
-        """Radiance that each vertex sends to the eye, linear, in the mesh's order of vertices.
+        """Linear radiance that each vertex sends to the eye, in the order of the mesh's vertices.
 
         Args:
-            light: From `shade`, or from `light` without bounces.
-            view: From `view`.
+            light: The result of `shade`; without bounces also that of `light`.
+            view: The result of `view`.
 
         Raises:
-            TypeError: Light or view were not made by this kind of system.
+            TypeError: The light or the view was not made by this kind of system.
         """
 
     @abc.abstractmethod
     def at(self, points: Any) -> "System":
-        """The same system at points between the vertices instead of the vertices: light is that of the system itself.
+        """The same system, evaluated at surface points instead of vertices. The result of `light` serves both.
 
-        `radiance(system.at(points), ...)` is at the points, in their order, and so are materials. What belongs to the
-        transport of vertices is interpolated; position, frame, view and BRDF are the point's own.
+        `radiance(system.at(points), ...)` returns one row per point, in their order, and takes materials of the points.
+        Light that arrives at vertices is interpolated; each point has its own position, frame, view and BRDF.
 
         Args:
-            points: `Points` on the triangles of the mesh, of a system of several parts a list of one for each.
+            points: `Points` on the triangles of the mesh. A system of several parts takes a list with one `Points` for
+                each part.
 
         Raises:
-            TypeError: They are no points.
+            TypeError: `points` is neither `Points` nor such a list.
         """
 
     @property
@@ -87,15 +88,15 @@ class System(eqx.Module):
 
     @property
     def shared_light(self) -> tuple | None:
-        """What `light` depends on besides the environment: systems of equal values have equal lights. None: on more."""
+        """Key of the result of `light`: systems with equal keys can share it. None if it cannot be shared."""
         return None
 
 
 class VertexSystem(System):
-    """A system of the vertices of one mesh, and of points between them.
+    """A system for the vertices of one mesh, or for points on its triangles.
 
     Attributes:
-        points: Where radiance is asked for; None for the vertices.
+        points: Points at which radiance is evaluated; None for the vertices.
     """
 
     points: Points | None = eqx.field(default=None, kw_only=True)
@@ -104,7 +105,7 @@ class VertexSystem(System):
         """The same system at points: `System.at`.
 
         Raises:
-            ValueError: Points are not on triangles of the mesh.
+            ValueError: The points do not lie on triangles of the mesh.
         """
         require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
         every = eqx.tree_at(lambda each: each.points, self, None, is_leaf=lambda each: each is None)
@@ -112,40 +113,40 @@ class VertexSystem(System):
         return eqx.tree_at(lambda each: each.points, self, points, is_leaf=lambda each: each is None)
 
     def carried(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
-        """What is linear in an attribute of the vertices, where radiance is asked for."""
+        """Interpolates an attribute of the vertices to the points; returns it as it is without points."""
         return attribute if self.points is None else self.points.carry(attribute, axis=axis)
 
     def place(self, transport: Any) -> tuple[Float[Array, "v 3"], Float[Array, "v 3 3"]]:
-        """Positions and frames of where radiance is asked for; `transport` has those of the vertices."""
+        """Positions and frames of the points, or those of the vertices, which `transport` holds."""
         return placed(transport.position, transport.frame, self.points)
 
 
 class Blend(eqx.Module):
-    """What each vertex is made of, over a BRDF of several channels.
+    """Material of each vertex: a weighted sum of basis BRDFs.
 
-    A BRDF with textures is a sum of a few fixed gray BRDFs with weights that vary: the system holds the fixed ones as
-    channels, the blend the weights. Radiance is linear in the weights, and differentiable in them.
+    A textured BRDF is a sum of a few fixed gray BRDFs with weights that vary over the surface. The system holds the
+    fixed BRDFs as channels, and the blend holds the weights. Radiance is linear in the weights.
 
     Attributes:
-        weight: How much each vertex has of each channel k, in each color.
-        parameter: The parameters of each vertex, for a BRDF that was tabulated over some.
+        weight: Weight of each channel k at each vertex, per color c.
+        parameter: BRDF parameters of each vertex, such as roughness, one array for each parameter of the table.
     """
 
     weight: Float[Array, "v k c"]
     parameter: tuple[Float[Array, " v"], ...] = ()
 
     def __check_init__(self):
-        """Refuses weights and parameters that are not finite, and parameters of other numbers of vertices."""
+        """Refuses weights and parameters that are not finite, and parameters whose length differs from the weights'."""
         require.finite("the weights of the blend", self.weight)
         for each in self.parameter:
             require.finite("the parameters of the blend", each)
             require.length("the parameters of the blend", each, len(self.weight))
 
     def check(self, vertices: int, channels: int) -> None:
-        """Refuses a blend of other numbers of vertices or channels.
+        """Refuses a blend with another number of vertices or channels.
 
         Raises:
-            ValueError: It has others.
+            ValueError: The numbers differ.
         """
         if self.weight.shape[:2] != (vertices, channels):
             raise ValueError(
@@ -164,7 +165,7 @@ class Total(System):
     """The sum of several systems over the same vertices, such as direct and reflected light.
 
     Attributes:
-        part: The systems. All get the same materials.
+        part: The systems. All receive the same materials.
     """
 
     part: tuple[System, ...]
@@ -180,7 +181,7 @@ class Total(System):
         return tuple(each.light(environment) for each in self.part)
 
     def shade(self, light: tuple[PyTree, ...], materials: PyTree = None) -> tuple[PyTree, ...]:
-        """What arrives, of each system."""
+        """Light that arrives at the vertices of each system."""
         require.kind("the light", light, tuple, source="Total.light")
         return tuple(each.shade(lit, materials) for each, lit in zip(self.part, light, strict=True))
 
@@ -206,9 +207,9 @@ class Total(System):
 
 
 class Joined(System):
-    """Systems of different vertices, those of one after those of the next, as `scene.mesh.join` puts them.
+    """Systems of different meshes, with their vertices concatenated in the order of `scene.mesh.join`.
 
-    Materials are one of each system, or None.
+    Materials are a list with one entry for each system, or None.
 
     Attributes:
         part: The systems.
@@ -217,7 +218,7 @@ class Joined(System):
     part: tuple[System, ...]
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """The light of each system; of systems that share it made once."""
+        """The light of each system. Systems with the same `shared_light` share one result."""
         made: dict[tuple, PyTree] = {}
         result = []
         for each in self.part:
@@ -229,7 +230,7 @@ class Joined(System):
         return tuple(result)
 
     def shade(self, light: tuple[PyTree, ...], materials: Sequence | None = None) -> tuple[PyTree, ...]:
-        """What arrives, of each system."""
+        """Light that arrives at the vertices of each system."""
         require.kind("the light", light, tuple, source="Joined.light")
         triples = zip(self.part, light, self._given(materials), strict=True)
         return tuple(each.shade(lit, own) for each, lit, own in triples)
@@ -239,7 +240,7 @@ class Joined(System):
         return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
 
     def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
-        """Radiance of all vertices; gray systems get as many colors as the others have."""
+        """Radiance of all vertices. Gray radiance is repeated to the number of colors of the other systems."""
         require.kind("the light", light, tuple, source="Joined.light")
         require.kind("the view", view, tuple, source="Joined.view")
         parts = [each.combine(*sides) for each, *sides in zip(self.part, light, view, strict=True)]
@@ -247,7 +248,7 @@ class Joined(System):
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in parts])
 
     def at(self, points: Sequence) -> "Joined":
-        """Points of each system, one list after the other: `System.at`."""
+        """The systems at points: `System.at`. Takes a list with the points of each system."""
         check_list(points, len(self.part))
         return Joined(tuple(each.at(own) for each, own in zip(self.part, points, strict=True)))
 
@@ -265,27 +266,27 @@ class Joined(System):
 
     @property
     def shared_light(self) -> tuple | None:
-        """Those of the systems, if all have one."""
+        """The keys of all systems; None if one of them has none."""
         keys = tuple(each.shared_light for each in self.part)
         return None if None in keys else (Joined, *keys)
 
 
 def check_list(points: Any, parts: int) -> None:
-    """Refuses what is no list of points for each of so many parts.
+    """Refuses anything but a list with one entry for each part.
 
     Raises:
-        TypeError: It is none.
+        TypeError: It is not a list, or has another length.
     """
     if not isinstance(points, Sequence) or len(points) != parts:
         raise TypeError(f"the points must be a list, one for each of {parts} parts, got {type(points).__name__}")
 
 
 def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
-    """Refuses what is no list of points for each part, of so many vertices.
+    """Refuses anything but a list with `Points` for each part; `vertices` are the numbers of vertices of the parts.
 
     Raises:
-        TypeError: It is none.
-        ValueError: Points are not on triangles of their part.
+        TypeError: It is not such a list.
+        ValueError: Points do not lie on triangles of their part.
     """
     check_list(points, len(vertices))
     for each, count in zip(points, vertices, strict=True):
@@ -295,11 +296,11 @@ def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
 
 
 def total(*systems: System) -> Total:
-    """The sum of systems: `total(direct, bounces)`.
+    """The sum of systems over the same vertices, such as `total(direct, bounces)`.
 
     Raises:
-        TypeError: One of them is no system.
-        ValueError: There are none, or they are of different vertices.
+        TypeError: An argument is not a system.
+        ValueError: There are no systems, or they have different numbers of vertices.
     """
     for each in systems:
         _check(each)
@@ -309,21 +310,22 @@ def total(*systems: System) -> Total:
 def radiance(
     system: System, environment: Environment, *, eye: Float[Array, "3"], materials: PyTree = None
 ) -> Float[Array, "*l v c"]:
-    """Radiance that each vertex sends to the eye: all four verbs of any system.
+    """Radiance that each vertex sends to the eye. Calls the four methods of any system in order.
 
     Args:
         system: The system.
         environment: The light, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
-        materials: As in `System.view`.
+        materials: Materials of the vertices, as a `Blend` or as the system documents; None for those of the BRDF.
 
     Returns:
         Linear radiance in the light's units, in the mesh's order of vertices. Differentiable in the light, the eye and
         the materials.
 
     Raises:
-        TypeError: The first argument is no system, the light no Environment, or materials are of another kind.
-        ValueError: As in the verbs of the system.
+        TypeError: The first argument is not a system, the light is not an `Environment`, or the materials have a type
+            that the system does not accept.
+        ValueError: A batch is empty, or a method of the system raises it.
     """
     _check(system)
     require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
@@ -339,7 +341,7 @@ def radiance(
 
 
 def memory(system: System) -> int:
-    """Bytes that a system holds: transport, and the form of its BRDF."""
+    """Bytes of all arrays of a system: its transport and its BRDF. Shared arrays count once."""
     _check(system)
     return sum(each.nbytes for each in {id(x): x for x in jax.tree.leaves(system) if hasattr(x, "nbytes")}.values())
 

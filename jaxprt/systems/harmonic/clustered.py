@@ -1,12 +1,12 @@
 """Transfer matrices as clustered principal components (Sloan, Hall, Hart, Snyder 2003).
 
-A transfer matrix is the product with the vertex's visibility, turned to the vertex's frame: M = R(frame) W(V), with W
-linear in the harmonics of V up to twice the degree. So the principal components of the matrices of a cluster, turned
-to the world, are W of the principal components of its visibilities, in the metric of the matrices. Components take
-(2 degree + 1)^2 numbers instead of (degree + 1)^4, and no matrix is ever made.
+A transfer matrix multiplies light by a vertex's visibility V and rotates the product to the vertex's frame: M =
+R(frame) W(V). W is linear in the harmonics of V up to twice the degree. The principal components of a cluster's
+matrices, in the world frame, are therefore W of the principal components of its visibilities, in the metric that W
+induces. A component takes (2 degree + 1)^2 numbers instead of (degree + 1)^4, and no matrix is formed.
 
-When the light changes, the components of every cluster meet it once; a vertex then adds up a few of the results. The
-arriving light stays in the world, and the BRDF's harmonics are turned there.
+When the light changes, it is multiplied once by every component of every cluster; each vertex then sums a few of these
+products. The arriving light stays in the world frame, to which the BRDF's coefficients are rotated.
 """
 
 import os
@@ -30,25 +30,26 @@ from jaxprt.sphere import harmonics, products
 from jaxprt.systems.harmonic import transfer
 from jaxprt.visibility import members
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic clustered": 1}
-_COMPONENTS = 16  # of a cluster, if nothing else is asked for
+_COMPONENTS = 16  # default number per cluster
 
 
 class ClusteredTransfer(eqx.Module):
     """Transfer matrices of all vertices, as means and principal components of clusters.
 
-    Weights are stored by row: vertices in the order of their clusters, the last vertex of a smaller cluster repeated.
+    Weights are stored by row. Rows are the vertices in the order of their clusters; smaller clusters are padded by
+    repeating their last vertex.
 
     Attributes:
-        mean: Harmonics of the mean visibility of each cluster, of twice the degree, in the world.
-        component: Those of its n principal components, the leading first.
-        weight: What each vertex takes of each component.
+        mean: SH coefficients of the mean visibility of each cluster p, up to twice the degree, in the world.
+        component: SH coefficients of the n principal components of each cluster, the leading one first.
+        weight: Weight of each component for each of the m vertices of a cluster.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         place: Row of each vertex.
-        left: Squared error of the matrices of each cluster under light of natural spectrum, summed over its rows.
-        total: Their squares, summed alike.
+        left: Squared error of the matrices under light of natural spectrum, summed over the rows of each cluster.
+        total: Squared norm of the matrices under the same light, summed over the rows of each cluster.
     """
 
     mean: Float[Array, "p k"]
@@ -67,7 +68,7 @@ class ClusteredTransfer(eqx.Module):
 
     @property
     def error(self) -> float:
-        """Relative L2 error of all matrices that the components leave, under light of natural spectrum."""
+        """Relative L2 error of the compressed matrices of all vertices, under light of natural spectrum."""
         return float(jnp.sqrt(jnp.sum(self.left) / jnp.sum(self.total)))
 
     @property
@@ -76,23 +77,23 @@ class ClusteredTransfer(eqx.Module):
         return self.mean.nbytes + self.component.nbytes + self.weight.nbytes
 
     def visible(self, vertex: Int[Array | np.ndarray, " b"]) -> Float[Array, "k b"]:
-        """Harmonics of the visibility of some vertices, in the world, as the components have it."""
+        """SH coefficients of the compressed visibility of the given vertices, in the world."""
         row = self.place[jnp.asarray(vertex)]
         cluster = row // self.weight.shape[1]
         weight = self.weight.reshape(-1, self.weight.shape[2])[row]
         return (self.mean[cluster] + jnp.einsum("bn,bnk->bk", weight, self.component[cluster])).T
 
     def matrices(self, vertex: Int[Array | np.ndarray, " b"]) -> transfer.TransferMatrix:
-        """Uncompressed transfer of some vertices, (degree + 1)^4 numbers for each."""
+        """Transfer matrices of the given vertices, (degree + 1)^4 numbers each."""
         vertex = jnp.asarray(vertex)
         matrix = transfer.from_visibility(self.visible(vertex), self.frame[vertex], degree=self.degree)
         return transfer.TransferMatrix(matrix[:, None], self.position[vertex], self.frame[vertex])
 
     def truncate(self, *, components: int) -> "ClusteredTransfer":
-        """The first components of each cluster; the error counts what the others held.
+        """The transfer with the first `components` components of each cluster. The error includes the dropped ones.
 
         Raises:
-            ValueError: There are fewer components, or none is asked for.
+            ValueError: `components` is below 1 or above the number of components.
         """
         require.between("components", components, 1, self.component.shape[1])
         kept, rest = self.component[:, :components], self.component[:, components:]
@@ -106,16 +107,16 @@ class ClusteredTransfer(eqx.Module):
 
 @jit
 def clustered_light(transport: ClusteredTransfer, light: Float[Array, "lm c"]) -> Float[Array, "lm c v"]:
-    """Light that arrives at every vertex, in the world: the light side.
+    """SH coefficients of the light that arrives at every vertex, in the world frame.
 
-    Each component meets the light once, by the operator that multiplies visibility by it.
+    The light is made an operator on visibility, which is applied once to each component.
 
     Args:
         transport: Clustered transfer.
-        light: Coefficients of the distant light in the world.
+        light: SH coefficients of the distant light in the world, from `project`.
 
     Raises:
-        ValueError: Light and transport differ in degree.
+        ValueError: The light and the transport differ in degree.
 
     Reference: Sloan, Hall, Hart, Snyder 2003, section 5.
     """
@@ -151,27 +152,29 @@ def precompute_clustered(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> ClusteredTransfer:
-    """Precomputes transfer with self-shadowing, compressed cluster by cluster: no more than a cluster is ever whole.
+    """Precomputes compressed transfer with self-shadowing. Only one cluster at a time is held uncompressed.
 
-    Vertices are clustered by position and normal. What is least is the squared error of the transfer matrices under
-    light of natural spectrum, summed over the vertices of a cluster.
+    Vertices are clustered by position and normal. The components minimize the squared error of the transfer matrices
+    under light of natural spectrum, summed over the vertices of a cluster.
 
     Args:
         mesh: The vertices to light.
         degree: Highest degree of the harmonics.
-        clusters: Number of clusters; by `jaxprt.visibility.members.clusters_for` if None.
-        components: Principal components of a cluster beside its mean; 16, or as many as it has vertices, if None.
-        size: Edge of the visibility's cubemap faces in texels.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
-        executor: Where clusters are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        clusters: Number of clusters; if None, the number from `jaxprt.visibility.members.clusters_for`.
+        components: Number of principal components per cluster, beside its mean. If None, 16 or the number of vertices
+            per cluster, whichever is smaller.
+        size: Edge of the cubemap faces of visibility, in texels.
+        occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished clusters are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the clusters; if None, the cores of this machine.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: Sizes out of range, more clusters than vertices, more components than vertices in a cluster,
-            positions or normals that are not finite, or a store made from something else.
-        BlockingIOError: The store is being written by another process.
+        ValueError: The degree or the size is out of range, there are more clusters than vertices or more components
+            than vertices in a cluster, positions or normals are not finite, or the folder holds results of other
+            inputs.
+        BlockingIOError: Another process is writing to the folder.
         RuntimeError: A worker of the executor died.
 
     Reference: Sloan, Hall, Hart, Snyder 2003, "Clustered principal components for precomputed radiance transfer".
@@ -207,14 +210,14 @@ def compress(
     """Mean and principal components of the transfer of one cluster.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         degree: Highest degree of the matrices.
-        components: How many components.
+        components: Number of components.
 
     Returns:
-        Harmonics of the mean and of the components, the weights of the vertices; and the squared error that remains
-        with the squares of all, summed over vertices, in the metric of the matrices.
+        SH coefficients of the mean visibility; those of the components; weights of the vertices; and two numbers: the
+        squared error and the squared norm of the matrices, summed over vertices.
     """
     value = transfer.visible(seen, frame, degree=2 * degree).T
     metric = jnp.asarray(_metric(degree), value.dtype)
@@ -230,11 +233,11 @@ def compress(
 
 @lru_cache(maxsize=8)
 def _metric(degree: int) -> np.ndarray:
-    """Squared size of the matrix of each harmonic of the visibility, under light of natural spectrum.
+    """Weight of each squared SH coefficient of visibility in the squared norm of its transfer matrix.
 
-    Expected squares of W(V) L, over lights whose bands have the squares C_l of `harmonics.natural`, are
-    ∫∫ V(s) V(t) K(s, t) K_C(s, t) with K = sum_i y_i(s) y_i(t) and K_C that with factors C: both are zonal, so their
-    product is one factor for each band of V.
+    The light is random, with the variances C_l of `harmonics.natural` in band l. The expected square of W(V) L is ∫∫
+    V(s) V(t) K(s, t) K_C(s, t) with K = sum_i y_i(s) y_i(t) and K_C = sum_i C_i y_i(s) y_i(t). Both kernels are zonal,
+    so their product multiplies each band of V by one factor.
     """
     height, weight = np.polynomial.legendre.leggauss(2 * degree + 1)
     band = np.arange(degree + 1)
@@ -246,7 +249,7 @@ def _metric(degree: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Job(members.ClusterJob, visibility.rays.VisibilityJob):
-    """Clusters of transfer; see `blocks.Job`."""
+    """Job that computes the transfer of each cluster; see `blocks.Job`."""
 
     member: np.ndarray
     degree: int

@@ -1,12 +1,12 @@
-"""Transfer in files that other tools write and read, in the conventions that they have.
+"""Files of transfer vectors and matrices for exchange with other tools, in the SH convention of each tool.
 
-    file        what it holds                                                   arrays
+    file        contents                                                        arrays
     .npz        vectors or matrices, with convention, positions and frames      `coefficient` and others
-    .npy        vectors or matrices alone; reading needs the convention         one
+    .npy        vectors or matrices only; to read it, give the convention       one
     .ply        vectors of vertices, with convention, positions and faces       properties `sh_<index>_<color>`
 
-Vectors are [v, lm, c] of vertices or [f, 3, lm, c] of the corners of triangles; matrices are [v, c, o, i], from the
-light's coefficients i in the world to the arriving ones o in the vertex's frame.
+Vectors are [v, lm, c], one per vertex, or [f, 3, lm, c], one per triangle corner. Matrices are [v, c, o, i]: they map
+coefficients i of the light in the world to coefficients o of the arriving light in the vertex's frame.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from jaxprt.sphere import directions, harmonics
 from jaxprt.sphere.conventions import Convention
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
 
-_AGREE = 1e-4  # of the largest coefficient, or of the mesh's size
+_AGREE = 1e-4  # tolerance, relative to the largest coefficient or to the size of the mesh
 _COMMENT = "jaxprt convention "
 
 
@@ -37,18 +37,20 @@ def export_transfer(
     convention: Convention = Convention(),  # noqa: B008
     corners: bool = False,
 ) -> None:
-    """Writes transfer vectors or matrices as another tool has them.
+    """Writes transfer vectors or matrices in the convention of another tool.
 
     Args:
-        path: A file that ends in .npz, .npy or .ply; PLY holds vectors of vertices.
+        path: Name of the file, with suffix .npz, .npy or .ply. PLY files hold vectors of vertices only.
         transport: Transfer of all vertices of the mesh.
-        mesh: Its mesh, whose positions and faces are written in the tool's axes.
-        convention: The tool's convention, such as `jaxprt.sphere.conventions.TOOLS["Mitsuba 3"]`; ours if left out.
-        corners: Whether vectors are written for each corner of each triangle instead of for each vertex.
+        mesh: The mesh. Its positions and faces are written in the tool's axes.
+        convention: SH convention of the tool, such as `jaxprt.sphere.conventions.TOOLS["Mitsuba 3"]`; the default is
+            that of jaxprt.
+        corners: Whether to write a vector for each corner of each triangle instead of each vertex.
 
     Raises:
-        TypeError: The transport is neither.
-        ValueError: The file's name ends otherwise, the mesh has another number of vertices, or the file cannot hold it.
+        TypeError: The transport is neither a `TransferVector` nor a `TransferMatrix`.
+        ValueError: The suffix is another one, the mesh has another number of vertices than the transport, or the file
+            format cannot hold the transport.
     """
     kind = _suffix(path)
     require.kind("the transport", transport, TransferVector, TransferMatrix, source="jaxprt.harmonic.precompute")
@@ -91,20 +93,21 @@ def import_transfer(
     convention: Convention | None = None,
     what: str | None = None,
 ) -> TransferVector | TransferMatrix:
-    """Reads transfer that another tool, or `export_transfer`, has written for a mesh.
+    """Reads transfer vectors or matrices that another tool or `export_transfer` wrote for a mesh.
 
     Args:
-        path: A .npz, .npy or .ply file; see the top of this module for its arrays.
-        mesh: The mesh, in our world, with the vertices in the file's order.
-        convention: The tool's convention. What the file says if None, and a file that says nothing is refused.
-        what: "vectors", "vectors of corners" or "matrices"; what the file says, or "vectors", if None.
+        path: Name of a .npz, .npy or .ply file; the top of this module lists its arrays.
+        mesh: The mesh in the axes of jaxprt, with its vertices in the order of the file.
+        convention: SH convention of the file. If None, it is read from the file, which must then state it.
+        what: Contents of the file: "vectors", "vectors of corners" or "matrices". If None, it is read from the file;
+            the default is "vectors".
 
     Returns:
-        Transfer for `DiffuseSystem` or `HarmonicSystem`; matrices have the frames of the mesh.
+        Transfer vectors for `DiffuseSystem`, or matrices for `HarmonicSystem` in the frames of the mesh.
 
     Raises:
         ValueError: The convention is not known, arrays have other axes or another number of vertices, values are not
-            finite, positions or frames in the file are others than the mesh's, or corners at a vertex disagree.
+            finite, positions or frames differ from those of the mesh, or vectors of corners at one vertex differ.
     """
     kind, source = _suffix(path), str(path)
     held = (
@@ -143,7 +146,7 @@ def import_transfer(
 
 
 def _said(source: str, text: str) -> Convention:
-    """The convention that a file says."""
+    """The convention that a file states."""
     try:
         return Convention(**json.loads(text))
     except (TypeError, json.JSONDecodeError) as error:
@@ -162,7 +165,7 @@ def _matrices(source: str, value: np.ndarray, mesh: Mesh, convention: Convention
 
 
 def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.ndarray:
-    """Coefficients of vertices from those of corners, which must agree."""
+    """Coefficients of vertices from those of triangle corners, which must agree at each vertex."""
     result = np.full((count, *value.shape[2:]), np.nan, value.dtype)
     result[face] = value
     wrong = np.abs(result[face] - value).max((2, 3)) > _AGREE * np.abs(value).max()
@@ -179,7 +182,7 @@ def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.
 
 
 def _same(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
-    """Refuses vertices that are not those of the mesh."""
+    """Refuses positions or frames in a file that differ from those of the mesh."""
     if found.shape != wanted.shape:
         raise ValueError(f"{name} must be those of the mesh, {list(wanted.shape)}, got {list(found.shape)}")
     off = np.abs(found - wanted).reshape(len(found), -1).max(1)
@@ -199,7 +202,7 @@ def _suffix(path: str | os.PathLike) -> str:
 
 
 def _write_ply(path, position: np.ndarray, face: np.ndarray, value: np.ndarray, convention: str) -> None:
-    """Binary PLY, with a property for each coefficient and color."""
+    """Writes a binary PLY file with one property for each coefficient and color."""
     count, terms, colors = value.shape
     names = [f"sh_{i}_{c}" for i in range(terms) for c in range(colors)]
     properties = [f"property float {name}" for name in (*"xyz", *names)]
@@ -212,8 +215,8 @@ def _write_ply(path, position: np.ndarray, face: np.ndarray, value: np.ndarray, 
 
 
 def _read_ply(path) -> dict[str, np.ndarray]:
-    """Positions, coefficients, and the convention where a comment has it."""
-    import trimesh  # Here, since it takes a second.
+    """Reads positions, coefficients and, if a comment states it, the convention."""
+    import trimesh  # imported here, because importing takes a second
 
     loaded = trimesh.load(path, process=False)
     elements = loaded.metadata["_ply_raw"]

@@ -1,7 +1,8 @@
-"""Interreflection for the harmonic system: bounces added to transfer matrices and vectors, for fixed BRDFs.
+"""Interreflection for the harmonic system: adds bounces to transfer matrices and vectors, for fixed BRDFs.
 
-Each bounce sends a ray through every texel above a vertex's horizon; where it meets the mesh, the vertices around
-shade the light of the bounce before towards it. Sloan, Kautz and Snyder 2002, section 5.
+Each bounce traces a ray from every vertex through every cubemap texel above its horizon. Where the ray hits a triangle,
+the radiance that its corners reflect towards the vertex is interpolated; it comes from the transfer of the previous
+bounce. See Sloan, Kautz and Snyder 2002, section 5.
 """
 
 import os
@@ -24,9 +25,9 @@ from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check, check_memory
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "bounce": 1}
-_RAYS = 1 << 12  # hits that are shaded at once
+_RAYS = 1 << 12  # number of hits shaded at once
 
 
 def interreflect(
@@ -40,23 +41,25 @@ def interreflect(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferMatrix:
-    """Adds the light that the surfaces throw onto each other to transfer matrices; fixes the BRDFs for that light.
+    """Adds light reflected between surfaces to transfer matrices. The BRDFs that reflect it are fixed here.
 
     Args:
-        mesh: The whole scene, which lights itself.
-        transport: Shadowed transfer of all its vertices.
-        brdf: The BRDF of each region of the mesh, of the transport's degree.
-        bounces: How many times light is reflected before it arrives.
-        size: Edge of the cubemap's faces through which rays are sent.
-        path: Folder that keeps the finished blocks of every bounce; a call that was stopped goes on from there.
-        executor: As of `precompute`.
-        progress: As of `precompute`.
+        mesh: Mesh of the whole scene.
+        transport: Shadowed transfer of all vertices of the mesh.
+        brdf: BRDF table of each region of the mesh, of the same degree as the transport and without parameters.
+        bounces: Number of reflections before light arrives at a vertex.
+        size: Edge of the cubemap faces through whose texels rays are traced, in texels.
+        path: Folder in which finished blocks of every bounce are stored. A call that was interrupted continues from
+            there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
+        progress: Whether to show a progress bar.
 
     Returns:
-        Transfer that includes the bounces; colored where a BRDF is.
+        Transfer that includes the bounces. It has colors if a BRDF has.
 
     Raises:
-        ValueError: Transport of other vertices or degree, a region without BRDF, or bounces below 0.
+        ValueError: The transport has other vertices, a BRDF has another degree, a region has no BRDF, or `bounces` is
+            negative.
         MemoryError: The matrices of two bounces do not fit into memory.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5; Sloan, Kautz, Snyder 2002, section 5.
@@ -91,21 +94,22 @@ def interreflect_diffuse(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferVector:
-    """Adds the light that diffuse surfaces throw onto each other to transfer vectors.
+    """Adds light reflected between diffuse surfaces to transfer vectors.
 
     Args:
-        mesh: The whole scene, which lights itself.
-        transport: Shadowed transfer of all its vertices.
-        albedo: Albedo of each region of the mesh.
-        bounces: How many times light is reflected before it arrives.
-        size: Edge of the cubemap's faces through which rays are sent.
-        path: Folder that keeps the finished blocks of every bounce; a call that was stopped goes on from there.
-        executor: As of `precompute`.
-        progress: As of `precompute`.
+        mesh: Mesh of the whole scene.
+        transport: Shadowed transfer of all vertices of the mesh.
+        albedo: Albedo of each region r of the mesh, gray or per color.
+        bounces: Number of reflections before light arrives at a vertex.
+        size: Edge of the cubemap faces through whose texels rays are traced, in texels.
+        path: Folder in which finished blocks of every bounce are stored. A call that was interrupted continues from
+            there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
+        progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: Transport of other vertices, a region without albedo, albedos that are not finite, or bounces
-            below 0.
+        ValueError: The transport has other vertices, a region has no albedo, an albedo is not finite, or `bounces` is
+            negative.
 
     Reference: Sloan, Kautz, Snyder 2002, section 5.
     """
@@ -138,7 +142,7 @@ def _shade(
     barycentric: Float[Array, "m 3"],
     direction: Float[Array, "m 3"],
 ) -> Float[Array, "m l lm"]:
-    """What leaves the hit points against the rays, as a linear map of the light."""
+    """Radiance that hit points reflect back along the rays, as a linear map of the light."""
 
     def one(total, k):
         vertex, weight = corner[:, k], barycentric[:, k]
@@ -156,7 +160,7 @@ def _shade(
 
 @jit
 def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "b l lm lm"]:
-    """The light that arrives from all texels, in the local frame."""
+    """Light that arrives through all texels, as SH coefficients in the local frame."""
     count, texels, colors, terms = leaving.shape
     size = haar.face_edge(texels)
     direction, area = cubemap.direction(size=size).reshape(-1, 3), cubemap.solid_angle(size=size).reshape(-1, 1)
@@ -168,14 +172,14 @@ def _arriving(leaving: Float[Array, "b d l lm"], frame: Float[Array, "b 3 3"]) -
 
 @dataclass(frozen=True)
 class _BounceJob(visibility.rays.VisibilityJob):
-    """Blocks of what one bounce adds to transfer matrices."""
+    """Job that computes what one bounce adds to transfer matrices, in blocks of vertices."""
 
     brdf: tuple[HarmonicBrdf, ...]
-    rows: np.ndarray  # [v, l, o, i] transfer of the bounce before
+    rows: np.ndarray  # [v, l, o, i] transfer of the previous bounce
 
     @cached_property
     def shading(self) -> tuple[Array, Array, Array, tuple[HarmonicBrdf, ...]]:
-        """What hits are shaded with, on the device once for all blocks."""
+        """Arguments of `_shade`, copied to the device once for all blocks."""
         return jnp.asarray(self.rows), jnp.asarray(self.frame), jnp.asarray(self.occluder.region), self.brdf
 
     @property
@@ -202,7 +206,7 @@ class _BounceJob(visibility.rays.VisibilityJob):
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         leaving = np.zeros((len(part), len(direction), self.rows.shape[1], self.rows.shape[3]), np.float32)
         for first in range(0, len(vertex), _RAYS):
-            # Padded with a hit's copies, so that one compiled function serves all.
+            # Padded with copies of the last hit, so that all calls have one shape and share one compiled program.
             at = np.minimum(np.arange(first, first + _RAYS), len(vertex) - 1)
             shaded = _shade(*self.shading, corner[at], barycentric[at], direction[texel[at]])
             leaving[vertex[at], texel[at]] = shaded
@@ -211,9 +215,9 @@ class _BounceJob(visibility.rays.VisibilityJob):
 
 @dataclass(frozen=True)
 class _DiffuseBounceJob(visibility.rays.VisibilityJob):
-    """Blocks of what one bounce adds to transfer vectors."""
+    """Job that computes what one bounce adds to transfer vectors, in blocks of vertices."""
 
-    rows: np.ndarray  # [v, l, i] albedo times the bounce before
+    rows: np.ndarray  # [v, l, i] albedo times the transfer of the previous bounce
     albedo: np.ndarray  # of each region
 
     @property
@@ -245,7 +249,7 @@ class _DiffuseBounceJob(visibility.rays.VisibilityJob):
 
 
 def _check(mesh: Mesh, vertices: int, materials: int, bounces: int) -> None:
-    """Refuses transport of other vertices, regions without a material, and bounces that are no count."""
+    """Refuses transport of other vertices, regions without a material, and bounces that are not a whole number >= 0."""
     if not isinstance(bounces, int | np.integer) or bounces < 0:
         raise ValueError(f"bounces must be a whole number from 0, got {bounces}")
     if vertices != len(mesh.position):

@@ -1,12 +1,13 @@
 """Relighting by spherical harmonics: arbitrary BRDFs under low-frequency light (Kautz, Sloan, Snyder 2002).
 
-The published four steps are `local_light` (rotate the light to each vertex's frame), the view turned to that frame
-and the table looked up there (`view_coefficients`), and their dot product (`combine`). With fixed light a caller keeps
-the first, or `transferred_light`; with fixed view the BRDF's coefficients turned to the world, `world_view` or
-`transferred_view`, which then meet the light's coefficients alone. `radiance` and `unshadowed_radiance` do all of it.
+`local_light` rotates the light to each vertex's frame, `view_coefficients` looks the BRDF up for each vertex's view,
+and `combine` forms their dot product: radiance. With shadows, `transferred_light` takes the place of `local_light`.
+While the light is fixed, keep its result; while the view is fixed, keep that of `world_view`, or of `transferred_view`
+with shadows, which is combined with the coefficients of the distant light. `radiance` and `unshadowed_radiance` do all
+steps.
 
-Lights, eyes and probes must be finite. Inside `jax.jit`, `jax.vmap` and `jax.grad` values are not known and not
-checked: NaN in a light or in an eye then reaches every vertex, NaN in a probe every vertex that it has a share in.
+Lights, eyes and probes must be finite. Values cannot be checked inside `jax.jit`, `jax.vmap` and `jax.grad`: there, NaN
+in a light or an eye reaches every vertex, and NaN at a probe reaches every vertex with a weight of it.
 """
 
 from typing import Any
@@ -73,10 +74,17 @@ def _probe_coefficient(value: Any) -> None:
 
 @require.arguments(light=_environment)
 def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
-    """SH coefficients of an environment, in its radiance times sr^1/2; of each one of a batch.
+    """Projects an environment, or each one of a batch, to spherical harmonics.
+
+    Args:
+        light: An environment, or a batch of them along leading axes.
+        degree: Highest degree of the harmonics.
+
+    Returns:
+        SH coefficients in l(l+1)+m order, in units of radiance times sr^1/2.
 
     Raises:
-        TypeError: The light is no Environment.
+        TypeError: The light is not an `Environment`.
         ValueError: The light is not finite, or the degree is negative.
     """
     *batch, faces, edge, _, colors = light.radiance.shape
@@ -99,19 +107,20 @@ def radiance(
     Differentiable in all arguments.
 
     Args:
-        transport: Transfer matrices.
-        brdf: The BRDF's table.
-        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
-        parameter: Per vertex, the parameters of a BRDF that varies.
-        eye: Position of the viewer.
+        transport: Transfer matrices, from `precompute`.
+        brdf: BRDF table, from `tabulate`.
+        light: SH coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Values of each BRDF parameter at the vertices, if the table has parameters.
+        eye: Position of the viewer in world units.
 
     Returns:
-        Linear radiance; negative where the harmonics ring.
+        Linear radiance. Ringing of the harmonics can make it negative.
 
     Raises:
-        TypeError: The transport is no matrix, the BRDF is no table, or the light is an environment.
-        ValueError: Light, transport and table differ in degree, an array has other axes, or the light or the eye is
-            not finite.
+        TypeError: The transport is not a `TransferMatrix`, the BRDF not a `HarmonicBrdf`, or the light an environment
+            instead of its coefficients.
+        ValueError: Light, transport and table differ in degree, an array has other axes, or the light or the eye is not
+            finite.
 
     Reference: Kautz, Sloan, Snyder 2002, sections 4 and 5.
     """
@@ -128,20 +137,20 @@ def unshadowed_radiance(
     *parameter: Float[Array, " v"],
     eye: Float[Array, "3"],
 ) -> Float[Array, "v _"]:
-    """Radiance of every vertex towards the eye without shadows: nothing is precomputed but the BRDF's table.
+    """Radiance of every vertex towards the eye, without shadows. Only the BRDF table is precomputed.
 
     Args:
-        mesh: The vertices.
-        brdf: The BRDF's table.
-        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
-        parameter: Per vertex, the parameters of a BRDF that varies.
-        eye: Position of the viewer.
+        mesh: The mesh.
+        brdf: BRDF table, from `tabulate`.
+        light: SH coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        parameter: Values of each BRDF parameter at the vertices, if the table has parameters.
+        eye: Position of the viewer in world units.
 
     Returns:
-        Linear radiance; negative where the harmonics ring.
+        Linear radiance. Ringing of the harmonics can make it negative.
 
     Raises:
-        TypeError: The BRDF is no table, or the light is an environment.
+        TypeError: The BRDF is not a `HarmonicBrdf`, or the light is an environment instead of its coefficients.
         ValueError: Light and table differ in degree, an array has other axes, or the light or the eye is not finite.
 
     Reference: Kautz, Sloan, Snyder 2002, section 4.
@@ -155,15 +164,15 @@ def unshadowed_radiance(
 def diffuse_radiance(
     transport: TransferVector, albedo: Float[Array, "..."], light: Float[Array, "lm c *w"]
 ) -> Float[Array, "v _"]:
-    """Radiance of ideal diffuse vertices, the same for all views.
+    """Radiance of ideal diffuse vertices, which is the same for all views.
 
     Args:
-        transport: Transfer vectors.
-        albedo: One for all or one for each vertex.
-        light: Coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
+        transport: Transfer vectors, from `precompute_diffuse`.
+        albedo: Albedo, gray or per color: one for all vertices, or one for each.
+        light: SH coefficients of the distant light in the world, from `project`: one set, or one for each vertex.
 
     Raises:
-        TypeError: The transport is no vector, or the light is an environment.
+        TypeError: The transport is not a `TransferVector`, or the light is an environment instead of its coefficients.
         ValueError: Light and transport differ in degree, or the light has other axes or is not finite.
     """
     return combine(light, transport.vector) * albedo
@@ -174,19 +183,23 @@ def diffuse_radiance(
 def probe_light(
     position: Float[Array, "v 3"], probe: Float[Array, "p 3"], coefficient: Float[Array, "p lm c"]
 ) -> Float[Array, "lm c v"]:
-    """Light that varies over an object: coefficients at some points, interpolated to the vertices.
+    """Interpolates the light at a few probes to the vertices, for light that varies over an object.
 
-    Shepard's weights, by the inverse fourth power of the distance: smooth, exact at the probes, and each vertex's
-    light is a mean of theirs. Where a vertex coincides with a probe derivatives by position are zero.
+    The light of each vertex is a weighted mean of the probes. Weights fall with the fourth power of distance (Shepard
+    interpolation), which is smooth and exact at the probes. Where a vertex coincides with a probe, derivatives with
+    respect to position are zero.
 
     Args:
-        position: Where light is wanted.
-        probe: Where it is known.
-        coefficient: SH coefficients of the light around each probe.
+        position: Vertex positions in world units.
+        probe: Positions of the probes in world units.
+        coefficient: SH coefficients of the light at each probe.
+
+    Returns:
+        SH coefficients of the light at each vertex, in the world.
 
     Raises:
-        TypeError: Probes or coefficients are no arrays.
-        ValueError: There are no probes, the light is not that of as many, or some values are not finite.
+        TypeError: Probes or coefficients are not arrays.
+        ValueError: There are no probes, the numbers of probes and of lights differ, or a value is not finite.
 
     Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting); Shepard 1968.
     """
@@ -203,11 +216,12 @@ def probe_light(
 @require.arguments(light=_light)
 @jit
 def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) -> Float[Array, "lm c v"]:
-    """Light turned to the frame of every vertex: the light side without transfer.
+    """Rotates the light to the frame of every vertex. This is the light side without shadows.
 
     Args:
-        frame: Rows are tangent, bitangent, normal; bitangents that point the other way count as turned around.
-        light: Coefficients in the world: one set, or one for each vertex.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal. The bitangent is replaced by normal x
+            tangent.
+        light: SH coefficients in the world, from `project`: one set, or one for each vertex.
     """
     return rotation.rotate_each(light, right_handed(frame))
 
@@ -215,11 +229,11 @@ def local_light(frame: Float[Array, "v 3 3"], light: Float[Array, "lm c *w"]) ->
 @require.arguments(transport=_matrix, light=_light)
 @jit
 def transferred_light(transport: TransferMatrix, light: Float[Array, "lm c *w"]) -> Float[Array, "lm _ v"]:
-    """Light that arrives at every vertex in its own frame: the light side with transfer.
+    """SH coefficients of the light that arrives at every vertex, in its frame. This is the light side with shadows.
 
     Args:
-        transport: Transfer matrices.
-        light: Coefficients in the world: one set, or one for each vertex.
+        transport: Transfer matrices, from `precompute`.
+        light: SH coefficients in the world, from `project`: one set, or one for each vertex.
 
     Raises:
         ValueError: Light and transport differ in degree.
@@ -246,20 +260,34 @@ def view_coefficients(
     *parameter: Float[Array, " v"],
     eye: Float[Array, "3"] | Float[Array, "v 3"],
 ) -> Float[Array, "lm c v"]:
-    """The BRDF's coefficients for every vertex's view, in its frame: the view side. The eye may be one for each."""
+    """SH coefficients of BRDF x cosine for every vertex's view, in its frame: the view side.
+
+    Args:
+        brdf: BRDF table, from `tabulate`.
+        position: Vertex positions in world units.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        parameter: Values of each BRDF parameter at the vertices, if the table has parameters.
+        eye: Position of the viewer in world units: one, or one for each vertex.
+    """
     return brdf.coefficients(directions.view(right_handed(frame), position, eye), *parameter)
 
 
 @jit
 def world_view(frame: Float[Array, "v 3 3"], view: Float[Array, "lm c v"]) -> Float[Array, "lm c v"]:
-    """`view_coefficients` turned to the world, so that all vertices meet the same light: for a fixed view."""
+    """Rotates `view_coefficients` to the world frame, where all vertices share the same light: for a fixed view."""
     return rotation.rotate_each(view, right_handed(frame).swapaxes(1, 2))
 
 
 @require.arguments(transport=_matrix)
 @jit
 def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) -> Float[Array, "lm _ v"]:
-    """`view_coefficients` through the transfer, to the distant light in the world: for a fixed view with shadows.
+    """Applies transposed transfer matrices to `view_coefficients`: for a fixed view with shadows.
+
+    The result is combined with the coefficients of the distant light in the world.
+
+    Args:
+        transport: Transfer matrices, from `precompute`.
+        view: The result of `view_coefficients`.
 
     Raises:
         ValueError: The table and the transport differ in degree.
@@ -269,7 +297,7 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
     _colors(view.shape[1], colors)
     rows = view.transpose(2, 1, 0)
     if colors == 1:
-        # Color by color, each a product of one vector and one matrix per vertex.
+        # One color at a time: a product of one vector and one matrix per vertex.
         part = [jnp.einsum("voi,vo->iv", transport.matrix[:, 0], rows[:, c]) for c in range(view.shape[1])]
         return jnp.stack(part, 1)
     return jnp.einsum("vcoi,vco->icv", transport.matrix, jnp.broadcast_to(rows, (count, colors, terms)))
@@ -278,14 +306,14 @@ def transferred_view(transport: TransferMatrix, view: Float[Array, "lm c v"]) ->
 @require.arguments(light=_light_shape)
 @jit
 def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Float[Array, "v _"]:
-    """Dot product of light and BRDF coefficients: radiance.
+    """Radiance: the dot product of light and BRDF coefficients.
 
     Args:
-        light: Coefficients of the light, one set or one for each vertex, in the frame that `view` is in.
-        view: Coefficients of the BRDF, or transfer vectors.
+        light: SH coefficients of the light, one set or one for each vertex, in the same frame as `view`.
+        view: SH coefficients of the BRDF, or transfer vectors.
 
     Raises:
-        ValueError: The two differ in degree, or in colors and neither is gray.
+        ValueError: The two differ in degree, or have different numbers of colors and neither is gray.
 
     Reference: Kautz, Sloan, Snyder 2002, equation 1.
     """
@@ -306,7 +334,7 @@ def _colors(mine: int, other: int) -> int:
 
 
 def _color(number: int, colors: int) -> int:
-    """Index of a color in an axis that is gray or colored."""
+    """Index of a color along an axis of length 1 (gray) or one entry per color."""
     return number if colors > 1 else 0
 
 

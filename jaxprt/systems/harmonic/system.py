@@ -1,4 +1,4 @@
-"""The harmonic system: its four verbs."""
+"""The harmonic system: `light`, `shade`, `view` and `combine` for its three kinds of transport."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,15 +17,15 @@ from jaxprt.systems.protocol import Blend
 
 
 class HarmonicSystem(protocol.VertexSystem):
-    """Transfer matrices and the harmonics of a BRDF, under low-frequency light.
+    """Transfer matrices with a BRDF in spherical harmonics, under low-frequency light.
 
-    A `Blend` weights the channels of the table, and has the parameters of each vertex for a table over some.
+    A `Blend` weights the channels of the BRDF table and holds the parameters of each vertex.
 
     Attributes:
         transport: Transfer matrices, from `jaxprt.harmonic.precompute` or `jaxprt.harmonic.interreflect`.
         brdf: The table, from `jaxprt.harmonic.tabulate`.
-        laplacian: Share of the light's squared Laplacian that a window against ringing leaves, from 0 to 1; 1 leaves
-            the light as it is. See `jaxprt.sphere.harmonics.least_laplacian`.
+        laplacian: Share of the light's squared Laplacian that remains after windowing against ringing, from 0 to 1.
+            With 1 there is no window. See `jaxprt.sphere.harmonics.least_laplacian`.
     """
 
     transport: TransferMatrix
@@ -33,7 +33,7 @@ class HarmonicSystem(protocol.VertexSystem):
     laplacian: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
 
     def __check_init__(self):
-        """Refuses transport and BRDFs of other systems or of unlike degrees."""
+        """Refuses transport and BRDFs of other systems, or of different degrees."""
         require.kind("the transport", self.transport, TransferMatrix, source="jaxprt.harmonic.precompute")
         require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
         if self.brdf.degree != self.degree:
@@ -45,36 +45,37 @@ class HarmonicSystem(protocol.VertexSystem):
         return harmonics.degree_of(self.transport.matrix.shape[-1])
 
     def light(self, environment: Environment) -> Float[Array, "lm c v"]:
-        """Harmonics of the light that arrives at each vertex, in its own frame."""
+        """SH coefficients of the light that arrives at each vertex, in its own frame."""
         coefficient = _projected(environment, self.degree)
         window = harmonics.least_laplacian(coefficient, self.laplacian)
         return transferred_light(self.transport, harmonics.convolve(coefficient, window))
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
-        """The BRDF's harmonics for each vertex's view: `jaxprt.harmonic.view_coefficients`."""
+        """SH coefficients of the BRDF for each vertex's view; see `jaxprt.harmonic.view_coefficients`."""
         return blended_view(self.brdf, *self.place(self.transport), materials, eye=eye)
 
     def combine(self, light: Float[Array, "lm c _"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
-        """Radiance: the dot product of light and BRDF."""
+        """Radiance: the dot product of light and BRDF coefficients."""
         require.array("the light", light, "lm c v", source="HarmonicSystem.light")
         require.array("the view", view, "lm c v", source="HarmonicSystem.view")
         return combine(self.carried(light, axis=2), view)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
 
 
 class ClusteredSystem(protocol.VertexSystem):
-    """Clustered principal components of transfer matrices with the harmonics of a BRDF: `HarmonicSystem` in few bytes.
+    """`HarmonicSystem` with transfer matrices compressed by clustered principal components.
 
-    The arriving light stays in the world, and the view's harmonics are turned there.
+    The arriving light stays in the world frame, to which the coefficients of the view are rotated.
 
     Attributes:
         transport: Clustered transfer, from `jaxprt.harmonic.precompute_clustered`.
         brdf: The table, from `jaxprt.harmonic.tabulate`.
-        laplacian: Share of the light's squared Laplacian that a window against ringing leaves, as in `HarmonicSystem`.
+        laplacian: Share of the light's squared Laplacian that remains after windowing against ringing, from 0 to 1.
+            With 1 there is no window.
     """
 
     transport: ClusteredTransfer
@@ -82,7 +83,7 @@ class ClusteredSystem(protocol.VertexSystem):
     laplacian: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
 
     def __check_init__(self):
-        """Refuses transport and BRDFs of other systems or of unlike degrees."""
+        """Refuses transport and BRDFs of other systems, or of different degrees."""
         source = "jaxprt.harmonic.precompute_clustered"
         require.kind("the transport", self.transport, ClusteredTransfer, source=source)
         require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
@@ -92,54 +93,54 @@ class ClusteredSystem(protocol.VertexSystem):
             )
 
     def light(self, environment: Environment) -> Float[Array, "lm c v"]:
-        """Harmonics of the light that arrives at each vertex, in the world."""
+        """SH coefficients of the light that arrives at each vertex, in the world."""
         coefficient = _projected(environment, self.transport.degree)
         window = harmonics.least_laplacian(coefficient, self.laplacian)
         return clustered_light(self.transport, harmonics.convolve(coefficient, window))
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
-        """The BRDF's harmonics for each vertex's view, turned to the world."""
+        """SH coefficients of the BRDF for each vertex's view, rotated to the world."""
         position, frame = self.place(self.transport)
         return world_view(frame, blended_view(self.brdf, position, frame, materials, eye=eye))
 
     def combine(self, light: Float[Array, "lm c _"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
-        """Radiance: the dot product of light and BRDF."""
+        """Radiance: the dot product of light and BRDF coefficients."""
         require.array("the light", light, "lm c v", source="ClusteredSystem.light")
         require.array("the view", view, "lm c v", source="ClusteredSystem.view")
         return combine(self.carried(light, axis=2), view)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
 
 
 class DiffuseSystem(protocol.VertexSystem):
-    """Transfer vectors: ideal diffuse vertices, which look the same from everywhere.
+    """Transfer vectors for ideal diffuse surfaces, whose radiance is the same for all views.
 
-    A `Blend` has one channel, the albedo of each vertex; it takes the place of `albedo`.
+    A `Blend` has one channel, the albedo of each vertex, and replaces `albedo`.
 
     Attributes:
         transport: Transfer vectors, from `jaxprt.harmonic.precompute_diffuse`.
-        albedo: One for all vertices, gray or a color.
+        albedo: Albedo of all vertices, gray or per color.
     """
 
     transport: TransferVector
     albedo: Float[Array, " c"]
 
     def __check_init__(self):
-        """Refuses other transport, and an albedo that is no color."""
+        """Refuses other transport, and an albedo that is negative or has neither one nor three colors."""
         source = "jaxprt.harmonic.precompute_diffuse"
         require.kind("the transport", self.transport, TransferVector, source=source)
         require.array("the albedo", self.albedo, "1", "3")
         require.at_least("the albedo", self.albedo, 0.0)
 
     def light(self, environment: Environment) -> Float[Array, "lm c"]:
-        """Harmonics of the light: `jaxprt.harmonic.project`."""
+        """SH coefficients of the light, from `jaxprt.harmonic.project`."""
         return _projected(environment, harmonics.degree_of(self.transport.vector.shape[0]))
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
-        """The albedo, of all or of each; the eye changes nothing."""
+        """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
         protocol.check_blend(materials)
         require.position("the eye", eye, each=self.vertices)
         if materials is None:
@@ -148,24 +149,24 @@ class DiffuseSystem(protocol.VertexSystem):
         return materials.weight[:, 0]
 
     def combine(self, light: Float[Array, "lm c"], view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
-        """Radiance: the dot product of light and transfer, times the albedo."""
+        """Radiance: the dot product of light and transfer vectors, times the albedo."""
         require.array("the light", light, "lm c", source="DiffuseSystem.light")
         require.array("the view", view, "v c", source="DiffuseSystem.view")
         return self.carried(combine(light, self.transport.vector)) * view
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:
-        """The coefficients depend on the environment alone."""
+        """Key of the light, which depends on the environment and the number of coefficients only."""
         return DiffuseSystem, self.transport.vector.shape[0]
 
 
 def _projected(environment: Environment, degree: int) -> Float[Array, "lm c"]:
-    """Harmonics of one environment."""
+    """SH coefficients of one environment."""
     require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
     if environment.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(environment.radiance.shape)}")
@@ -180,11 +181,18 @@ def blended_view(
     *,
     eye: Float[Array, "*p 3"],
 ) -> Float[Array, "lm c v"]:
-    """`jaxprt.harmonic.view_coefficients` of a table whose channels and parameters a blend has for each vertex.
+    """`jaxprt.harmonic.view_coefficients` with the materials of a blend, whose weights sum the table's channels.
+
+    Args:
+        brdf: BRDF table, from `tabulate`.
+        position: Vertex positions in world units.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        materials: Weights and parameters of each vertex; None for the table's own channels as colors.
+        eye: Position of the viewer in world units: one, or one for each vertex.
 
     Raises:
-        TypeError: The materials are no `Blend`.
-        ValueError: They are of other vertices or channels.
+        TypeError: The materials are not a `Blend`.
+        ValueError: The blend has another number of vertices or channels.
     """
     protocol.check_blend(materials)
     parameter = () if materials is None else materials.parameter

@@ -1,10 +1,10 @@
-"""The harmonic form of a BRDF: f times cosine in spherical harmonics of the light, tabulated over the view direction.
+"""BRDF x cosine in spherical harmonics of the light direction, tabulated over the view direction.
 
     f*(s, v) = f(s, v) max(0, s_z) = sum_i c_i(v) y_i(s),        c_i(v) = ∫ y_i(s) f*(s, v) ds
 
-as published by Kautz, Sloan and Snyder (2002), with one or two further parameters of the BRDF where it varies over a
-surface. An isotropic BRDF is tabulated over the view angle alone: for a view at azimuth phi its coefficients are those
-at azimuth 0, rotated about z by phi.
+as published by Kautz, Sloan and Snyder (2002). The table may have one or two more axes, for BRDF parameters that vary
+over a surface. An isotropic BRDF is tabulated over the view angle only: its coefficients for a view at azimuth phi are
+those at azimuth 0, rotated about z by phi.
 """
 
 import itertools
@@ -23,32 +23,32 @@ from jaxprt.brdf import grid
 from jaxprt.compile import jit
 from jaxprt.sphere import harmonics, hemisphere, rotation
 
-# Rings and sectors of the quadrature, one after the other until the error is reached; the last is for judging alone.
+# Rings and sectors of the quadrature, tried in this order until the error is met. The last one only measures errors.
 _RULES = ((24, 96), (32, 160), (48, 320), (64, 640), (96, 960))
-_ANGLES = (48, 96, 192, 384, 768)  # nodes of the view angle that are tried
-_EDGES = (16, 32, 64, 128)  # edges of maps that are tried
-_ERROR = 1e-3  # asked for where nothing is said
-_WORTHWHILE = 0.8  # A finer table must have at most this share of the error, or finer ones still are not tried.
-_ISOTROPIC = 1e-4  # Rotated coefficients of sharp BRDFs agree so well in float32.
-_PROBES = 48  # views at which errors are measured
-_BATCH = 16  # views integrated at once
+_ANGLES = (48, 96, 192, 384, 768)  # numbers of view angle nodes, tried in this order
+_EDGES = (16, 32, 64, 128)  # edges of parabolic maps, tried in this order
+_ERROR = 1e-3  # default error
+_WORTHWHILE = 0.8  # Refinement stops when a finer table has more than this share of the coarser one's error.
+_ISOTROPIC = 1e-4  # relative difference of rotated coefficients that float32 rounding causes for sharp BRDFs
+_PROBES = 48  # number of views at which errors are measured
+_BATCH = 16  # number of views integrated at once
 _TINY = 1e-12
 
 
 class HarmonicBrdf(eqx.Module):
-    """A BRDF times cosine as SH coefficients of the light direction, tabulated over the view direction.
+    """BRDF x cosine as SH coefficients of the light direction, tabulated over the view direction.
 
     Attributes:
-        table: Coefficients in l(l+1)+m order, gray or one per color. Axes after these two follow the parameters. The
-            last axis, or the last two, are nodes of the view: tables of isotropic BRDFs are over tan(theta / 2) from
-            the normal to the horizon, at azimuth 0; others are parabolic maps.
-        knot: Increasing values of each parameter at which the table was made; none where the BRDF does not vary.
-        error: Relative L2 error of the coefficients that are looked up, over some fifty views that are evenly spread in
-            height and not nodes of the table; of a BRDF that varies the largest, at the knots and halfway between
-            them. NaN where it is not known. Views that graze the surface may have several times it.
+        table: SH coefficients in l(l+1)+m order, then gray or colors, then one axis per BRDF parameter, then nodes of
+            the view direction. Isotropic tables have one axis of nodes, at even steps of tan(theta / 2) from the normal
+            to the horizon and azimuth 0. Anisotropic tables have two, of a parabolic map.
+        knot: Increasing values of each BRDF parameter at which the table has entries; empty without parameters.
+        error: Relative L2 error of interpolated coefficients over about fifty views between the nodes, spread evenly in
+            cos(theta). With parameters it is the largest error at and halfway between the knots. NaN if unknown.
+            Grazing views may have several times this error.
     """
 
-    holds_cosine: ClassVar = True  # Values are the BRDF times the cosine.
+    holds_cosine: ClassVar = True  # values include the cosine of the light direction
 
     table: Float[Array, "lm c *q"]
     knot: tuple[Float[Array, " _"], ...]
@@ -61,12 +61,12 @@ class HarmonicBrdf(eqx.Module):
 
     @property
     def isotropic(self) -> bool:
-        """Whether the table is over the view angle alone."""
+        """Whether the table depends on the view angle only, not on the azimuth."""
         return self.table.ndim - len(self.knot) == 3
 
     @property
     def steps(self) -> float:
-        """Nodes for one unit of tan(theta / 2), in the table of an isotropic BRDF."""
+        """Number of nodes per unit of tan(theta / 2), for an isotropic table."""
         resolution = self.table.shape[-1]
         return (resolution - 1) / _outermost(resolution)
 
@@ -76,25 +76,29 @@ class HarmonicBrdf(eqx.Module):
         return self.table.nbytes
 
     def truncate(self, *, degree: int) -> "HarmonicBrdf":
-        """The table with fewer bands; its error is no longer known and reads NaN where bands were dropped."""
+        """The table with the bands up to `degree`. If bands are dropped, its error is unknown and set to NaN."""
         if not 0 <= degree <= self.degree:
             raise ValueError(f"degree must be between 0 and the table's {self.degree}, got {degree}")
         error = self.error if degree == self.degree else jnp.full_like(self.error, jnp.nan)
         return HarmonicBrdf(self.table[: (degree + 1) ** 2], self.knot, error)
 
     def coefficients(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> Float[Array, "lm c v"]:
-        """Coefficients c_i(wo), linearly between nodes of the view and between knots of each parameter.
+        """SH coefficients c_i(wo), interpolated linearly between view nodes and between the knots of each parameter.
 
-        Zero below the horizon. Parameters outside their knots count as the nearest knot. Differentiable in the view,
-        the normal included.
+        They are zero for views below the horizon. Parameters are clamped to the range of their knots. Differentiable in
+        the view direction, also at the normal.
+
+        Args:
+            wo: Unit directions to the viewer in the local frame.
+            parameter: Values of each BRDF parameter for these views.
 
         Raises:
-            ValueError: The number of parameters is not that of the table.
+            ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
         resolution = self.table.shape[-1]
-        # At the normal the azimuth is undefined; there (x, y) / sin_o is 0, as all orders but m = 0 are.
+        # At the normal the azimuth is undefined. There (x, y) / sin_o is 0, and so are all coefficients except m = 0.
         sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
         if self.isotropic:
             place = [sin_o / (1 + jnp.maximum(wo[:, 2], 0)) * self.steps]
@@ -112,9 +116,9 @@ class HarmonicBrdf(eqx.Module):
     def __call__(
         self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"], *parameter: Float[Array, "*b"]
     ) -> Float[Array, "*b c"]:
-        """Value of the BRDF times the cosine of wi in 1/sr, as far as the harmonics carry it; may be negative.
+        """BRDF x cosine of wi in 1/sr, reconstructed from the harmonics.
 
-        Not zero below the horizon of wi, where the sum rings about zero.
+        Ringing can make it negative, and nonzero for wi below the horizon.
         """
         batch = wo.shape[:-1]
         basis = harmonics.evaluate(wi.reshape(-1, 3), degree=self.degree)
@@ -130,26 +134,28 @@ def tabulate(
     resolution: int | None = None,
     knot: Sequence[np.ndarray] = (),
 ) -> HarmonicBrdf:
-    """Tabulates a BRDF times cosine in spherical harmonics.
+    """Tabulates BRDF x cosine in spherical harmonics.
 
-    Tables of BRDFs that are isotropic, as far as these harmonics tell, are over the view angle alone; others are maps.
+    The table of an isotropic BRDF depends on the view angle only; that of an anisotropic one is a parabolic map.
+    Whether the BRDF is isotropic is tested at a few views.
 
     Args:
-        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the
-            parameters that makes one.
-        degree: Highest degree of the harmonics: 4 for the 25 coefficients of the paper.
-        error: Largest error of the table, see `HarmonicBrdf`; 1e-3 if neither it nor a resolution is given. Warns if
-            the table misses it.
-        resolution: Nodes of the view angle, or edge of the parabolic map of an anisotropic BRDF. If None, as many as
-            the error needs, up to 768 nodes or an edge of 128.
-        knot: For a BRDF that varies, the increasing values of each of its one or two parameters.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions: a model or any function. With `knot`, a
+            function of the parameters that returns such a BRDF.
+        degree: Highest degree of the harmonics; 4 gives the 25 coefficients of the paper.
+        error: Largest error of the table; see `HarmonicBrdf`. The default is 1e-3 if `resolution` is None. A table that
+            misses it causes a warning.
+        resolution: Number of view angle nodes, or edge of the parabolic map of an anisotropic BRDF. If None, as many as
+            the error requires, up to 768 nodes or an edge of 128.
+        knot: Increasing values of each BRDF parameter, of which there are one or two, for a BRDF that varies over the
+            surface.
 
     Returns:
-        The table, with the error that was measured.
+        The table, with its measured error.
 
     Raises:
-        ValueError: An option is out of range, knots do not increase, or the BRDF has values that are not finite or
-            no axis for colors.
+        ValueError: An option is out of range, knots do not increase, or the BRDF returns values that are not finite or
+            have no color axis.
 
     Reference: Kautz, Sloan, Snyder 2002, section 3.
     """
@@ -166,7 +172,7 @@ def tabulate(
         [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in every]
         for every in (points, halfway)
     )
-    # A middle and the extreme parameters stand for all where the number of nodes is chosen.
+    # The quadrature is chosen for the first, middle and last parameters only.
     rule, finer, quadrature = _choose_rule(
         [made[i] for i in sorted({0, len(made) // 2, len(made) - 1})], degree, wanted
     )
@@ -176,7 +182,7 @@ def tabulate(
     sizes = (_ANGLES if isotropic else _EDGES) if resolution is None else (resolution,)
     known: list[tuple[float, HarmonicBrdf]] = []
     for size in sizes:
-        # Linear interpolation has an error of second order: a size that is far from enough is not tried.
+        # The error of linear interpolation is of second order. Sizes that are predicted to miss it by far are skipped.
         if known and 2 * wanted * (size / known[-1][1].table.shape[-1]) ** 2 < known[-1][0] and size != sizes[-1]:
             continue
         table = _table(made, points, knots, _nodes(size, isotropic), degree, rule)
@@ -206,14 +212,14 @@ def project(
     """SH coefficients of f(wi, wo) max(0, wi_z) for given views, by quadrature on arcs around the mirror direction.
 
     Args:
-        brdf: A BRDF that is a pytree and callable, as the models are.
-        wo: Unit view directions in the local frame.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr that is a callable pytree, as the models are.
+        wo: Unit directions to the viewer in the local frame.
         degree: Highest degree of the harmonics.
-        rings: Number of nodes on an arc.
+        rings: Number of quadrature nodes on each arc.
         sectors: Number of arcs.
 
     Returns:
-        Coefficients in l(l+1)+m order; zero for views below the horizon where the BRDF is.
+        SH coefficients in l(l+1)+m order. They are zero for views at which the BRDF is zero.
 
     Reference: Kautz, Sloan, Snyder 2002, section 3.
     """
@@ -230,7 +236,7 @@ def project(
 
 
 def _project(brdf: Callable, wo: Array, degree: int, rule: tuple[int, int]) -> np.ndarray:
-    """`project` of many views, as many at once as there are probes: what was compiled for these serves again."""
+    """`project` for many views, in blocks of the number of probes, so that one compiled program serves all."""
     block = np.resize(wo, (-(-len(wo) // _PROBES), _PROBES, 3))
     value = [
         np.asarray(project(brdf, jnp.asarray(each), degree=degree, rings=rule[0], sectors=rule[1])) for each in block
@@ -241,10 +247,10 @@ def _project(brdf: Callable, wo: Array, degree: int, rule: tuple[int, int]) -> n
 def _table(
     made: Sequence[Callable], points: Sequence[tuple], knots: tuple, wo: Array, degree: int, rule: tuple[int, int]
 ) -> HarmonicBrdf:
-    """The table of some BRDFs on the nodes `wo` [*q 3], its error not yet known; gray ones are as colored as others.
+    """The table of BRDFs at the view nodes `wo` [*q 3], with an error of NaN. Gray BRDFs are repeated to all colors.
 
     Raises:
-        ValueError: A BRDF has values that are not finite.
+        ValueError: A BRDF returns values that are not finite.
     """
     tables = [_project(each, wo.reshape(-1, 3), degree, rule) for each in made]
     for point, table in zip(points, tables, strict=True):
@@ -259,7 +265,7 @@ def _table(
 
 
 def _missed(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequence[np.ndarray]) -> float:
-    """Largest relative error of what is looked up at some parameters."""
+    """Largest relative error of interpolated coefficients over the given parameter values."""
     error = [0.0]
     for point, expected in zip(points, truth, strict=True):
         value = np.asarray(_looked_up(table, wo, tuple(jnp.full(len(wo), each, wo.dtype) for each in point)))
@@ -278,12 +284,12 @@ def _difference(value: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _outermost(resolution: int) -> float:
-    """tan(theta / 2) of the last node: a quarter of a step above the horizon, where a BRDF has no value."""
+    """tan(theta / 2) of the last node, a quarter of a step above the horizon: at the horizon a BRDF has no value."""
     return 1 - 0.25 / resolution
 
 
 def _nodes(resolution: int, isotropic: bool) -> Float[Array, "*q 3"]:
-    """View directions of the nodes of a table."""
+    """View directions at the nodes of a table."""
     if not isotropic:
         return hemisphere.parabolic_texel_direction(resolution=resolution)
     radius = np.linspace(0, _outermost(resolution), resolution)
@@ -298,13 +304,13 @@ def _views(height: np.ndarray, angle: np.ndarray) -> Float[Array, "v 3"]:
 
 
 def _probe_views() -> Float[Array, "v 3"]:
-    """Views at which errors are measured: evenly spread in height, their azimuths by the golden angle."""
+    """Views at which errors are measured: evenly spread in cos(theta), with azimuths in steps of the golden angle."""
     number = np.arange(_PROBES)
     return _views((number + 0.5) / _PROBES, number * np.pi * (3 - np.sqrt(5)))
 
 
 def _is_isotropic(brdf: Callable, error: float, degree: int, rule: tuple[int, int]) -> bool:
-    """Whether coefficients at some azimuths are those at azimuth 0, rotated about z."""
+    """Whether the coefficients at other azimuths equal those at azimuth 0 rotated about z, within the error."""
     number = np.arange(_PROBES // 2)
     height, angle = (number + 0.5) / len(number), 1 + number * np.pi * (3 - np.sqrt(5))
     both = jnp.concatenate([_views(height, 0 * angle), _views(height, angle)])
@@ -316,7 +322,7 @@ def _is_isotropic(brdf: Callable, error: float, degree: int, rule: tuple[int, in
 def _choose_rule(
     brdfs: Sequence[Callable], degree: int, error: float
 ) -> tuple[tuple[int, int], tuple[int, int], float]:
-    """Rings and sectors that reach half an error, the next finer ones that judge them, and the error reached."""
+    """Chooses a quadrature with at most half the error; returns it, the finer one that measured it, and its error."""
     wo = _probe_views()
 
     def integrals(rule):
@@ -326,7 +332,7 @@ def _choose_rule(
     for finer in _RULES[1:]:
         fine = integrals(finer)
         reached = max(_difference(a, b) for a, b in zip(coarse, fine, strict=True))
-        if not reached > error / 2 or finer == _RULES[-1]:  # No rule helps what is NaN.
+        if not reached > error / 2 or finer == _RULES[-1]:  # NaN does not improve with a finer rule.
             break
         rule, coarse = finer, fine
     return rule, finer, reached

@@ -1,8 +1,8 @@
-"""Transport of the harmonic system: how an object shadows and lights itself, as linear maps of the light's SH.
+"""Transport of the harmonic system: self-shadowing and interreflection as linear maps of the light's SH coefficients.
 
-A transfer matrix takes coefficients of distant light in the world to those of the light that arrives at a vertex, in
-the vertex's own frame; with a BRDF's coefficients it gives radiance for any view. A transfer vector is what remains
-of it for an ideal diffuse surface of albedo 1.
+A transfer matrix maps SH coefficients of distant light in the world to those of the light that arrives at a vertex, in
+the vertex's frame. The dot product of these with a BRDF's coefficients is radiance, for any view. A transfer vector is
+the same for an ideal diffuse surface of albedo 1: its dot product with the light is radiance.
 """
 
 import os
@@ -24,7 +24,7 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, products, rotation
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic": 1}
 
 
@@ -32,11 +32,11 @@ class TransferMatrix(eqx.Module):
     """Light that arrives at each vertex, as a linear map of the distant light.
 
     Attributes:
-        matrix: To each coefficient of the arriving light in the local frame (third axis) from those of the light in
-            the world (last axis); gray, or one per color where colored surfaces light each other. Vertices come
-            first, so that a view's coefficients meet a matrix in one place.
+        matrix: Transfer matrices [v, color, row, column]. Rows are coefficients of the arriving light in the local
+            frame, columns those of the distant light in the world. The color axis is 1 (gray), or one per color with
+            interreflection between colored surfaces. Vertices come first, so that each matrix is contiguous in memory.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
     """
 
     matrix: Float[Array, "v l lm lm"]
@@ -50,10 +50,10 @@ class TransferMatrix(eqx.Module):
 
 
 class TransferVector(eqx.Module):
-    """Radiance that leaves each vertex, were it ideally diffuse with albedo 1, as a linear map of the distant light.
+    """Radiance that each vertex would reflect if it were ideal diffuse with albedo 1, as a linear map of distant light.
 
     Attributes:
-        vector: For each coefficient of the light in the world; gray, or one per color.
+        vector: Factor for each SH coefficient of the light in the world; the color axis is 1 (gray) or one per color.
         position: Vertex positions in world units.
     """
 
@@ -80,20 +80,21 @@ def precompute(
     """Precomputes transfer matrices with self-shadowing, for any BRDF.
 
     Args:
-        mesh: The vertices to light.
+        mesh: The mesh to light.
         degree: Highest degree of the harmonics.
-        size: Edge of the visibility's cubemap faces in texels.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        size: Edge of the cubemap faces of visibility, in texels; a power of two.
+        occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: Sizes out of range, positions or normals that are not finite, or a store made from something else.
-        MemoryError: The matrices do not fit into memory, which is known before any ray is traced. With a path they stay
-            in files on processors, which is a warning.
-        BlockingIOError: The store is being written by another process.
+        ValueError: The degree or the size is out of range, positions or normals are not finite, or the folder holds
+            results of other inputs.
+        MemoryError: The matrices do not fit into memory. This is checked before rays are traced. With `path`, on a CPU,
+            the matrices stay in memory-mapped files and there is only a warning.
+        BlockingIOError: Another process is writing to the folder.
         RuntimeError: A worker of the executor died.
 
     Reference: Kautz, Sloan, Snyder 2002, section 5.
@@ -117,7 +118,26 @@ def precompute_diffuse(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferVector:
-    """Precomputes transfer vectors with self-shadowing, for ideal diffuse surfaces; options as of `precompute`."""
+    """Precomputes transfer vectors with self-shadowing, for ideal diffuse surfaces.
+
+    Args:
+        mesh: The mesh to light.
+        degree: Highest degree of the harmonics.
+        size: Edge of the cubemap faces of visibility, in texels; a power of two.
+        occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: The degree or the size is out of range, positions or normals are not finite, or the folder holds
+            results of other inputs.
+        BlockingIOError: Another process is writing to the folder.
+        RuntimeError: A worker of the executor died.
+
+    Reference: Sloan, Kautz, Snyder 2002, section 4.
+    """
     check(degree, size)
     job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=True)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
@@ -128,13 +148,14 @@ def precompute_diffuse(
 def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "b lm lm"]:
     """Transfer matrices of shadowed light: M_oi = ∫ V y_o (in the local frame) y_i (in the world).
 
-    Below the horizon, where no BRDF meets it, the light counts as dimmed by the mean visibility, and not as dark: an
-    edge there would only ring. So an open vertex has the rotation to its frame, and one that sees nothing zero.
-    Visibility is projected to twice the degree, which is all of it that products of two harmonics meet.
+    Below the horizon, where BRDF x cosine is zero, visibility V is set to its mean above the horizon; an edge at the
+    horizon would cause ringing. The matrix of an unoccluded vertex is therefore the rotation to its frame, and that of
+    a vertex that sees nothing is zero. V is projected to twice the degree, because products of two harmonics have no
+    higher bands.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal. See `right_handed`.
         degree: Highest degree of the harmonics.
 
     Raises:
@@ -147,12 +168,12 @@ def transfer(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree:
 
 @partial(jit, static_argnames="degree")
 def visible(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "k b"]:
-    """Harmonics of what vertices see, in the world: 1 where light is clear, the mean visibility below the horizon.
+    """SH coefficients of each vertex's visibility, in the world. Below the horizon it is the mean of that above.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
-        degree: Highest degree of the harmonics; transfer matrices need twice theirs.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        degree: Highest degree of the harmonics. Transfer matrices need twice their own degree.
 
     Raises:
         ValueError: d is not 6 n n for a power of two n.
@@ -167,13 +188,13 @@ def visible(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: 
 def from_visibility(
     coefficient: Float[Array, "k b"], frame: Float[Array, "b 3 3"], *, degree: int
 ) -> Float[Array, "b lm lm"]:
-    """Transfer matrices of a visibility that is given by its harmonics: M_oi = ∫ V y_o (in the local frame) y_i.
+    """Transfer matrices from SH coefficients of visibility V: M_oi = ∫ V y_o (in the local frame) y_i (in the world).
 
-    A matrix has no more in it than these (2 degree + 1)^2 numbers and the frame: `to_visibility` is the inverse.
+    The (2 degree + 1)^2 coefficients and the frame determine the matrix, and `to_visibility` recovers them from it.
 
     Args:
-        coefficient: Coefficients of the visibility in the world, of twice the degree.
-        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+        coefficient: SH coefficients of visibility in the world, up to twice the degree.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal. See `right_handed`.
         degree: Highest degree of the matrices.
     """
     node, weight = (jnp.asarray(each, frame.dtype) for each in products.quadrature(4 * degree))
@@ -185,15 +206,15 @@ def from_visibility(
 
 @jit
 def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"]) -> Float[Array, "k b"]:
-    """Coefficients of the visibility that matrices were made of, in the world: the inverse of `from_visibility`.
+    """SH coefficients of visibility, in the world, from transfer matrices: the inverse of `from_visibility`.
 
-    Of other matrices, such as those with interreflection, it is the visibility whose matrices are nearest to them.
-    Turned to the world on both sides, the function sum_oi y_o(s) M_oi y_i(s) is the visibility convolved with the
-    square of the kernel sum_i y_i(s) y_i(t), which is zonal: a division for each band undoes that.
+    For other matrices, such as those with interreflection, the result is the visibility whose matrices are nearest.
+    With M rotated to the world, sum_oi y_o(s) M_oi y_i(s) is the visibility convolved with the square of the kernel
+    sum_i y_i(s) y_i(t). This kernel is zonal, so the convolution is undone by one division per band.
 
     Args:
         matrix: Transfer matrices.
-        frame: Rows are tangent, bitangent, normal; see `right_handed`.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal. See `right_handed`.
     """
     degree = harmonics.degree_of(matrix.shape[-1])
     back = right_handed(frame).swapaxes(1, 2)
@@ -207,11 +228,11 @@ def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"])
 
 @partial(jit, static_argnames="degree")
 def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: int) -> Float[Array, "lm b"]:
-    """Transfer vectors of shadowed light, t_i = 1/pi ∫ V y_i cos, with i in the world.
+    """Transfer vectors of shadowed light, t_i = 1/pi ∫ V y_i cos, with y_i in the world.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         degree: Highest degree of the harmonics.
 
     Raises:
@@ -226,10 +247,10 @@ def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *,
 
 @jit
 def right_handed(frame: Float[Array, "v 3 3"]) -> Float[Array, "v 3 3"]:
-    """Frames with the bitangent that belongs to their tangent and normal: a proper rotation whatever it was.
+    """Replaces the bitangent of each frame by normal x tangent, which makes the frame a proper rotation.
 
-    Frames that the package makes are so already. Those made by hand may have mirrored bitangents, as texture
-    coordinates have, of which rotations of harmonics would make nonsense.
+    Frames made by jaxprt are proper already. Frames from elsewhere may have a mirrored bitangent, as mirrored texture
+    coordinates do; rotations of harmonics would then be wrong.
     """
     return jnp.stack([frame[:, 0], jnp.cross(frame[:, 2], frame[:, 0]), frame[:, 2]], 1)
 
@@ -246,7 +267,7 @@ def _project(value: Float[Array, "b d"], *, degree: int) -> Float[Array, "lm b"]
 
 
 def _squared_kernel(degree: int) -> np.ndarray:
-    """Factors of the zonal function (sum_i y_i(s) y_i(t))^2, whose sum goes up to a degree, for twice as many bands."""
+    """Zonal factors of (sum_i y_i(s) y_i(t))^2, up to band 2 degree; the sum is over all harmonics up to the degree."""
     height, weight = np.polynomial.legendre.leggauss(2 * degree + 1)
     kernel = np.polynomial.legendre.legval(height, (2 * np.arange(degree + 1) + 1) / (4 * np.pi))
     return 2 * np.pi * (weight * kernel**2) @ np.polynomial.legendre.legvander(height, 2 * degree)
@@ -254,7 +275,7 @@ def _squared_kernel(degree: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Job(visibility.rays.VisibilityJob):
-    """Blocks of shadowed transfer matrices, or of the vectors of ideal diffuse surfaces; see `blocks.Job`."""
+    """Job that computes blocks of shadowed transfer matrices or transfer vectors; see `blocks.Job`."""
 
     degree: int
     diffuse: bool
@@ -283,12 +304,13 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
     Args:
         vertices: Number of vertices.
         degree: Highest degree of the harmonics.
-        copies: How many of them are held at once.
-        colors: Number of colors of each.
-        in_files: Whether they stay in files that are mapped, which is a warning where JAX computes on the processor.
+        copies: Number of copies held at the same time.
+        colors: Number of colors of each matrix.
+        in_files: Whether the matrices stay in memory-mapped files. On a CPU, too little memory then causes a warning
+            instead of the error.
 
     Raises:
-        MemoryError: They do not fit.
+        MemoryError: The matrices do not fit.
     """
     each = 4 * (degree + 1) ** 4 * colors
     require.memory(
@@ -300,6 +322,6 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
 
 
 def check(degree: int, size: int) -> None:
-    """Refuses degrees and sizes that are out of range."""
+    """Refuses a degree or a size that is out of range."""
     if not 0 <= degree <= 25 or size < 1 or size & (size - 1):
         raise ValueError(f"degree must be 0 to 25 and size a power of two, got {degree} and {size}")
