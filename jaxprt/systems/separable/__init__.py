@@ -1,4 +1,4 @@
-"""The separable system: BRDFs as sums of products, light and transport in Haar wavelets (Wang, Tran, Luebke 2004)."""
+"""The separable system: factored BRDFs, with light and transport in Haar wavelets (Wang, Tran, Luebke 2004)."""
 
 from jaxprt.systems.separable import (
     clustered,

@@ -1,9 +1,10 @@
 """Transport as clustered principal components: a few dense products per cluster of vertices instead of sparse sums.
 
-Vertices that lie and face alike have transport alike. In each cluster the matrices of its vertices, all terms
-together, are combinations of a few components, and these distinguish a few modes of the light. Only the modes meet the
-light. So the cost of a term falls from `keep` sparse coefficients a vertex to as many numbers as there are components,
-and thirty-two to a hundred terms become affordable.
+Vertices with similar positions and normals have similar transport. The transport of a cluster is a matrix with one row
+per vertex and term and one column per wavelet coefficient of the light. It is compressed twice: each vertex is a
+weighted sum of a few principal components, and the components depend on the light through a few linear combinations of
+its coefficients, called modes. A change of light evaluates the modes once per cluster. Each term then costs one number
+per component and vertex, instead of `keep` sparse coefficients.
 """
 
 import os
@@ -29,30 +30,31 @@ from jaxprt.systems.separable import wavelets
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
 from jaxprt.visibility import StoredVisibility, members
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}
-SPECTRUM = 0.4  # rms of natural light grows with the area of a Haar function to about this power
-_COMPONENTS, _MODES, _KEEP = 16, 128, 1024  # of a cluster, if nothing else is asked for
-_SAMPLE = 24  # vertices of a cluster that choose its coefficients
+SPECTRUM = 0.4  # The rms coefficient of natural light is about the area of its Haar function to this power.
+_COMPONENTS, _MODES, _KEEP = 16, 128, 1024  # defaults per cluster
+_SAMPLE = 24  # number of vertices of a cluster by which its coefficients are chosen
 
 
 class ClusteredTransport(eqx.Module):
     """Principal components of the transport of each cluster of vertices.
 
-    Weights are stored by row: vertices in the order of their clusters, the last vertex of a smaller cluster repeated.
-    Everything else, and what `apply` returns, is in the order of the vertices.
+    Weights are stored by row. Rows are the vertices in the order of their clusters; smaller clusters are padded by
+    repeating their last vertex. All else, and the result of `apply`, is in the order of the vertices.
 
     Attributes:
-        index: Numbers of the coefficients among the 6 n n that each cluster keeps, the most important first.
-        mode: Its l modes of the light on those coefficients, the leading first.
-        core: What each mode gives to each of n components and each term.
-        weight: What each vertex takes of each component, the leading first.
+        index: Indices of the k wavelet coefficients that each cluster p keeps, of the 6 n n of the light, the most
+            important first.
+        mode: Values of the l modes of each cluster on these coefficients, the leading mode first.
+        core: Value of each mode for each of n components and each BRDF term r.
+        weight: Weight of each component for each of the m vertices of a cluster.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         vertex: Vertex of each row.
         place: Row of each vertex.
-        rms: Root mean square over rows and terms of each coefficient as kept.
-        mark: Some values of the light factors that it was made of, by which other BRDFs are refused; None if unknown.
+        rms: Root mean square of the compressed transport over rows and terms, for each wavelet coefficient.
+        mark: Samples of the BRDF's light factors, by which relighting refuses another BRDF; None if unknown.
     """
 
     index: UInt[Array, "p k"]
@@ -84,7 +86,7 @@ class ClusteredTransport(eqx.Module):
         components: int | None = None,
         terms: int | None = None,
     ) -> "ClusteredTransport":
-        """The first `count` coefficients, modes, components and terms (all of them if None)."""
+        """The transport with the first `count` coefficients, and the first modes, components and terms (None: all)."""
         most = (self.index.shape[1], *self.core.shape[1:])
         asked = {"count": count, "modes": modes, "components": components, "terms": terms}
         for (name, value), limit in zip(asked.items(), most, strict=True):
@@ -98,28 +100,28 @@ class ClusteredTransport(eqx.Module):
 
     @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
-        """Transport times light coefficients, per vertex: each cluster's modes meet the light once.
+        """Multiplies the transport by the light: one product per BRDF term and vertex.
 
         Args:
-            coefficient: Coefficients of the light.
+            coefficient: Haar coefficients of the light, from `jaxprt.separable.project`.
 
         Returns:
-            The light-modulated tuple of Wang et al., in the light's units.
+            The light-modulated tuple of Wang et al., in units of radiance.
 
         Raises:
-            ValueError: The light has another number of coefficients than the transport was made for.
+            ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
         return linear(_relit, _transposed, self, coefficient)
 
 
 def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
-    """Writes each cluster's rows where its vertices are: a gather after the loop would double what is written."""
+    """`apply`: writes each cluster's rows to its vertices directly; a gather afterwards would double memory traffic."""
     _, modes, components, terms = transport.core.shape
     light = coefficient[transport.index.astype(jnp.int32)]
     dtype = light.dtype
     count, rows = len(transport.place), len(transport.vertex)
-    # Rows that no vertex is read from are written past the end, which is dropped.
+    # Padding rows get an index past the end, and writes there are dropped.
     at = jnp.where(_read(transport), transport.vertex, count + jnp.arange(rows)).reshape(len(light), -1)
 
     def one(argument):
@@ -142,7 +144,7 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
 
 
 def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
-    """Cluster by cluster too: JAX's own would keep modes and cores of all of them in full precision."""
+    """Transpose of `_relit`, cluster by cluster. JAX's own would hold all modes and cores in full precision."""
     clusters, modes, components, terms = transport.core.shape
     dtype = cotangent.dtype
 
@@ -161,7 +163,7 @@ def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
 
 
 def _read(transport: ClusteredTransport) -> Array:
-    """Rows that a vertex is read from: one of those that stand for the same vertex."""
+    """Whether each row is the one that its vertex is read from; padding rows are not."""
     return transport.place[transport.vertex] == jnp.arange(len(transport.vertex))
 
 
@@ -178,34 +180,35 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> ClusteredTransport:
-    """Compresses the transport of a mesh, cluster by cluster; no more than a cluster is ever held uncompressed.
+    """Computes and compresses the transport of a mesh. Only one cluster at a time is held uncompressed.
 
-    Vertices are clustered by position and normal. What is least is the squared error under light whose spectrum falls
-    like that of natural light, summed over the cluster's vertices and all terms.
+    Vertices are clustered by position and normal. The components minimize the squared error under light with the
+    spectrum of natural light, summed over the cluster's vertices and all terms.
 
     Args:
-        direct: Visibility of the vertices.
-        brdf: Their factored BRDF, with light maps that all colors share, as `jaxprt.separable.factor` makes them.
-        clusters: Number of clusters, made by `members.cluster`; by `members.clusters_for` if None.
-        member: Vertices of each cluster, in place of `clusters`; a vertex may be in one cluster several times.
-        components: Principal components of the vertices of a cluster; 16, or as many as it has vertices, if None.
-        modes: Principal components of the light that it meets; 128, or as many as there are, if None.
-        keep: Wavelet coefficients kept per cluster; 1024, or all of them, if None.
-        path: Folder that keeps finished clusters; a call that was stopped, or killed, goes on from there.
-        executor: Where clusters are computed; this machine's cores if None.
+        direct: Visibility of the vertices, from `jaxprt.visibility.precompute`.
+        brdf: Factored BRDF of the vertices, with light maps shared by all colors, from `jaxprt.separable.factor`.
+        clusters: Number of clusters that `members.cluster` makes; if None, the number from `members.clusters_for`.
+        member: Vertices of each cluster, instead of `clusters`. A cluster may repeat a vertex.
+        components: Number of principal components per cluster. If None, 16 or the number of vertices per cluster,
+            whichever is smaller.
+        modes: Number of modes of the light per cluster. If None, 128 or as many as there are.
+        keep: Number of wavelet coefficients of the light per cluster. If None, 1024 or as many as there are.
+        path: Folder in which finished clusters are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the clusters; if None, the cores of this machine.
         progress: Whether to show a progress bar.
 
     Returns:
         The compressed transport of every vertex.
 
     Raises:
-        TypeError: The BRDF is not factored.
-        ValueError: Light maps per color, more clusters than vertices, more components than vertices in a cluster, more
-            coefficients than there are, or a store at `path` made from something else.
-        BlockingIOError: The store is being written by another process.
+        TypeError: The BRDF is not a `SeparableBrdf`.
+        ValueError: The light maps have colors, a number is out of range, `member` does not name all vertices, or the
+            folder holds results of other inputs.
+        BlockingIOError: Another process is writing to the folder.
         RuntimeError: A worker of the executor died.
 
-    Reference: Sloan, Hall, Hart, Snyder 2003, for the principal components of clusters.
+    Reference: Sloan, Hall, Hart, Snyder 2003, for clustered principal components.
     """
     if not isinstance(brdf, SeparableBrdf):
         raise TypeError(f"brdf must be factored, by jaxprt.separable.factor, got {type(brdf).__name__}")
@@ -252,20 +255,20 @@ def compress(
     modes: int,
     keep: int,
 ) -> tuple[UInt[Array, " k"], Float16[Array, "k l"], Float16[Array, "l n r"], Float[Array, "m n"], Array, Array]:
-    """Principal components of one cluster, along its vertices and then along the light.
+    """Compresses the transport of one cluster: principal components over its vertices, then over the light.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
-        brdf: The factored BRDF, of which only the light maps matter.
-        components: How many along the vertices.
-        modes: How many along the light.
-        keep: How many coefficients.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        brdf: The factored BRDF. Only its light maps are used.
+        components: Number of principal components over the vertices.
+        modes: Number of modes of the light.
+        keep: Number of wavelet coefficients.
 
     Returns:
-        Numbers of the coefficients; modes on them and cores, scaled to largest entries of 1 so that half precision
-        holds them; weights; and the squared errors that remain, under light of natural spectrum and relative to the
-        whole, after 0, 1, ... components, and after all components and 0, 1, ... modes.
+        Indices of the coefficients; modes and cores, scaled to a largest entry of 1 to fit half precision; weights; and
+            two lists of squared errors relative to the squared norm, under light of natural spectrum: after 0, 1, ...
+            components, and after all components and 0, 1, ... modes.
     """
     size = haar.face_edge(seen.shape[1])
     importance = jnp.tile(haar.area(size=size).ravel(), 6) ** SPECTRUM
@@ -285,7 +288,7 @@ def compress(
     strength, mode, _ = eigen.left_singular(basis, terms=modes)
     core = mode.T @ basis
     mode = mode / importance
-    # Scales go from modes to cores and from cores to weights.
+    # The scale of each mode moves to its core, and the scale of each core to the weights.
     scale = _largest(mode, 0)
     mode, core = mode / scale, (core * scale[:, None]).reshape(modes, components, -1)
     scale = _largest(core, (0, 2))
@@ -302,7 +305,7 @@ def _largest(array: Array, axis) -> Array:
 
 
 def _remainder(value: Array, total: Array) -> Array:
-    """Share of the whole that is left before the first value, and after each."""
+    """Share of the squared norm that remains after the first 0, 1, 2, ... values."""
     left = jnp.maximum(total - jnp.cumsum(value), 0)
     return jnp.concatenate([total[None], left]) / jnp.where(total > 0, total, 1)
 
@@ -326,7 +329,7 @@ def _is_reference(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Job(members.ClusterJob):
-    """Transport of the terms of a BRDF; see `blocks.Job`."""
+    """Job that computes the transport of each cluster; see `blocks.Job`."""
 
     direct: StoredVisibility
     brdf: SeparableBrdf
@@ -336,12 +339,12 @@ class _Job(members.ClusterJob):
     count: int
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields; visibility that is mapped from a store travels as the name of its file."""
+        """State for pickling. Memory-mapped visibility is pickled as the name of its file."""
         level = reference(self.direct.level)  # pyright: ignore[reportArgumentType]
         return {**vars(self), "direct": eqx.tree_at(lambda each: each.level, self.direct, level)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Maps the visibility here."""
+        """Restores the state. Memory-mapped visibility is mapped again."""
         direct = state["direct"]
         if isinstance(direct.level, Reference):
             direct = eqx.tree_at(lambda each: each.level, direct, direct.level.open(), is_leaf=_is_reference)

@@ -1,4 +1,4 @@
-"""How far a factored BRDF is from the BRDF itself: in the radiance under a light, and over pairs of directions."""
+"""Errors of factored BRDFs: in reflected radiance under a light, and over random pairs of directions."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -16,34 +16,34 @@ from jaxprt.sphere import cubemap, directions
 
 @runtime_checkable
 class Terms(Protocol):
-    """The two factors of each term, as `jaxprt.separable.SeparableBrdf` has them."""
+    """A BRDF given by a light factor and a view factor for each term, such as `jaxprt.separable.SeparableBrdf`."""
 
     def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
-        """Light factors."""
+        """Light factors of all terms r, gray or per color l."""
         ...
 
     def view(self, wo: Float[Array, "*b 3"]) -> Float[Array, "*b r c"]:
-        """View factors."""
+        """View factors of all terms r, per color c."""
         ...
 
 
 def light_errors(
     brdf: Callable, factored: Terms, light: Environment, *, frames: int = 32, views: int = 32
 ) -> Float[Array, " r"]:
-    """Relative L2 error of the radiance that vertices reflect under a light, without shadows, by number of terms.
+    """Relative L2 error of radiance reflected under a light, without shadows, for each number of terms.
 
-    Normals and views are spread evenly over the sphere and the hemisphere. The BRDF and its terms are taken at the
-    centers of the light's texels, so that the number tells what the terms lose, and no more.
+    Normals are spread evenly over the sphere, and views over the hemisphere. The BRDF and its terms are both sampled at
+    the centers of the light's texels, so the error is that of the factorization only.
 
     Args:
-        brdf: The BRDF, (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: The terms that stand for the BRDF.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: The factored BRDF.
         light: One environment.
         frames: Number of normals.
-        views: Number of views for each.
+        views: Number of views for each normal.
 
     Returns:
-        The error of the first term, of the first two, and so on to all. Zero where all radiance is zero.
+        Error of the first term, of the first two terms, and so on. Zero if all radiance is zero.
 
     Raises:
         ValueError: The light is a batch.
@@ -79,7 +79,7 @@ def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: A
 
 
 def _spread(count: int, lowest: int) -> Array:
-    """Directions that a golden spiral spreads evenly over what lies above a height."""
+    """Directions with z above `lowest`, spread evenly on a golden spiral."""
     height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
     radius = np.sqrt(1 - height**2)
@@ -89,27 +89,27 @@ def _spread(count: int, lowest: int) -> Array:
 def sample_error(
     brdf: Callable, factored: Callable, *, samples: int = 80_000
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Root mean square difference of two BRDFs over random directions, weighted by the cosine of the incident one.
+    """RMS difference of two BRDFs over random pairs of directions, weighted by the cosine of the incident direction.
 
-    sqrt(sum cos_i |f - g|^2 / sum cos_i) over pairs of directions that are drawn independently and uniformly by solid
-    angle above the horizon, the same ones at each call; squares are averaged over colors. Half the views lie within 30
-    degrees of the horizon, where glossy BRDFs are largest: their errors make most of this one. The error of the
-    rendered radiance is another matter.
+    The error is sqrt(sum cos_i |f - g|^2 / sum cos_i), with squares averaged over colors. Both directions are drawn
+    independently, uniformly in solid angle above the horizon; every call draws the same ones. Half of the views lie
+    within 30 degrees of the horizon, where glossy BRDFs have their largest values and contribute most of the error. The
+    error of rendered radiance can be much smaller; `light_errors` measures it.
 
     Args:
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
-        factored: The BRDF in its factored form, or any other callable of the same channels or of one.
-        samples: Number of pairs.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: The factored BRDF, or any other BRDF with the same number of colors, or gray.
+        samples: Number of pairs of directions.
 
     Returns:
-        The error in 1/sr, and relative to the root mean square of the BRDF under the same weight; the latter is zero
-        where both are.
+        The error in 1/sr, and the error relative to the root mean square of the BRDF with the same weights. The latter
+            is zero if both are zero.
 
     Raises:
-        ValueError: No samples.
+        ValueError: `samples` is below 1.
 
-    Reference: Wang, Tran, Luebke 2004, section 4.3, which names no distribution of the samples; uniform is the choice
-        here.
+    Reference: Wang, Tran, Luebke 2004, section 4.3. The paper does not state the distribution of its samples; uniform
+        sampling is our choice.
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
@@ -119,7 +119,7 @@ def sample_error(
 @eqx.filter_jit
 def _sample_error(brdf: Callable, factored: Callable, samples: int) -> tuple[Array, Array]:
     height, turn = jax.random.uniform(jax.random.key(0), (2, 2, samples), jnp.result_type(float))
-    height = 1 - height  # In (0, 1]: above the horizon.
+    height = 1 - height  # in (0, 1], above the horizon
     radius, angle = jnp.sqrt(1 - height**2), 2 * jnp.pi * turn
     wi, wo = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], -1)
     value = brdf(wi, wo)

@@ -1,4 +1,4 @@
-"""BRDFs as sums of products of a light map and a view map: f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
+"""Factored BRDFs: sums of products of a light map and a view map, f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -18,29 +18,30 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems.separable import errors
 
-_DEGREE = 36  # of the light prior: the lobes of a 48 x 48 map hold nothing finer
+_DEGREE = 36  # of the light prior; maps of 48 x 48 texels resolve nothing finer
 _MOST_TERMS = 256
-_BLOCK = 2048  # directions that are looked up at once, and again for gradients, so that what was read is not kept
-_NEAR = 1e-3  # of the norm: more than the rounding of another processor
-_MORE = 4  # terms beyond those asked for, whose values may equal that of the last one
-_NULL = 4  # rounding errors of the largest value: less is none
+_BLOCK = 2048  # directions looked up at once, and again for gradients, which saves memory
+_NEAR = 1e-3  # tolerance relative to the norm; larger than rounding differences between processors
+_MORE = 4  # terms computed beyond those requested, because their singular values may equal the last one's
+_NULL = 4  # singular values below this many rounding errors of the largest count as zero
 
-# Places on square maps, inside the disk and away from its symmetries, at which light factors are compared.
+# Points on square maps, inside the disk and off its symmetry axes, at which light factors are compared.
 _RADIUS, _TURN = 0.45 * np.sqrt((np.arange(16) + 0.5) / 16), 2.4 * np.arange(16) + 0.3
 _MARKS = 0.5 + _RADIUS * np.stack([np.cos(_TURN), np.sin(_TURN)])
 
 
 class SeparableBrdf(eqx.Module):
-    """A factored BRDF on maps of the hemisphere.
+    """A factored BRDF, with factors stored in maps of the hemisphere.
 
     Attributes:
-        light_map: g_r on the incident direction; the last axis is 1 (shared by all colors) or one per color.
-        view_map: h_r on the view direction, per color; light_map * view_map is in 1/sr.
-        error: Relative error of the terms kept. `factor` without lights states the error of reflected radiance under
-            natural light in the mean, without shadows; with lights, the largest of their `light_errors`. Other
-            factorizations state it in the norm that they minimize. A sun makes radiance err many times as much.
-        coordinates: From local direction to coordinates in the maps, a function of `sphere.hemisphere`; polar maps are
-            periodic, and read as such.
+        light_map: Factors g_r of the incident direction. The last axis is 1 (shared by all colors) or one per color.
+        view_map: Factors h_r of the view direction, per color. The product light_map * view_map is in 1/sr.
+        error: Relative error of the terms kept. From `factor` without lights, it is the mean error of reflected
+            radiance under natural light, without shadows; with lights, the largest of their `light_errors`. From other
+            factorizations, it is the error in the norm that they minimize. Under a small bright light such as a sun,
+            radiance can have a many times larger error.
+        coordinates: Function from local directions to map coordinates, one of `sphere.hemisphere`. Lookup in polar maps
+            is periodic in azimuth.
     """
 
     light_map: Float[Array, "r n n l"]
@@ -54,27 +55,27 @@ class SeparableBrdf(eqx.Module):
         return self.light_map.shape[0]
 
     def __reduce__(self):
-        """Pickles the function of coordinates by its name: pickle cannot take jitted functions."""
+        """Pickles the `coordinates` function by its name, because pickle cannot store jitted functions."""
         return objects.reduced(self)
 
     def truncate(self, terms: int) -> "SeparableBrdf":
-        """The first `terms` terms; their error is no longer known and reads NaN where terms were dropped."""
+        """The BRDF with its first `terms` terms. If terms are dropped, its error is unknown and set to NaN."""
         if not 1 <= terms <= self.terms:
             raise ValueError(f"terms must be between 1 and {self.terms}, got {terms}")
         error = self.error if terms == self.terms else jnp.full_like(self.error, jnp.nan)
         return SeparableBrdf(self.light_map[:terms], self.view_map[:terms], error, self.coordinates)
 
     def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
-        """Light factors g_r(wi), without the horizon: the cosine that they meet is zero below it."""
+        """Light factors g_r(wi). They are not zero below the horizon, where the cosine that multiplies them is."""
         return self._read(self.light_map, wi)
 
     def view(self, wo: Float[Array, "*b 3"]) -> Float[Array, "*b r c"]:
-        """View factors h_r(wo); zero below the horizon."""
+        """View factors h_r(wo), which are zero below the horizon."""
         value = self._read(self.view_map, wo)
         return jnp.where(wo[..., 2:, None] > 0, value, 0)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-        """Value of the factored BRDF in 1/sr, by bilinear lookup; zero below the horizon."""
+        """Value of the factored BRDF in 1/sr, by bilinear lookup. It is zero below the horizon."""
         return jnp.where(wi[..., 2:] > 0, jnp.sum(self.light(wi) * self.view(wo), -2), 0)
 
     def _read(self, texel: Array, direction: Array) -> Array:
@@ -85,17 +86,17 @@ class SeparableBrdf(eqx.Module):
 @partial(isolated, static=("polar",))
 def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
     lookup = hemisphere.polar_lookup if polar else hemisphere.lookup
-    if texel.shape[-1] == 1:  # Gradients by the place would take ten times as long with a trailing axis of 1.
+    if texel.shape[-1] == 1:  # With a trailing axis of 1, gradients with respect to coordinates take ten times as long.
         return _looked_up(texel[..., 0], coordinates, polar=polar)[..., None]
     *batch, axes = coordinates.shape
-    if math.prod(batch) <= _BLOCK or not texel.size:  # Blocks of nothing have no number.
+    if math.prod(batch) <= _BLOCK or not texel.size:  # An empty array cannot be divided into blocks.
         return lookup(texel, coordinates)
     each = jax.checkpoint(lambda place: lookup(texel, place))
     return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
 
 
 def marked(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray, "r m"]:
-    """Values of light factors at a few texels: by these transport knows the BRDF that it was made for."""
+    """Samples of the light factors at a few texels, by which transport recognizes the BRDF it was made for."""
     edge = light_map.shape[1]
     row, column = (_MARKS * edge).astype(int)
     value = np.asarray(light_map)[:, row, column]
@@ -103,17 +104,17 @@ def marked(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray,
 
 
 def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF") -> None:
-    """Refuses light factors that are not those which transport was made of, up to the rounding of other processors.
+    """Refuses light factors that differ from those of the transport by more than rounding on another processor.
 
-    Values that are being traced, and transport that does not know its BRDF, pass.
+    Nothing is checked if the samples are unknown, or inside a JAX transformation, where values are not known.
 
     Args:
-        known: `marked` of the transport's light factors, or None.
-        light_map: Light maps of the BRDF, for all of the transport's terms or the first ones.
-        name: What errors call the BRDF.
+        known: Samples of the transport's light factors, from `marked`, or None.
+        light_map: Light maps of the BRDF, for all terms of the transport or the first ones.
+        name: Name of the BRDF in the error message.
 
     Raises:
-        ValueError: They differ.
+        ValueError: The light factors differ.
     """
     if known is None or isinstance(known, Tracer) or isinstance(light_map, Tracer) or len(light_map) > len(known):
         return
@@ -135,38 +136,38 @@ def factor(
     light: Sequence[Environment] | None = None,
     resolution: int = 48,
 ) -> SeparableBrdf:
-    """Factors a BRDF with all colors joint, weighted by the light that it will meet.
+    """Factors a BRDF, with all colors together, by a singular value decomposition weighted for natural light.
 
-    View maps are the leading left singular vectors of M diag(cos dw) C^(1/2), where M[wo c, wi] is the BRDF and
-    C(wi, wi') = sum_l (l + 1/2)^-2 (2l + 1) / (4 pi) P_l(wi . wi') the covariance of natural light, whose spectrum
-    falls like that. Light maps are the projections U^T M, gray for any BRDF, so that transport is gray too.
+    View maps are the leading left singular vectors U of M diag(cos dw) C^(1/2). M[wo c, wi] is the BRDF, and C(wi, wi')
+    = sum_l (l + 1/2)^-2 (2l + 1) / (4 pi) P_l(wi . wi') is the covariance of natural light. Light maps are the
+    projections U^T M. They are gray for any BRDF, so the transport is gray too.
 
-    Nine real environments, without their brightest texels, fall with exponents of .4 to 2.8 instead of 2, 1.8 in the
-    mean; between 1.5 and 3 the radiance of 16 terms under them changes by 1 %. Factored apart from the diffuse part, a
-    specular one needs more terms in all: two are 6 to 18 % farther off than together, 16 are 4 to 7 %.
+    The result depends little on the assumed spectrum of light. Diffuse and specular parts are better factored together:
+    separate factorizations need more terms in all.
 
-    Maps are parabolic: on the orthographic disk the last texel before the rim spans 14 degrees at 48 x 48, and at
-    grazing angles, where glossy BRDFs are brightest, bilinear lookup is then off by more than all else.
+    Maps are parabolic, because the orthographic disk is too coarse at grazing angles, where glossy BRDFs are brightest:
+    at 48 x 48 its last texel before the rim spans 14 degrees.
 
-    Runs on the host, and its derivatives by a BRDF's parameters are not promised: singular vectors have none where
-    singular values repeat, as those of isotropic BRDFs do, and transport made with the old light maps would not follow.
-    `reference` is differentiable in them.
+    Runs on the host. Derivatives with respect to BRDF parameters are not supported: singular vectors have none where
+    singular values coincide, as they do for isotropic BRDFs, and existing transport would keep the old light maps. For
+    such derivatives use `jaxprt.reference.radiance`.
 
     Args:
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
-        terms: Number of terms; or
-        error: relative error that the terms must reach: by `jaxprt.separable.light_errors` under each of the lights,
-            if lights are given; else in the mean over natural light with the covariance above, which promises nothing
-            for one light. Neither has shadows: `jaxprt.plan.separable` measures errors on a mesh.
-        light: Lights that the error must hold for, if `error` is given.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        terms: Number of terms. Give either `terms` or `error`.
+        error: Relative L2 error that the terms must meet. With `light`, it holds under each of these lights, by
+            `jaxprt.separable.light_errors`. Otherwise it is the mean over natural light with the covariance above, and
+            single lights may exceed it. Both are without shadows; `jaxprt.plan.separable` measures errors on a mesh.
+        light: Environments under which `error` must hold.
         resolution: Edge of the square maps in texels.
 
     Returns:
-        The factored BRDF, terms by falling contribution.
+        The factored BRDF, with its terms in order of decreasing contribution.
 
     Raises:
-        ValueError: Neither or both of terms and error, lights without an error, more terms than texels, an error that
-            256 terms do not reach, or a BRDF that is not finite or has no channel axis.
+        ValueError: Neither or both of `terms` and `error` are given, `light` is given without `error`, there are more
+            terms than texels, 256 terms do not meet the error, or the BRDF returns values that are not finite or have
+            no color axis.
 
     Reference: Wang, Tran, Luebke 2004, section 3.2, with the prior in place of their Frobenius norm.
     """
@@ -185,7 +186,8 @@ def factor(
     flux, matrix, covariance = _weighted(table, direction, solid_angle, inside)
     value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
     light_map, view_map = _maps(table, solid_angle, flux, matrix, covariance, value, vector)
-    # Transport that another machine made serves the same factors here.
+    # Fix the signs and the order of coinciding terms, so that transport from another machine fits the factors made
+    # here.
     turn = eigen.orientation(np.asarray(value), np.asarray(vector))[:, :terms].T.astype(value.dtype)
     light_map, view_map = _turned(turn, light_map, view_map, resolution=resolution)
     return SeparableBrdf(light_map, view_map, jnp.asarray(remainder[terms - 1]), hemisphere.parabolic_coordinates)
@@ -193,7 +195,7 @@ def factor(
 
 @jit
 def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array) -> tuple[Array, Array, Array]:
-    """M diag(cos dw) without and with the weight of the views, in rows of one view and color, and C."""
+    """M diag(cos dw), the same with rows (view and color) weighted by the view's solid angle, and the covariance C."""
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
     return flux, matrix, light_covariance(direction[inside], degree=_DEGREE)
@@ -201,7 +203,7 @@ def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array)
 
 @partial(jit, static_argnames="resolution")
 def _turned(turn: Array, *value: Array, resolution: int) -> tuple[Array, ...]:
-    """Maps [r n n c] of singular vectors turned among each other."""
+    """Maps [r n n c] of the terms after the orthogonal transformation `turn` of the singular vectors."""
     return tuple(jnp.tensordot(turn, each, 1).reshape(len(turn), resolution, resolution, -1) for each in value)
 
 
@@ -209,13 +211,13 @@ def _turned(turn: Array, *value: Array, resolution: int) -> tuple[Array, ...]:
 def _maps(
     table: Array, solid_angle: Array, flux: Array, matrix: Array, covariance: Array, value: Array, vector: Array
 ) -> tuple[Array, Array]:
-    """Light and view maps [r d c] of some singular vectors."""
+    """Light and view maps [r d c] from singular vectors."""
     color = table.shape[0]
     project = vector.reshape(color, -1, value.size) * jnp.sqrt(solid_angle)[:, None]
     light_map = jnp.einsum("cor,coi->ri", project, table)
-    # M C M^T u = value u continues the view map to texels of no weight, which bilinear lookup needs at the rim.
+    # M C M^T u = value u extends the view map to texels of zero weight, which bilinear lookup reads at the rim.
     response = covariance @ (matrix.T @ vector)
-    # What rounding leaves of a null term must not be divided by.
+    # Singular values that are zero up to rounding are not divided by.
     known = value > _NULL * jnp.finfo(value.dtype).eps * jnp.max(value)
     inverse = jnp.where(known, 1 / jnp.where(known, value, 1), 0)
     view_map = jnp.einsum("coi,ir->roc", flux, response * inverse)
@@ -223,7 +225,7 @@ def _maps(
 
 
 def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None, error: float | None, resolution: int):
-    """As many terms as an error under each of some lights needs."""
+    """`factor` with the smallest number of terms that meets the error under each light."""
     if error is None or not len(light):
         raise ValueError(f"lights must be at least one and come with error, got {len(light)} and terms={terms}")
     count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
@@ -241,20 +243,21 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
 
 
 def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
-    """Puts factored BRDFs side by side into one, whose transport serves every mixture of them.
+    """Concatenates the terms of several factored BRDFs, so that one transport serves every weighted sum of them.
 
-    `jaxprt.separable.modulate` mixes them.
+    `jaxprt.separable.modulate` applies the weights.
 
     Args:
-        brdfs: One or more, on maps of one kind and size; those with one color serve as gray beside those with more.
+        brdfs: One or more factored BRDFs with the same map coordinates and resolution. Gray ones are repeated to the
+            number of colors of the others.
 
     Returns:
-        The sum of the BRDFs, with the terms of the first, then those of the next. Its error is not known and reads NaN.
+        The sum of the BRDFs: the terms of the first, then those of the next. Its error is unknown and set to NaN.
 
     Raises:
         ValueError: There are no BRDFs, or their maps differ in coordinates or resolution.
 
-    Reference: Wang, Tran, Luebke 2004, section 3.1, which names linear combinations of basic BRDFs.
+    Reference: Wang, Tran, Luebke 2004, section 3.1, which mentions linear combinations of basis BRDFs.
     """
     kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
     if len(kinds) != 1:
@@ -269,17 +272,17 @@ def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
 
 
 def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c d d"]:
-    """The BRDF at all pairs of directions, [c, view, light].
+    """Values of the BRDF at all pairs of directions, [c, view, light].
 
     Args:
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
-        direction: Directions above the horizon.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        direction: Unit directions above the horizon.
 
     Returns:
         Values in 1/sr.
 
     Raises:
-        ValueError: The BRDF has no channel axis, or values that are not finite.
+        ValueError: The BRDF returns values that are not finite or have no color axis.
     """
     shape = eqx.filter_eval_shape(_row, brdf, direction, direction[0]).shape
     if len(shape) != 2 or shape[0] != direction.shape[0] or not shape[1]:
@@ -296,20 +299,20 @@ def _row(brdf: Callable, direction: Array, wo: Array) -> Array:
 
 @eqx.filter_jit
 def _rows(brdf: Callable, direction: Array) -> tuple[Array, Array]:
-    """Values for all pairs of directions, [c, view, light], and how many are not finite."""
+    """Values at all pairs of directions, [c, view, light], and the number of values that are not finite."""
     rows = jax.lax.map(lambda wo: _row(brdf, direction, wo), direction, batch_size=64)
     return jnp.moveaxis(rows, 2, 0), jnp.sum(~jnp.isfinite(rows))
 
 
 def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Array, "d d"]:
-    """Covariance of natural light between directions, sum_l s_l^2 (2l + 1) / (4 pi) P_l(cos).
+    """Covariance of natural light between pairs of directions, sum_l s_l^2 (2l + 1) / (4 pi) P_l(cos).
 
     Args:
         direction: Unit directions.
         degree: Highest degree of the sum.
 
     Returns:
-        A positive semidefinite matrix, relative units.
+        A positive semidefinite matrix, in relative units.
 
     Reference: the addition theorem, with s_l from `jaxprt.sphere.harmonics.natural`.
     """
@@ -330,9 +333,10 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
 def _leading(
     matrix: Array, covariance: Array, terms: int | None, error: float | None
 ) -> tuple[Array, Array, np.ndarray, int]:
-    """Squared singular values, vectors and remaining errors of `terms` terms, or of as many as the error needs.
+    """Squared singular values, singular vectors, errors by number of terms, and the number of terms requested.
 
-    A few more follow, since terms of equal values are told apart together. The last is the number of terms.
+    The number of terms is `terms`, or the smallest that meets the error. With `terms`, a few more values and vectors
+    are returned, because terms with equal singular values must be oriented together.
     """
     total = _total(matrix, covariance)
     most = min(_MOST_TERMS, matrix.shape[1])
@@ -358,9 +362,9 @@ def _total(matrix: Array, covariance: Array) -> Array:
 
 @jit
 def _remainder(value: Array, total: Array) -> Array:
-    """Errors that the first terms leave."""
+    """Relative errors of the first 1, 2, ... terms."""
     lost = jnp.maximum(1 - jnp.cumsum(value) / jnp.where(total > 0, total, 1), 0)
-    return jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF is met exactly
+    return jnp.where(total > 0, jnp.sqrt(lost), 0)  # a black BRDF has no error
 
 
 def _check_resolution(resolution: int) -> None:

@@ -1,7 +1,7 @@
-"""Factored BRDFs as published: eigenvectors of each color, and one normalized term.
+"""Published factorizations of BRDFs: eigenvectors of each color, and one normalized term.
 
-Maps are orthographic or polar. Either samples the BRDF at its texels; every texel counts by the integral of
-cos(theta) d omega over it. On the orthographic disk these are all equal, so that the matrix is the published one.
+Maps are orthographic or polar. The BRDF is sampled at the texels, and each texel is weighted by the integral of
+cos(theta) d omega over it. On the orthographic disk all weights are equal, so the matrix is the published one.
 """
 
 import math
@@ -19,7 +19,7 @@ from jaxprt.decompose import eigen
 from jaxprt.sphere import hemisphere
 from jaxprt.systems.separable.factorization import SeparableBrdf, tabulate
 
-_RECIPROCAL = 1e-3  # Asymmetry beyond which the eigenvectors of M are not its singular vectors.
+_RECIPROCAL = 1e-3  # largest relative asymmetry of M at which its eigenvectors count as singular vectors
 _TEXELS: dict[Callable, tuple[Callable, Callable]] = {
     hemisphere.disk_coordinates: (hemisphere.texel_direction, hemisphere.texel_area),
     hemisphere.polar_coordinates: (hemisphere.polar_texel_direction, hemisphere.polar_texel_area),
@@ -36,28 +36,27 @@ def factor_symmetric(
 ) -> SeparableBrdf:
     """Factors each color of a reciprocal BRDF by the eigenvectors of its matrix, as published.
 
-    The light and the view map of a term differ by the sign of its eigenvalue. Optimal in the Frobenius norm of the
-    disk, which a few grazing texels dominate: prefer `separable.factor` unless the published form itself is wanted.
+    The light map and the view map of a term differ by the sign of its eigenvalue only. The factorization is optimal in
+    the Frobenius norm on the disk, which a few grazing texels dominate. Use `separable.factor` unless you need the
+    published form.
 
-    Polar maps minimize the same norm and resolve grazing directions more finely: their last row of 48 spans 2.4
-    degrees, the last texel of the disk 14. One term of Ashikhmin-Shirley's BRDF, for which the paper finds them
-    significantly better, has the same `errors.sample_error` in both, 0.98; with 4 terms that of the disk is 0.93 and
-    that of polar maps 0.98, since they spend their terms on the large values that they resolve.
+    Polar maps minimize the same norm and resolve grazing directions more finely: at 48 x 48 their last row spans 2.4
+    degrees, the last texel of the disk 14 degrees.
 
     Args:
-        brdf: A reciprocal BRDF, any callable (wi, wo) -> value [*b c] in 1/sr on local directions.
+        brdf: Reciprocal BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
         terms: Number of terms.
         resolution: Edge of the square maps in texels.
         coordinates: `hemisphere.disk_coordinates` or `hemisphere.polar_coordinates`.
-        solve: Gives eigenpairs of a matrix: `eigen.symmetric`, or `eigen.power` for the iteration as printed, which
-            need not converge; the error then says what came of it.
+        solve: Function that returns eigenpairs of a symmetric matrix: `eigen.symmetric`, or `eigen.power` for the
+            published power iteration. The latter may not converge; `error` of the result then shows it.
 
     Returns:
-        The factored BRDF with one light map per color; its error is relative, in the Frobenius norm.
+        The factored BRDF with one light map per color. Its error is relative, in the Frobenius norm.
 
     Raises:
-        ValueError: More terms than texels, other coordinates, or a BRDF that is not finite, not reciprocal or has no
-            channel axis.
+        ValueError: There are more terms than texels, `coordinates` is another function, or the BRDF is not reciprocal
+            or returns values that are not finite or have no color axis.
 
     Reference: Wang, Tran, Luebke 2004, section 3.2, equations 7 and 8, and appendix (S = |D|, not D^2).
     """
@@ -76,22 +75,22 @@ def factor_symmetric(
 def _eigenvectors(
     table: Array, area: Array, inside: Array, *, terms: int, solve: Callable
 ) -> tuple[Array, Array, Array, Array]:
-    """Light and view maps, their error, and how far the BRDF is from reciprocal."""
+    """Light and view maps, their error, and the relative asymmetry of the BRDF."""
     root = jnp.sqrt(area[inside])
     matrix = table[:, inside][:, :, inside] * root * root[:, None]
     total = jnp.sum(matrix**2)
     asymmetry = jnp.sqrt(jnp.sum((matrix - matrix.swapaxes(1, 2)) ** 2) / jnp.maximum(total, 1e-30))
     value, vector, _ = jax.vmap(lambda m: solve(m, terms=terms))(matrix)
     image = matrix @ vector
-    # M v continues an eigenvector v to texels outside the disk, which bilinear lookup needs at the rim; divided by its
-    # own norm, which is |value| for an eigenvector and more for what has not converged to one.
+    # M v extends an eigenvector v to texels outside the disk, which bilinear lookup reads at the rim. It is divided by
+    # its own norm, which is |value| for an eigenvector and larger for a vector that has not converged.
     norm = jnp.linalg.norm(image, axis=1, keepdims=True) * jnp.sign(value)[:, None]
     beyond = table[:, :, inside] @ (vector * root[:, None]) / jnp.where(norm == 0, 1, norm)
     light_map = beyond.at[:, inside].set(vector / root[:, None]) * jnp.sqrt(jnp.abs(value))[:, None]
     shape = (terms, math.isqrt(area.size), -1, table.shape[0])
     light_map = jnp.moveaxis(light_map, -1, 0).swapaxes(1, 2).reshape(shape)
     view_map = light_map * jnp.sign(value).T[:, None, None, :]
-    # |M - V D V^T|^2, whether or not the vectors are eigenvectors.
+    # |M - V D V^T|^2, which is valid for any vectors V
     overlap = jnp.einsum("cir,cis->crs", vector, vector) ** 2
     kept = 2 * jnp.sum(value * jnp.sum(vector * image, 1)) - jnp.einsum("cr,crs,cs->", value, overlap, value)
     return light_map, view_map, jnp.sqrt(jnp.maximum(total - kept, 0) / jnp.maximum(total, 1e-30)), asymmetry
@@ -100,26 +99,27 @@ def _eigenvectors(
 def factor_normalized(
     brdf: Callable, *, resolution: int = 48, coordinates: Callable = hemisphere.disk_coordinates
 ) -> SeparableBrdf:
-    """One term by normalized decomposition: norms of the BRDF's rows, and the mean of the rows divided by them.
+    """Factors a BRDF into one term by normalized decomposition: norms of its rows, and the mean of the normalized rows.
 
-    A row holds the values of one view direction and color over all incident directions. Its norm here is the sum of
-    its absolute values by texel area, which is the reflectance of that view in that color: the one term reflects
-    constant light without occluders as the BRDF does, in every direction of view. The norms are the view map, per
-    color; the light map is gray and its integral over the disk is one. One pass over the BRDF, without iteration.
+    A row holds the values of one view direction and color over all incident directions. Its norm is the sum of its
+    absolute values weighted by texel area, which is the reflectance for that view and color. The term therefore
+    reflects constant light without shadows exactly like the BRDF, for every view. The norms form the view map, per
+    color. The light map is gray, with integral one over the disk. There is no iteration.
 
     Args:
-        brdf: Any callable (wi, wo) -> value [*b c] in 1/sr on local directions; need not be reciprocal.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions. It need not be reciprocal.
         resolution: Edge of the square maps in texels.
         coordinates: `hemisphere.disk_coordinates` or `hemisphere.polar_coordinates`.
 
     Returns:
-        A factored BRDF of one term; its error is relative, in the Frobenius norm by texel area.
+        A factored BRDF of one term. Its error is relative, in the Frobenius norm weighted by texel area.
 
     Raises:
-        ValueError: Other coordinates, a resolution below two, or a BRDF that is not finite or has no channel axis.
+        ValueError: `coordinates` is another function, the resolution is below 2, or the BRDF returns values that are
+            not finite or have no color axis.
 
     Reference: Kautz and McCool 1999, "Interactive rendering with arbitrary BRDFs using separable approximations", for
-        the decomposition by any norm; which norm, and color in the view map alone, are choices here.
+        the decomposition with any norm. The norm, and colors in the view map only, are our choices.
     """
     direction, area = texels(resolution, coordinates)
     light_map, view_map, error = _normalized(tabulate(brdf, direction), area)
@@ -128,7 +128,7 @@ def factor_normalized(
 
 @jit
 def _normalized(table: Array, area: Array) -> tuple[Array, Array, Array]:
-    """Light and view map, and their error."""
+    """Light map, view map and their error."""
     view_map = jnp.sum(jnp.abs(table) * area, -1)
     weight = area * (view_map > 0)
     rows = weight / jnp.where(view_map > 0, view_map, 1) / jnp.maximum(jnp.sum(weight), 1e-30)
@@ -141,24 +141,24 @@ def _normalized(table: Array, area: Array) -> tuple[Array, Array, Array]:
 
 
 def red_plastic() -> models.BlinnPhong:
-    """A red plastic; Wang et al. show one and print no parameters, these are chosen here."""
+    """A red plastic. Wang et al. show one without parameters; these parameters are ours."""
     return models.BlinnPhong(diffuse=jnp.array([0.45, 0.05, 0.04]), specular=0.15, exponent=60.0)
 
 
 def brown_plastic() -> models.BlinnPhong:
-    """A light brown plastic; Wang et al. show one and print no parameters, these are chosen here.
+    """A light brown plastic. Wang et al. show one without parameters; these parameters are ours.
 
-    The other materials of their section 4.1 are `AshikhminShirley` as it stands, and clay and skin of Lafortune et al.,
-    which `load_lafortune` reads.
+    The other materials of their section 4.1 are `AshikhminShirley` with its default parameters, and the clay and skin
+    of Lafortune et al., which `load_lafortune` reads.
     """
     return models.BlinnPhong(diffuse=jnp.array([0.45, 0.3, 0.17]), specular=0.12, exponent=40.0)
 
 
 def texels(resolution: int, coordinates: Callable) -> tuple[Array, Array]:
-    """Directions and areas of the texels of a map.
+    """Directions of the texels of a map, and the integral of cos(theta) d omega over each.
 
     Raises:
-        ValueError: Other coordinates, or a resolution below two.
+        ValueError: `coordinates` is neither disk nor polar, or the resolution is below 2.
     """
     if resolution < 2:
         raise ValueError(f"resolution must be at least 2, got {resolution}")

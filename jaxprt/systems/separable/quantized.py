@@ -1,4 +1,4 @@
-"""Sparse transport in whole numbers: 16 bits for a gray coefficient, 11 + 11 + 10 bits for a colored one."""
+"""Quantized sparse transport: 16 bits per gray coefficient, 11 + 11 + 10 bits per colored one."""
 
 import equinox as eqx
 import jax
@@ -17,16 +17,17 @@ _COLOR = (11, 11, 10)  # red in the highest bits
 
 
 class QuantizedTransport(eqx.Module):
-    """Kept wavelet coefficients of transport as multiples of a quantum of each vertex, term and color.
+    """Kept wavelet coefficients of transport, as integer multiples of a quantum per vertex, term and color.
 
     Attributes:
-        index: Number of each kept coefficient among the 6 n n; 0 where padded.
-        level: Its multiples: int16 if gray; if colored three signed numbers of 11, 11 and 10 bits in a uint32.
+        index: Index of each of the k kept coefficients of vertex v and term r, of the 6 n n of the light; 0 in padding.
+        level: Integer multiple of the quantum: int16 if gray. If colored, three signed integers of 11, 11 and 10 bits
+            in a uint32.
         quantum: Value of level 1. The last axis is 1 (gray) or one per color.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        rms: Root mean square over vertices and terms of each coefficient as kept.
-        mark: As `jaxprt.separable.SparseTransport` has it.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        rms: Root mean square of the kept transport over vertices and terms, for each wavelet coefficient.
+        mark: Samples of the BRDF's light factors, by which relighting refuses another BRDF; None if unknown.
     """
 
     index: UInt[Array, "k v r"]
@@ -38,7 +39,7 @@ class QuantizedTransport(eqx.Module):
     mark: Float[Array, "r m"] | None = None
 
     def truncate(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
-        """The first `count` coefficients, largest before rounding, of the first `terms` terms (all of them if None)."""
+        """The transport with the first `count` coefficients, the largest ones, and `terms` terms (None: all)."""
         require.between("count", count, 1, self.index.shape[0])
         require.between("terms", terms, 1, self.terms)
         index, level, quantum = self.index[:count, :, :terms], self.level[:count, :, :terms], self.quantum[:, :terms]
@@ -49,18 +50,18 @@ class QuantizedTransport(eqx.Module):
 
     @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
-        """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
+        """Multiplies the transport by the light: a sum over the kept coefficients of each vertex, term and color.
 
-        Levels become floating point one row at a time, and meet their quantum after the sum.
+        Levels are converted to floating point one row at a time, and multiplied by their quantum after the sum.
 
         Args:
-            coefficient: Coefficients of the light.
+            coefficient: Haar coefficients of the light, from `jaxprt.separable.project`.
 
         Returns:
-            The light-modulated tuple of Wang et al., in the light's units.
+            The light-modulated tuple of Wang et al., in units of radiance.
 
         Raises:
-            ValueError: The light has another number of coefficients than the transport was made for.
+            ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
         kept, vertices, terms = self.index.shape
@@ -81,27 +82,24 @@ class QuantizedTransport(eqx.Module):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the coefficients."""
+        """Bytes of indices, levels and quanta."""
         return self.index.nbytes + self.level.nbytes + self.quantum.nbytes
 
 
 @jit
 def quantize(transport: SparseTransport) -> QuantizedTransport:
-    """Rounds coefficients to multiples of a quantum: the largest of each vertex, term and color over the last level.
+    """Rounds coefficients to integer multiples of a quantum, with one quantum per vertex, term and color.
 
-    The error of a coefficient is at most half a quantum, 1 / 65,534 of the largest beside it if gray, 1 / 2,046 (red
-    and green) or 1 / 1,022 (blue) if colored. The paper names no range for its uniform quantization. One range for all
-    vertices leaves few levels to those that see little: on the bunny and its ground, with 4 terms of 96 coefficients,
-    its error in transport is twice that of a range per vertex, term and color, and 5 (gray) to 13 times (color) in the
-    radiance of the worst vertex. Ranges add 1 % to the bytes.
-
-    Coefficients that round to zero become padding.
+    The quantum is the largest magnitude divided by the highest level. The error of a coefficient is at most half a
+    quantum: relative to the largest coefficient, 1 / 65,534 if gray, and 1 / 2,046 (red and green) or 1 / 1,022 (blue)
+    if colored. The paper does not state the range of its uniform quantization. A single range for all vertices would
+    leave few levels to vertices that see little light. Coefficients that round to zero become padding.
 
     Args:
-        transport: Gray or in three colors.
+        transport: Sparse transport, gray or in three colors.
 
     Returns:
-        The same transport, in two thirds of the bytes if gray and less than half of them if colored.
+        The quantized transport. It takes two thirds of the bytes if gray, and less than half if colored.
 
     Raises:
         ValueError: The transport has neither one nor three colors.
@@ -123,7 +121,7 @@ def quantize(transport: SparseTransport) -> QuantizedTransport:
 
 @jit
 def dequantize(transport: QuantizedTransport) -> SparseTransport:
-    """The transport in floating point again, rounded as it is."""
+    """Converts quantized transport back to floating point. The rounding stays."""
     level = _unpack(transport.level.reshape(-1)).reshape(*transport.level.shape, -1)
     value = level.astype(transport.quantum.dtype) * transport.quantum
     same = (transport.position, transport.frame, transport.rms)
@@ -131,7 +129,7 @@ def dequantize(transport: QuantizedTransport) -> SparseTransport:
 
 
 def _pack(level: Array) -> Array:
-    """Levels [... l] in the form that is stored."""
+    """Packs levels [... l] into the stored integers."""
     if level.shape[-1] == 1:
         return level[..., 0].astype(jnp.int16)
     left, right = _shifts()
@@ -140,7 +138,7 @@ def _pack(level: Array) -> Array:
 
 
 def _unpack(level: Array) -> Array:
-    """Levels [n l] of what is stored, a sign in front of each."""
+    """Unpacks stored integers [n] to signed levels [n l]."""
     if level.dtype == jnp.int16:
         return level[:, None]
     left, right = _shifts()
@@ -148,6 +146,6 @@ def _unpack(level: Array) -> Array:
 
 
 def _shifts() -> tuple[np.ndarray, np.ndarray]:
-    """How far each color's bits are from the top of a word, and how many of its bits are others'."""
+    """For each color, the left shift that moves its bits to the top of a word, and the right shift back with sign."""
     bits = np.array(_COLOR, np.int32)
     return (np.cumsum(bits) - bits).astype(np.int32), 32 - bits

@@ -1,6 +1,6 @@
-"""Relighting by the separable system: a light-modulated and a view-modulated tuple per vertex, and their product.
+"""Relighting by the separable system: the dot product of a light-modulated and a view-modulated tuple per vertex.
 
-Turning the light redoes only `light_tuple`, moving the eye only `view_tuple`; the caller keeps the other.
+When the light changes, call `light_tuple` again; when the eye moves, call `view_tuple` again. Keep the other result.
 """
 
 from functools import partial, reduce
@@ -17,18 +17,18 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, check_mark
 
-_STEPS = (1 << 15) - 1  # signed 16 bits
+_STEPS = (1 << 15) - 1  # highest level in signed 16 bits
 
 
 @runtime_checkable
 class Transport(Protocol):
-    """What relighting asks of precomputed transport, however it is stored.
+    """Interface of precomputed transport: what relighting needs from sparse, quantized and clustered transport.
 
     Attributes:
-        position: Vertex positions in world units, in the mesh's order.
-        frame: Rows are tangent, bitangent, normal.
-        rms: Root mean square over vertices and terms of each coefficient.
-        mark: Some values of the light factors that it was made of, see `factorization.marked`; None if unknown.
+        position: Vertex positions in world units, in the order of the mesh.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        rms: Root mean square of the transport over vertices and terms, for each wavelet coefficient.
+        mark: Samples of the BRDF's light factors, from `factorization.marked`; None if unknown.
     """
 
     position: Float[Array, "v 3"]
@@ -42,7 +42,7 @@ class Transport(Protocol):
         ...
 
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r c"]:
-        """Transport times light coefficients, per vertex, term and color."""
+        """Multiplies the transport by Haar coefficients of the light: one value per vertex, term and color."""
         ...
 
 
@@ -58,15 +58,15 @@ def _environment(value: Any) -> None:
 @require.arguments(light=_environment)
 @jit
 def project(light: Environment) -> Float[Array, "b c"]:
-    """Haar coefficients of an environment, each cubemap face by itself.
+    """Haar coefficients of an environment. Each cubemap face is transformed separately.
 
-    Solid angles are in the transport, so the radiance is transformed as it is.
+    The solid angles of texels are part of the transport, so radiance is transformed without weights.
 
     Args:
-        light: One environment; edges of faces a power of two.
+        light: One environment. The edge n of its cubemap faces must be a power of two.
 
     Returns:
-        Coefficients on b = 6 n n, in the light's units.
+        b = 6 n n coefficients per color, in units of radiance.
     """
     coefficient = haar.forward(light.radiance)
     return coefficient.reshape(-1, coefficient.shape[-1])
@@ -74,18 +74,16 @@ def project(light: Environment) -> Float[Array, "b c"]:
 
 @partial(jit, static_argnames=("threshold",))
 def choose_by_magnitude(coefficient: Float[Array, "b c"], *, threshold: int = 1024) -> Float[Array, "b c"]:
-    """Drops what is below the threshold in signed 16 bits per color, as published.
+    """Sets light coefficients below a threshold in signed 16 bits to zero, as published.
 
-    It keeps 691 of the 24,576 coefficients of Grace, 878 of Eucalyptus and 372 of St Peter's, in one color or more;
-    the published count is 200 to 600. Radiance of the bunny and its ground is then off by 5.2, 1.2 and 8.4 %, and with
-    200 coefficients by `choose_by_transport` by 0.5, 0.3 and 0.5 %.
+    `choose_by_transport` reaches a smaller error with fewer coefficients.
 
     Args:
-        coefficient: Coefficients of the light.
-        threshold: Smallest magnitude kept, in steps of the largest coefficient of each color / 32767.
+        coefficient: Haar coefficients of the light, from `project`.
+        threshold: Smallest magnitude kept, in multiples of the largest magnitude of each color / 32767.
 
     Returns:
-        Coefficients with zeros where dropped; kept ones are not rounded, which is for `quantize`.
+        The coefficients, zero where dropped. Kept ones are not rounded; `quantize` rounds.
 
     Reference: Wang, Tran, Luebke 2004, section 3.4.
     """
@@ -94,15 +92,14 @@ def choose_by_magnitude(coefficient: Float[Array, "b c"], *, threshold: int = 10
 
 @jit
 def quantize(coefficient: Float[Array, "b c"]) -> Float[Array, "b c"]:
-    """Rounds to signed 16 bits: multiples of the largest coefficient of each color / 32767.
-
-    That changes the radiance of the bunny under Grace by 3e-5, under St Peter's by 8e-5 of its norm.
+    """Rounds light coefficients to signed 16 bits: to multiples of the largest magnitude of each color / 32767.
 
     Args:
-        coefficient: Coefficients of the light.
+        coefficient: Haar coefficients of the light, from `project`.
 
     Returns:
-        Rounded coefficients, in the same units. Derivatives are those of the largest alone: the rest are steps.
+        Rounded coefficients in the same units. Rounding has a zero derivative, so gradients reach the largest
+        coefficient only, which sets the scale.
 
     Reference: Wang, Tran, Luebke 2004, section 3.4.
     """
@@ -110,7 +107,7 @@ def quantize(coefficient: Float[Array, "b c"]) -> Float[Array, "b c"]:
 
 
 def _level(coefficient: Array) -> Array:
-    """Whole multiples of the largest coefficient of each color / 32767."""
+    """Coefficients as multiples of the largest magnitude of each color / 32767, rounded."""
     largest = jnp.max(jnp.abs(coefficient), 0)
     quantum = jnp.where(largest > 0, largest, 1) / _STEPS
     return jnp.round(coefficient / quantum)
@@ -118,7 +115,14 @@ def _level(coefficient: Array) -> Array:
 
 @partial(jit, static_argnames=("count",))
 def choose_by_area(coefficient: Float[Array, "b c"], *, count: int) -> Float[Array, "b c"]:
-    """Keeps the `count` coefficients largest in magnitude times the area of their basis function.
+    """Keeps the `count` light coefficients with the largest magnitude times area of the basis function.
+
+    Args:
+        coefficient: Haar coefficients of the light, from `project`.
+        count: Number of coefficients to keep.
+
+    Returns:
+        The coefficients, zero where dropped.
 
     Reference: Ng, Ramamoorthi, Hanrahan 2003, section 5.
     """
@@ -131,17 +135,17 @@ def choose_by_area(coefficient: Float[Array, "b c"], *, count: int) -> Float[Arr
 def choose_by_transport(
     coefficient: Float[Array, "b c"], rms: Float[Array, " b"], *, count: int
 ) -> Float[Array, "b c"]:
-    """Keeps the `count` coefficients largest in magnitude times the rms of the transport that they meet.
+    """Keeps the `count` light coefficients with the largest magnitude times rms of the transport.
 
-    That is the order of their mean squared contribution to the picture.
+    This orders coefficients by their mean squared contribution to the picture.
 
     Args:
-        coefficient: Coefficients of the light.
-        rms: `Transport.rms`.
-        count: How many to keep.
+        coefficient: Haar coefficients of the light, from `project`.
+        rms: Root mean square of the transport for each coefficient, `Transport.rms`.
+        count: Number of coefficients to keep.
 
     Returns:
-        Coefficients with zeros where dropped.
+        The coefficients, zero where dropped.
     """
     return _choose(coefficient, rms, count)
 
@@ -169,36 +173,38 @@ def _(primal, tangent):
 
 
 def _sum(fixed: Array, x: Array) -> Array:
-    # Written out term by term: a reduction over the middle axis costs XLA's CPU code ten times as much.
+    # Written out term by term, because XLA's CPU code for a reduction over the middle axis takes ten times as long.
     return reduce(jnp.add, (fixed[:, term] * x[:, term] for term in range(fixed.shape[1])))
 
 
 def _spread(fixed: Array, cotangent: Array) -> Array:
-    """The transpose; JAX's own pads every term."""
+    """Transpose of `_sum`. JAX's own transpose pads every term."""
     return fixed * cotangent[:, None]
 
 
 def _spread_gray(fixed: Array, cotangent: Array) -> Array:
-    """The same for what is gray beside colors, written out for the same reason."""
+    """`_spread` for a gray factor beside a colored one: sums over colors, written out for the same reason as `_sum`."""
     colors = range(cotangent.shape[1])
     return reduce(jnp.add, (fixed[..., c] * cotangent[:, None, c] for c in colors))[..., None]
 
 
 @require.arguments(light=_environment)
 def light_tuple(transport: Transport, light: Environment, *, light_keep: int | None = None) -> Float[Array, "v r c"]:
-    """The light side: what changes when the light turns.
+    """The light-modulated tuple of every vertex: light times visibility, cosine and the light factor of each term.
+
+    Call it again when the light changes; it does not depend on the view.
 
     Args:
         transport: Precomputed transport.
-        light: The environment, on the size of cubemap that the transport was made for.
-        light_keep: Coefficients of the light to keep, chosen by `choose_by_transport`; all of them if None. Keeping
-            all costs no more here, since the light is read through a dense table.
+        light: The environment. Its cubemap must have the size of the transport's.
+        light_keep: Number of light coefficients to keep, chosen by `choose_by_transport`; all if None. Keeping all
+            takes no more time, because coefficients are read from a dense table.
 
     Returns:
-        The light-modulated tuple of every vertex, in the mesh's order.
+        One value per vertex, term and color, with vertices in the order of the mesh.
 
     Raises:
-        ValueError: The light is a batch, its cubemap is not six faces of the transport's size, or it is not finite.
+        ValueError: The light is a batch, has another cubemap size than the transport, or is not finite.
     """
     require.finite("the light", light.radiance)
     size = haar.face_edge(transport.rms.shape[0])
@@ -212,20 +218,21 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
 
 @require.arguments(brdf=_brdf)
 def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]) -> Float[Array, "v r c"]:
-    """The view side: view maps looked up at each vertex's direction to the eye.
+    """The view-modulated tuple of every vertex: view maps looked up in the direction to the eye.
+
+    Call it again when the eye moves; it does not depend on the light.
 
     Args:
-        transport: Whose vertices.
+        transport: Precomputed transport, which holds the vertices.
         brdf: The factored BRDF of the transport.
         eye: Position of the viewer in world units.
 
     Returns:
-        The view-modulated tuple of every vertex, in the mesh's order.
+        One value per vertex, term and color, with vertices in the order of the mesh.
 
     Raises:
-        ValueError: The eye is not one position, or not finite: inside `jax.jit` its values are not known, and all
-            vertices get NaN. Or the transport was made for another BRDF: values that JAX is tracing are not compared,
-            nor is transport that does not know its BRDF.
+        ValueError: The eye is not one finite position, or the transport was made for another BRDF. Neither can be
+            checked inside `jax.jit`, where NaN in the eye reaches all vertices.
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
@@ -236,10 +243,16 @@ def view_tuple(transport: Transport, brdf: SeparableBrdf, eye: Float[Array, "3"]
 def view_factors(
     brdf: SeparableBrdf, position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], eye: Float[Array, "*p 3"]
 ) -> Float[Array, "v r c"]:
-    """View maps looked up for any positions and frames: `view_tuple` without a transport.
+    """View maps looked up for given positions and frames: `view_tuple` without a transport.
+
+    Args:
+        brdf: The factored BRDF.
+        position: Positions in world units.
+        frame: Shading frames; rows are tangent, bitangent, normal.
+        eye: Position of the viewer in world units: one, or one for each position.
 
     Raises:
-        ValueError: The eye is neither one position nor one for each, or not finite.
+        ValueError: The eye is not finite, or is neither one position nor one for each.
     """
     require.position("the eye", eye, each=len(position))
     return _view_factors(brdf, position, frame, eye)
@@ -253,23 +266,24 @@ def _view_factors(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array
 def modulate(
     view: Float[Array, "v r d"], weight: Float[Array, "v n w"], *, terms: tuple[int, ...]
 ) -> Float[Array, "v r e"]:
-    """Gives every vertex a BRDF of its own: the view tuple with the terms of n basis BRDFs weighted.
+    """Gives every vertex its own BRDF, a weighted sum of n basis BRDFs, by weighting the terms of the view tuple.
 
-    A texture over all of one BRDF is n = 1; a texture on its diffuse part is `jaxprt.separable.join` of that part
-    and the rest, with weight 1 for the rest. Neither transport nor the light tuple depends on the weights, so new ones
-    cost no more than a view change. Linear in the weights, and differentiable in them.
+    For a texture that multiplies a whole BRDF, n is 1. For a texture on the diffuse part only, join the diffuse part
+    and the rest with `jaxprt.separable.join`, and give the rest a weight of 1. Neither the transport nor the light
+    tuple depends on the weights, so changing them costs no more than changing the view. The result is linear in the
+    weights.
 
     Args:
         view: `view_tuple` of the joined BRDF.
-        weight: Of each vertex, in the mesh's order, each basis BRDF, and each color or all colors alike.
+        weight: Weight of each of n basis BRDFs at each vertex, per color or for all colors.
         terms: Number of terms of each basis BRDF, in the order of `jaxprt.separable.join`.
 
     Returns:
-        The view tuple for `combine`, in the colors of the BRDF or of the weights, whichever are more.
+        The view tuple for `combine`. It has colors if the BRDF or the weights have.
 
     Raises:
-        ValueError: The weights' n or the tuple's r do not fit the terms, or weights are not finite. Inside `jax.jit`
-            values are not known, and NaN reaches the vertices that have it.
+        ValueError: The number of weights or of terms does not match `terms`, or a weight is not finite. Values cannot
+            be checked inside `jax.jit`, where NaN reaches the vertices that have such a weight.
 
     Reference: Wang, Tran, Luebke 2004, section 3.1.
     """
@@ -290,17 +304,17 @@ def _modulated(view: Array, weight: Array, *, terms: tuple[int, ...]) -> Array:
 
 @isolated
 def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
-    """Dot product of the two tuples: outgoing radiance per vertex and color.
+    """Radiance: the dot product of the light tuple and the view tuple over the terms r.
 
     Args:
-        light: `light_tuple`; its c channels are the light's, one if that is gray.
-        view: `view_tuple`; its d channels are the BRDF's.
+        light: The result of `light_tuple`, with the c colors of the light.
+        view: The result of `view_tuple`, with the d colors of the BRDF.
 
     Returns:
-        Linear radiance in e colors, the larger of c and d: a gray side serves all colors of the other.
+        Linear radiance of each vertex in e = max(c, d) colors. If one tuple is gray, it is used for all colors.
 
     Raises:
-        ValueError: The tuples are of other vertices, other terms, or unlike colors.
+        ValueError: The tuples differ in vertices, terms or colors, and neither is gray.
     """
     (c, d), shapes = (light.shape[-1], view.shape[-1]), (list(light.shape), list(view.shape))
     if light.shape[:2] != view.shape[:2] or (c != d and 1 not in (c, d)):
@@ -321,24 +335,24 @@ def radiance(
 ) -> Float[Array, "v c"]:
     """Radiance that each vertex sends to the eye.
 
-    Differentiable in the light, the eye, the view maps and the transport's values. The light maps are not read: they
-    are in the transport. So the gradient in the BRDF is the view maps' part alone; for parameters of a BRDF
-    model take `jaxprt.reference.radiance`.
+    Differentiable in the light, the eye, the view maps and the transport's values. The light maps are part of the
+    transport and not read here, so gradients with respect to the BRDF cover the view maps only. For gradients with
+    respect to the parameters of a BRDF model use `jaxprt.reference.radiance`.
 
     Args:
         transport: Precomputed transport.
-        brdf: The factored BRDF that it was made for.
-        light: The environment.
+        brdf: The factored BRDF of the transport.
+        light: The environment. Its cubemap must have the size of the transport's.
         eye: Position of the viewer in world units.
-        light_keep: As in `light_tuple`.
+        light_keep: Number of light coefficients to keep, chosen by `choose_by_transport`; all if None.
 
     Returns:
-        Linear radiance per vertex, in the light's units.
+        Linear radiance per vertex, in units of the light's radiance.
 
     Raises:
-        TypeError: The BRDF is not factored, or the light is no Environment.
-        ValueError: The BRDF has another number of terms than the transport, the transport was made for another BRDF,
-            or as in `light_tuple`.
+        TypeError: The BRDF is not a `SeparableBrdf`, or the light is not an `Environment`.
+        ValueError: The transport was made for another BRDF, the light is a batch or has another cubemap size than the
+            transport, or the light or the eye is not finite.
 
     Reference: Wang, Tran, Luebke 2004, equation 6.
     """

@@ -1,4 +1,4 @@
-"""Transport as padded sparse rows: the coefficients that each vertex keeps of each BRDF term."""
+"""Sparse transport: the largest wavelet coefficients of each vertex and BRDF term, padded to rows of equal length."""
 
 from functools import partial
 
@@ -11,18 +11,18 @@ from jaxtyping import Array, Float, Int, Shaped, UInt
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, total
 
-# Versions of what makes the results of `separable.wavelets`; a release that changes them raises one.
+# Versions of the algorithms of `separable.wavelets`. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "separable": 1}
-_CHUNKS = 4  # of each number on average: longer ones are padded more, shorter ones leave more sums to scatter
+_CHUNKS = 4  # per wavelet coefficient on average; longer chunks have more padding, shorter ones more sums to scatter
 
 
 class Transpose(eqx.Module):
-    """Kept coefficients by their number, in chunks of those with the same one.
+    """Kept coefficients sorted by index. Each of n chunks holds up to w coefficients with the same index.
 
     Attributes:
-        row: Vertex and term of each, as vertex x terms + term; 0 where padded.
-        value: Its value; 0 where padded.
-        number: Number that all of a chunk have, rising.
+        row: Vertex and term of each coefficient, as vertex x terms + term; 0 in padding.
+        value: Value of each coefficient; 0 in padding.
+        number: Index that the coefficients of each chunk have in common, in increasing order.
     """
 
     row: Int[Array, "w n"]
@@ -31,16 +31,17 @@ class Transpose(eqx.Module):
 
 
 class SparseTransport(eqx.Module):
-    """Kept wavelet coefficients of transport, largest first, and the vertices that they belong to.
+    """The k largest wavelet coefficients of the transport of each vertex v and BRDF term r, largest first.
 
     Attributes:
-        index: Number of each kept coefficient among the 6 n n; 0 where padded.
-        value: Its value; 0 where padded. The last axis is 1 (gray) or one per color.
+        index: Index of each kept coefficient, of the 6 n n of the light; 0 in padding.
+        value: Value of each kept coefficient; 0 in padding. The last axis is 1 (gray) or one per color.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        rms: Root mean square over vertices and terms of each coefficient as kept.
-        transpose: The same by number, for gradients by the light; from `with_transpose`.
-        mark: Some values of the light factors that it was made of, by which other BRDFs are refused; None if unknown.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        rms: Root mean square of the kept transport over vertices and terms, for each wavelet coefficient.
+        transpose: The coefficients sorted by index, for fast gradients with respect to the light; from
+            `with_transpose`.
+        mark: Samples of the BRDF's light factors, by which relighting refuses another BRDF; None if unknown.
     """
 
     index: UInt[Array, "k v r"]
@@ -52,7 +53,7 @@ class SparseTransport(eqx.Module):
     mark: Float[Array, "r m"] | None = None
 
     def truncate(self, count: int, *, terms: int | None = None) -> "SparseTransport":
-        """The `count` largest coefficients of the first `terms` terms (all of them if None)."""
+        """The transport with the `count` largest coefficients and the first `terms` terms (None: all)."""
         require.between("count", count, 1, self.index.shape[0])
         require.between("terms", terms, 1, self.terms)
         index, value = self.index[:count, :, :terms], self.value[:count, :, :terms]
@@ -61,12 +62,13 @@ class SparseTransport(eqx.Module):
         return SparseTransport(index, value, self.position, self.frame, size, mark=mark)
 
     def with_transpose(self) -> "SparseTransport":
-        """The same, whose gradient by the light takes about as long as the light itself: without, five times as long.
+        """Adds a transposed copy of the coefficients, which makes gradients with respect to the light faster.
 
-        It takes 8 bytes more for each coefficient (16 in color), and some again for padding: 1.5 times the transport's
-        own. Derivatives by the values need none of it, and are right with it; `keep` drops it.
+        With it, such a gradient takes about as long as `apply`; without it, about five times as long. The copy takes 8
+        bytes per coefficient (16 in color) and padding. Derivatives with respect to the transport's values do not use
+        it. `truncate` drops it.
         """
-        # By row, so that what is read together lies together.
+        # Sorted by row, so that values read together are contiguous in memory.
         rows, colors = self.index[0].size, self.value.shape[3]
         value = np.asarray(self.value).reshape(-1, rows, colors).swapaxes(0, 1)
         kept = np.any(value != 0, -1)
@@ -87,16 +89,16 @@ class SparseTransport(eqx.Module):
 
     @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r _"]:
-        """Transport times light coefficients: each vertex's sum over its kept coefficients, per term and color.
+        """Multiplies the transport by the light: a sum over the kept coefficients of each vertex, term and color.
 
         Args:
-            coefficient: Coefficients of the light.
+            coefficient: Haar coefficients of the light, from `jaxprt.separable.project`.
 
         Returns:
-            The light-modulated tuple of Wang et al., in the light's units.
+            The light-modulated tuple of Wang et al., in units of radiance.
 
         Raises:
-            ValueError: The light has another number of coefficients than the transport was made for.
+            ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
         colors = max(coefficient.shape[1], self.value.shape[3])
@@ -112,12 +114,12 @@ class SparseTransport(eqx.Module):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the coefficients, and of their transpose where there is one."""
+        """Bytes of indices and values, and of the transpose if there is one."""
         return self.index.nbytes + self.value.nbytes + sum(each.nbytes for each in jax.tree.leaves(self.transpose))
 
 
 def _gather(transport: SparseTransport, coefficient: Array) -> Array:
-    """The kept-coefficient axis comes first, so that one step reads contiguous rows of all vertices."""
+    """`apply`. The axis of kept coefficients comes first, so that each step reads contiguous rows of all vertices."""
     kept, vertices, terms = transport.index.shape
     rows = transport.index.reshape(kept, -1), transport.value.reshape(kept, vertices * terms, -1)
     return _accumulate(*rows, coefficient).reshape(vertices, terms, -1)
@@ -132,8 +134,8 @@ def _scatter(transport: SparseTransport, cotangent: Array) -> Array:
 
 
 def _accumulate(index: Shaped[Array, "k n"], value: Float[Array, "k n l"], table: Float[Array, "m c"]) -> Array:
-    """Sums along the first axis of values times the rows of a table."""
-    # A gray value is broadcast by hand: a trailing axis of 1 in the loop costs XLA's CPU code twice the time.
+    """Sums, along the first axis, of values times the table rows that `index` names."""
+    # Gray values are broadcast by hand: with a trailing axis of 1, XLA's CPU code for the loop takes twice as long.
     gray = value.shape[-1] == 1
     value = value[..., 0] if gray else value
 
@@ -149,20 +151,20 @@ def _accumulate(index: Shaped[Array, "k n"], value: Float[Array, "k n l"], table
 def largest(
     coefficient: Float[Array, "b d r l"], *, keep: int
 ) -> tuple[Shaped[Array, "k b r"], Float[Array, "k b r l"]]:
-    """The `keep` coefficients of largest magnitude (over colors jointly) of each row, largest first.
+    """The `keep` coefficients of largest magnitude of each row, largest first. Colors are chosen together.
 
-    The best approximation with as many coefficients in the L2 norm, since the basis is orthonormal. Of equal ones
-    that with the lower number comes first; those that are zero become padding.
+    The basis is orthonormal, so this is the best L2 approximation with `keep` coefficients. Among equal magnitudes the
+    lower index comes first. Coefficients of zero become padding.
 
     Args:
-        coefficient: Rows of coefficients along d.
-        keep: How many to keep.
+        coefficient: Coefficients d of each vertex b and term r, per color l.
+        keep: Number of coefficients to keep.
 
     Returns:
-        Numbers along d, uint16 where they fit, and values.
+        Indices along d, as uint16 if they fit and else uint32, and values.
 
     Raises:
-        ValueError: More are to be kept than there are.
+        ValueError: `keep` is below 1 or above the number of coefficients.
     """
     count = coefficient.shape[1]
     if not 1 <= keep <= count:
@@ -177,7 +179,7 @@ def largest(
 
 
 def rms(index: Array | np.ndarray, value: Array | np.ndarray, size: int) -> Array:
-    """Root mean square over vertices and terms (and colors) of each of `size` coefficients, zero where not kept."""
+    """Root mean square over vertices, terms and colors of each of `size` coefficients; those not kept count as zero."""
     total = np.zeros(size)
     for number, kept in zip(np.asarray(index), np.asarray(value), strict=True):
         total += np.bincount(number.ravel(), np.mean(kept**2, -1).ravel(), size)

@@ -1,4 +1,4 @@
-"""The separable system: its four verbs."""
+"""The separable system: `light`, `shade`, `view` and `combine` for factored BRDFs."""
 
 from typing import Any
 
@@ -14,20 +14,21 @@ from jaxprt.systems.separable.relight import Transport, combine, light_tuple, vi
 
 
 class SeparableSystem(protocol.VertexSystem):
-    """Transport of the terms of a factored BRDF, however it is stored: sparse, quantized or clustered.
+    """A factored BRDF with the transport of its terms, which may be sparse, quantized or clustered.
 
     A `Blend` weights the channels of the view maps.
 
     Attributes:
-        transport: From `jaxprt.separable.precompute` or `jaxprt.separable.clustered.precompute`.
-        brdf: The factored BRDF that it was made for.
+        transport: Transport from `jaxprt.separable.precompute`, `jaxprt.separable.quantized.quantize` or
+            `jaxprt.separable.clustered.precompute`.
+        brdf: The factored BRDF for which the transport was precomputed.
     """
 
     transport: Any
     brdf: SeparableBrdf
 
     def __check_init__(self):
-        """Refuses transport and BRDFs of other systems, and transport that was made for another BRDF."""
+        """Refuses transport and BRDFs of other systems, and transport that was precomputed for another BRDF."""
         require.kind("the transport", self.transport, Transport, source="jaxprt.separable.precompute")
         require.kind("the BRDF", self.brdf, SeparableBrdf, source="jaxprt.separable.factor")
         if self.brdf.terms != self.transport.terms:
@@ -35,11 +36,11 @@ class SeparableSystem(protocol.VertexSystem):
         check_mark(self.transport.mark, self.brdf.light_map)
 
     def light(self, environment: Environment) -> Float[Array, "v r c"]:
-        """The light-modulated tuple of every vertex: `jaxprt.separable.light_tuple`."""
+        """The light-modulated tuple of every vertex; see `jaxprt.separable.light_tuple`."""
         return light_tuple(self.transport, environment)
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "v r d"]:
-        """The view-modulated tuple of every vertex: `jaxprt.separable.view_tuple`."""
+        """The view-modulated tuple of every vertex; see `jaxprt.separable.view_tuple`."""
         protocol.check_blend(materials)
         factor = view_factors(self.brdf, *self.place(self.transport), eye)
         if materials is None:
@@ -55,5 +56,5 @@ class SeparableSystem(protocol.VertexSystem):
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)

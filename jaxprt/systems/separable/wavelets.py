@@ -1,4 +1,4 @@
-"""Transport of the separable system: per vertex and BRDF term, visibility x cosine x light map in Haar wavelets."""
+"""Transport of the separable system: Haar coefficients of visibility x cosine x light map, per vertex and BRDF term."""
 
 import os
 from collections.abc import Mapping
@@ -34,29 +34,29 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> SparseTransport:
-    """Precomputes the transport of a mesh: what it takes to relight it.
+    """Precomputes the transport of a mesh with self-shadowing, for a factored BRDF.
 
     Args:
-        mesh: The vertices to light.
-        brdf: Their factored BRDF.
-        keep: Wavelet coefficients kept per vertex and term.
-        size: Edge of the light's cubemap faces in texels, a power of two.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks, made with its parents; a call that was stopped, or killed, goes on
-            from there.
-        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
-            Process pools must not fork a process in which JAX runs: use the "spawn" context.
+        mesh: The mesh to light.
+        brdf: Factored BRDF of the mesh, from `jaxprt.separable.factor`.
+        keep: Number of wavelet coefficients kept per vertex and term.
+        size: Edge of the light's cubemap faces in texels; a power of two.
+        occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished blocks are stored; it is created with its parents. A call that was interrupted
+            continues from there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine. Process
+            pools must not fork a process in which JAX runs: use the "spawn" context.
         progress: Whether to show a progress bar.
 
     Returns:
         The transport of every vertex.
 
     Raises:
-        TypeError: The BRDF is not factored.
-        ValueError: A size that is no power of two, more coefficients to keep than there are, positions, normals or
-            tangents that are not finite, no such vertices, or a store at `path` made from something else.
-        BlockingIOError: The store is being written by another process.
+        TypeError: The BRDF is not a `SeparableBrdf`.
+        ValueError: The size is not a power of two, `keep` or a vertex index is out of range, positions, normals or
+            tangents are not finite, or the folder holds results of other inputs.
+        BlockingIOError: Another process is writing to the folder.
         RuntimeError: A worker of the executor died.
 
     Reference: Wang, Tran, Luebke 2004, section 3.3.
@@ -79,15 +79,15 @@ def precompute(
 def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: SeparableBrdf) -> Float[Array, "b d r l"]:
     """Haar coefficients of visibility x cosine x solid angle x light map.
 
-    Light map x cosine is integrated over each texel by 2 x 2 Gauss points. Points below the horizon count nothing.
+    Light map x cosine is integrated over each texel with 2 x 2 Gauss points. Points below the horizon contribute zero.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
-        brdf: The factored BRDF, of which only the light maps matter.
+        seen: Visible share of each cubemap texel in sixteenths.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        brdf: The factored BRDF. Only its light maps are used.
 
     Returns:
-        Coefficients on d = 6 n n, each face by `haar.forward`.
+        d = 6 n n coefficients per vertex, term and color. Each face is transformed separately by `haar.forward`.
 
     Raises:
         ValueError: d is not 6 n n for a power of two n.
@@ -105,7 +105,7 @@ def project(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], brdf: Separ
 
 
 def _points(size: int) -> tuple[Float[np.ndarray, "p d 3"], Float[np.ndarray, "p d 3"]]:
-    """Directions of 2 x 2 Gauss points in each texel, and what they count: direction times solid angle."""
+    """Directions of 2 x 2 Gauss points in each texel, and their weights: direction times solid angle."""
     center, step = (2 * np.arange(size) + 1) / size - 1, 1 / (np.sqrt(3) * size)
     axis = cubemap.axes()[:, None, None]
     direction, area = [], []
@@ -127,10 +127,10 @@ def compress(
     *,
     keep: int,
 ) -> tuple[Shaped[Array, "k b r"], Float[Array, "k b r l"]]:
-    """`project`, and of that the largest coefficients: one block of a `SparseTransport`.
+    """Projects one block of vertices and keeps the largest coefficients: one block of a `SparseTransport`.
 
-    Vertex by vertex, so that what lies between rays and kept coefficients stays in a core's cache and blocks run side
-    by side.
+    Vertices are processed one by one, so that intermediate arrays stay in a core's cache and blocks can run in
+    parallel.
     """
 
     def one(argument):
@@ -144,7 +144,7 @@ def compress(
 
 @dataclass(frozen=True)
 class _Job(visibility.rays.VisibilityJob):
-    """Blocks of transport; see `blocks.Job`."""
+    """Job that computes blocks of transport; see `blocks.Job`."""
 
     brdf: SeparableBrdf
     keep: int
