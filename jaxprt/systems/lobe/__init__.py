@@ -1,4 +1,4 @@
-"""The lobe system: BRDFs as mixtures of von Mises-Fisher lobes, visibility in pyramids."""
+"""The lobe system: BRDFs as mixtures of von Mises-Fisher lobes, and visibility in pyramids of cubemaps."""
 
 from jaxprt.systems.lobe import em, knots, published, pyramid, relight, remainder, system, table
 from jaxprt.systems.lobe.published import mirror_lobes

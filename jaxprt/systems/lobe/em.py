@@ -1,4 +1,4 @@
-"""The steps by which lobes are fitted to a BRDF at all nodes of a table at once; see `jaxprt.lobe.tabulate`."""
+"""Steps of the fit of lobes to a BRDF by expectation maximization (EM); `jaxprt.lobe.tabulate` calls them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,16 +12,16 @@ from jaxprt.compile import jit
 from jaxprt.decompose import mixture
 from jaxprt.sphere import directions, hemisphere
 
-RINGS, SECTORS = 64, 96  # of the quadrature that EM's samples are
-FINEST = 2e5  # concentration: a width of an eighth of a degree
-_WIDEST = 2.0  # times the concentration of one lobe for all: what a lobe must have, or light and shadow decorrelate
-_TAIL = 4  # One lobe of so many may be wider, for tails:
-_RATIO = 4.0  # each by this factor in concentration than the one before it,
+RINGS, SECTORS = 64, 96  # of the quadrature whose nodes are the samples of EM
+FINEST = 2e5  # largest concentration, a width of an eighth of a degree
+_WIDEST = 2.0  # smallest concentration relative to a single lobe's; wider lobes would average light and shadow
+_TAIL = 4  # One of this many lobes may be wider, to fit the BRDF's tails:
+_RATIO = 4.0  # each has this factor less concentration than the one before it,
 _BROADEST = 8.0  # down to this concentration, a width of twenty degrees.
-_SHARP = 50.0  # concentration from where a lobe is as good as flat
-_CORE = 0.6  # share of the mass nearest to the mirror direction by which lobes are laid out
-_BATCH = 8  # views fitted at once
-_LOWEST = 0.02  # least height at which a lobe starts
+_SHARP = 50.0  # concentration above which a lobe counts as a planar normal distribution
+_CORE = 0.6  # share of the mass, nearest to the mirror direction, that sets the initial spread of lobes
+_BATCH = 8  # number of views fitted at once
+_LOWEST = 0.02  # smallest z of the initial direction of a lobe
 _GRAZING = 1e-3
 _TINY = 1e-12
 
@@ -30,7 +30,16 @@ _TINY = 1e-12
 def samples(
     brdf: Callable, wo: Float[Array, "v 3"]
 ) -> tuple[Float[Array, "v s 3"], Float[Array, "v s c"], Float[Array, "v s 1"], Float[Array, "v s"]]:
-    """For each view directions, the mass of f cos that each has, the logarithm of cos / pi, and their extents."""
+    """Samples of BRDF x cosine for each view, around the mirror direction.
+
+    Args:
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        wo: Unit directions to the viewer.
+
+    Returns:
+        Directions s of the samples of each view v; their mass, the value of BRDF x cosine times solid angle; the
+        logarithm of the diffuse density cos / pi; and their extent, solid angle / (4 pi).
+    """
 
     def one(view):
         wi, area = hemisphere.arcs(mirror(view), rings=RINGS, sectors=SECTORS)
@@ -38,7 +47,7 @@ def samples(
         if jnp.ndim(value) != 2 or len(value) != len(wi):
             raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
         cosine = jnp.maximum(wi[:, 2], jnp.finfo(wi.dtype).tiny)
-        # A disk of solid angle a is a / (4 pi) off its center in the mean of 1 - cos.
+        # Over a disk of solid angle a, the mean of 1 - cos of the angle to its center is a / (4 pi).
         return wi, value * (cosine * area)[:, None], jnp.log(cosine / np.pi)[:, None], area / (4 * np.pi)
 
     return jax.lax.map(one, wo, batch_size=_BATCH)
@@ -48,10 +57,16 @@ def samples(
 def start(
     wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
 ) -> tuple[mixture.Mixture, Float[Array, "v l"]]:
-    """Lobes on a spiral over half vectors, as dense as the BRDF's core is; and the least concentration of each.
+    """Initial lobes for EM, on a spiral over half vectors that covers the BRDF's core; and their concentration bounds.
 
-    The last quarter of the lobes have smaller bounds: they may widen to the tails of a sharp BRDF. Without them EM
-    gives the tails to the diffuse part.
+    The last quarter of the lobes have smaller bounds, so that they can widen to fit the tails of a sharp BRDF. Without
+    them EM would assign the tails to the diffuse part.
+
+    Args:
+        wo: Unit directions to the viewer.
+        sample: Directions of the samples of each view, from `samples`.
+        mass: Mass of each sample, summed over colors.
+        lobes: Number of lobes.
     """
     away = 1 - jnp.einsum("vsi,vi->vs", sample, mirror(wo))
     order = jnp.argsort(away, 1)
@@ -62,7 +77,7 @@ def start(
     total = jnp.sum(near, 1)
     near = near / jnp.where(total > 0, total, 1)[:, None]
     slope = _slope(sample + wo[:, None])
-    # The core holds about half of the variance. A BRDF without mass has neither.
+    # The core holds about half of the variance. The small term serves BRDFs without mass.
     square = 2 * jnp.einsum("vs,vsi,vsj->vij", near, slope, slope) + 1e-8 * jnp.eye(2, dtype=wo.dtype)
     number = jnp.arange(lobes, dtype=wo.dtype)
     radius, turn = 0.9 * jnp.sqrt(-2 * jnp.log1p(-(number + 0.5) / lobes)), np.pi * (3 - 5**0.5) * number
@@ -89,7 +104,21 @@ def improve(
     *,
     steps: int,
 ) -> tuple[mixture.Mixture, Float[Array, "v k"]]:
-    """Some steps of EM for each view; arguments as of `jaxprt.decompose.mixture.fit`, with a leading axis of views."""
+    """Runs `steps` steps of EM for each view v by `jaxprt.decompose.mixture.fit`.
+
+    Args:
+        sample: Directions of the samples.
+        mass: Mass of each sample.
+        extent: Mean of 1 - cos over the solid angle of each sample.
+        lobe: The lobes before these steps.
+        least: Smallest concentration of each lobe.
+        fixed: Logarithm of each fixed density at the samples, such as that of the diffuse part.
+        weight: Weight of each fixed density.
+        steps: Number of steps.
+
+    Returns:
+        The lobes, and the weights of the fixed densities.
+    """
 
     def one(argument):
         sample, mass, extent, lobe, least, fixed, weight = argument
@@ -105,10 +134,11 @@ def improve(
 def blend(
     wo: Float[Array, "v 3"], lobe: mixture.Mixture, smoothing: Float[Array, ""], *, nodes: tuple[int, ...]
 ) -> mixture.Mixture:
-    """Draws the lobes of each node to those of its neighbors: slopes of half vectors, logarithms, parts of the weight.
+    """Moves the lobes of each node towards those of its neighbors in the table.
 
-    The two neighbors along an axis together have the weight `smoothing`. Each counts by its lobe's weight, since
-    lobes without weight may be anywhere.
+    Slopes of half vectors, logarithms of concentrations and relative weights are averaged. The two neighbors along an
+    axis together get the weight `smoothing`, and each of them counts in proportion to its lobe's weight, because a lobe
+    without weight has an arbitrary direction.
     """
     total = jnp.sum(lobe.weight, 1, keepdims=True)
     part = (lobe.weight / jnp.where(total > 0, total, 1))[..., None]
@@ -135,12 +165,12 @@ def weigh(
     fixed: Float[Array, "v s k"],
     weight: Float[Array, "v k"],
 ) -> Float[Array, "c m v"]:
-    """Weights of all components, the diffuse one last, for each color; the energy above the horizon is the BRDF's."""
+    """Weights of the lobes and, last, of the diffuse part per color, scaled to the BRDF's energy above the horizon."""
 
     def one(argument):
         sample, mass, extent, lobe, fixed, weight = argument
         density = mixture.log_density(sample, lobe.mean, lobe.concentration)
-        # Part of each lobe above the horizon: the plane cuts a sharp one like a normal distribution.
+        # Part of each lobe above the horizon. For a sharp lobe it is that of a normal distribution cut by a plane.
         wide = jnp.minimum(jnp.sum(jnp.exp(density) * 4 * np.pi * extent[:, None], 0), 1)
         sharp = jax.scipy.special.ndtr(lobe.mean[:, 2] * jnp.sqrt(lobe.concentration))
         above = jnp.append(jnp.where(lobe.concentration < _SHARP, wide, sharp), 1)
@@ -153,7 +183,7 @@ def weigh(
 
 
 def mirror(wo: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
-    """The mirror images of directions about the normal."""
+    """Mirror directions: the given directions reflected about the normal."""
     return wo * jnp.array([-1, -1, 1], wo.dtype)
 
 
@@ -162,7 +192,7 @@ def _slope(half: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
 
 
 def _reflected(wo: Float[Array, "v 3"], slope: Float[Array, "v l 2"], lowest: float) -> Float[Array, "v l 3"]:
-    """Directions whose half vectors with wo have given slopes, at least so high."""
+    """Directions whose half vectors with wo have the given slopes, raised to at least `lowest` in z."""
     normal = directions.normalize(jnp.concatenate([slope, jnp.ones_like(slope[..., :1])], -1))
     mean = 2 * jnp.sum(wo[:, None] * normal, -1, keepdims=True) * normal - wo[:, None]
     return directions.normalize(mean.at[..., 2].set(jnp.maximum(mean[..., 2], lowest)))

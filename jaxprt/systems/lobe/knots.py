@@ -1,4 +1,4 @@
-"""Lobes between the knots of a table whose parameters differ from view to view."""
+"""Interpolation of a table of lobes over BRDF parameters that differ from view to view."""
 
 import itertools
 import math
@@ -10,19 +10,19 @@ _TINY = 1e-12
 
 
 def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> Float[Array, "r v"]:
-    """Rows of a table for views that each have parameters of their own: between knots first, then between nodes.
+    """Interpolates the rows of a table for views v with their own parameters: between knots first, then between nodes.
 
     Args:
-        row: Means, logarithms of concentrations, weights and diffuse albedos of all lobes, on knots and nodes.
-        knot: Lower neighbor and weight of the upper one, for each parameter of each view.
-        axis: The same for the nodes of the view.
+        row: Means, logarithms of concentrations, weights and diffuse albedos [r] of all lobes, at all knots and nodes.
+        knot: For each parameter, the index of the lower knot and the weight of the upper one, for each view.
+        axis: For each axis of view nodes, the index of the lower node and the weight of the upper one, for each view.
         lobes: Number of lobes.
     """
     sizes, nodes = row.shape[1 : 1 + len(knot)], row.shape[1 + len(knot) :]
     flat = row.reshape(len(row), -1)
 
     def read(index: Array, node: Array, left: list) -> Array:
-        """Rows at a node, between the knots of the parameters that are left."""
+        """Rows at a node, interpolated over the parameters in `left`."""
         if not left:
             return flat.at[:, index * math.prod(nodes) + node].get(mode="promise_in_bounds")
         size, (low, upper) = left[0]
@@ -39,7 +39,7 @@ def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) ->
 
 
 def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
-    """Rows of lobes between those of two knots, as `jaxprt.systems.lobe.table.mean` has it."""
+    """Rows interpolated between two knots by the formula of `jaxprt.systems.lobe.table.mean`."""
     count = (3 * lobes, 4 * lobes, first.shape[0] - (first.shape[0] - 4 * lobes) // (lobes + 1))
     parts = [jnp.split(each, count) for each in (first, second)]
     strong = [jnp.sum(each[2].reshape(-1, lobes, each[2].shape[1]), 0) for each in parts]

@@ -1,4 +1,4 @@
-"""Which lobes are narrow enough for rays along them."""
+"""Selection of lobes that are narrow enough to be traced by rays."""
 
 import math
 
@@ -7,11 +7,11 @@ from jaxtyping import Array, Float
 
 from jaxprt.compile import jit
 
-WIDE, NARROW = 8.0, 32.0  # concentrations up to which harmonics carry a lobe, and from which rays carry all of it
+WIDE, NARROW = 8.0, 32.0  # concentrations below which harmonics represent a lobe, and above which rays do
 
 
 @jit
 def share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """How much of a lobe is traced: nothing of a wide one, all of a narrow one, with a smooth step between."""
+    """Share of a lobe that is traced by rays: 0 for wide lobes, 1 for narrow ones, with a smooth step between."""
     place = jnp.clip(jnp.log(concentration / WIDE) / math.log(NARROW / WIDE), 0, 1)
     return place**2 * (3 - 2 * place)

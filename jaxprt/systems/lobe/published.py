@@ -1,4 +1,4 @@
-"""Lobes as published: of fixed widths, around the mirror direction."""
+"""Published lobes: fixed widths around the mirror direction."""
 
 from collections.abc import Callable
 
@@ -16,24 +16,25 @@ from jaxprt.systems.lobe import table as lobe_table
 def mirror_lobes(
     brdf: Callable, *, angles: tuple[int | float, ...] = (0, 7, 14, 21), resolution: int = 32
 ) -> lobe_table.LobeBrdf:
-    """Separates lobes around the mirror direction, of fixed widths, from a BRDF times cosine.
+    """Fits lobes of fixed widths around the mirror direction to BRDF x cosine.
 
-    A lobe of k degrees is a Gaussian of which three standard deviations cover k degrees, and 0 degrees the perfect
-    mirror, for which a lobe of an eighth of a degree stands. EM finds their weights for each view and color, against a
-    uniform density above the horizon that stands for what remains; that is not in the table. The samples are those of
-    `lobe.tabulate`, dense around the mirror direction, and above the horizon alone: EM compares the parts of the lobes
-    that are there. The weights in the table are those of whole lobes, as for all tables.
+    A lobe of k degrees is a Gaussian with three standard deviations in k degrees. 0 degrees is the perfect mirror,
+    represented by a lobe of an eighth of a degree. EM finds the weights of the lobes for each view and color, together
+    with that of a uniform density above the horizon, which represents the rest and is not part of the table. Samples
+    are those of `lobe.tabulate`, dense around the mirror direction and only above the horizon, so EM compares the parts
+    of lobes above the horizon. Weights in the table are those of whole lobes, as in all tables.
 
     Args:
-        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr.
-        angles: Degrees that each lobe covers.
-        resolution: As of `lobe.tabulate`.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        angles: Angle of each lobe in degrees.
+        resolution: Number of view angle nodes. Anisotropic BRDFs have maps with half this edge.
 
     Returns:
-        A table of lobes without a diffuse part. What is left of the BRDF is `lobe.Remainder`, of either sign.
+        A table of lobes without a diffuse part. `lobe.Remainder` is the rest of the BRDF, which may be negative.
 
     Raises:
-        ValueError: No angles, negative ones, or a BRDF that is negative or not finite.
+        ValueError: There are no angles, an angle is negative, or the BRDF returns values that are negative or not
+            finite.
 
     Reference: Sun et al. 2007, section 4.1.
     """
@@ -50,7 +51,7 @@ def mirror_lobes(
 def _mirror_lobes(
     wo: Array, sample: Array, mass: Array, extent: Array, concentration: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Directions, logarithms of the concentrations, weights, and no diffuse part, on the nodes `wo` [*q 3]."""
+    """Directions, logarithms of concentrations, weights, and zero diffuse albedos at the view nodes `wo` [*q 3]."""
     nodes, mean, count = wo.shape[:-1], em.mirror(wo.reshape(-1, 3)), len(concentration)
 
     def one(argument):
@@ -58,7 +59,7 @@ def _mirror_lobes(
         every = jnp.broadcast_to(mean, (count, 3))
         rest = jnp.full((len(sample), 1), -np.log(2 * np.pi), sample.dtype)
         density = mixture.log_density(sample, every, concentration)
-        above = 4 * np.pi * extent @ jnp.exp(density)  # Part of each lobe; half at least, as means are not below.
+        above = 4 * np.pi * extent @ jnp.exp(density)  # part above the horizon; at least half of each lobe
         density = jnp.concatenate([density - jnp.log(above), rest], 1)
         start = jnp.ones(count + 1, sample.dtype)
         found = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=200)[0], in_axes=1)(mass)

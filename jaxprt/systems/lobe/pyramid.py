@@ -1,7 +1,7 @@
-"""What a vertex sees of the sphere at all scales, in six kilobytes: visibility for lobes of any direction and width.
+"""Visibility pyramids: visibility of each vertex at all scales, for lobes of any direction and width, in six kilobytes.
 
-Visibility of cubemap texels in one bit, and means over ever larger texels in bytes. What is seen of a lobe is read at
-the scale of its width, in a few places, whatever BRDF it comes from.
+A pyramid stores the visibility of cubemap texels as one bit each, and means over larger and larger texels as bytes. The
+visibility of a lobe is read from a few texels at the scale of its width. Pyramids do not depend on the BRDF.
 """
 
 import os
@@ -26,10 +26,10 @@ from jaxprt.sphere import cubemap, haar
 from jaxprt.systems import harmonic
 from jaxprt.visibility import StoredVisibility
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
-DEGREE = 6  # of the harmonics that the diffuse part is lit by
-_BITS = 2  # finest scales, which are read from bits
+DEGREE = 6  # of the harmonics by which the diffuse part is lit
+_BITS = 2  # number of finest scales, which are read from the bits
 _BLOCK = 1024
 
 
@@ -37,12 +37,12 @@ class LobeTransport(eqx.Module):
     """Visibility pyramids, and transfer vectors for the diffuse part of BRDFs.
 
     Attributes:
-        pyramid: For each vertex the bits of all texels, four neighbors in each half of a byte, then the means at a
-            quarter of the resolution and below, each face with a rim of its neighbors' texels.
-        vector: SH coefficients of visibility times cosine over pi.
+        pyramid: For each vertex, first the bits of all texels, with 2 x 2 neighbors in each half of a byte; then the
+            means at a quarter of the resolution and below, as bytes, each face with a border of its neighbors' texels.
+        vector: Transfer vectors: SH coefficients of visibility x cosine / pi.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        size: Edge of the cubemap's faces in texels.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        size: Edge of the cubemap faces in texels.
     """
 
     pyramid: UInt8[Array, "v n"]
@@ -57,7 +57,7 @@ class LobeTransport(eqx.Module):
         return self.pyramid.nbytes + self.vector.nbytes
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
-        """Whether each vertex sees some texels, 1 or 0: whether it sees at least half of each."""
+        """1 where a vertex sees at least half of a texel, 0 elsewhere; one row for each of the given texels."""
         byte, bit = _bit(*_split(texel, self.size), self.size)
         value = self.pyramid.at[:, byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
@@ -70,22 +70,23 @@ class LobeTransport(eqx.Module):
         spread: Float[Array, "l v"],
         points: Points | None = None,
     ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
-        """What each vertex sees of its lobes: the mean visibility over each, its horizon included, and the slopes.
+        """Mean visibility over each lobe of each vertex, horizon included, and its derivatives.
 
-        Bilinear in the two scales next to the lobe's, linear in the spread between them. At points it is the mean of
-        what the corners see of the point's own lobes.
+        Lookup is bilinear at the two scales next to the lobe's width, and linear in the spread between them. At points,
+        visibility at the three corners of the triangle is interpolated, for the lobes of the point itself.
 
         Args:
-            face: Face of the cube that each lobe's direction meets.
-            s: First coordinate on it, from `jaxprt.sphere.cubemap.project`.
-            t: Second coordinate.
-            spread: Mean of 1 - cos of the angle to the lobe's direction, as from `jaxprt.decompose.mixture.drop`.
-            points: Whose lobes they are; None for the vertices.
+            face: Cubemap face of each lobe's direction, from `jaxprt.sphere.cubemap.project`.
+            s: Column coordinate of the direction on the face, from -1 to 1.
+            t: Row coordinate of the direction on the face, from -1 to 1.
+            spread: Mean of 1 - cos of the angle to the lobe's direction, from `jaxprt.decompose.mixture.drop`.
+            points: Points that the lobes belong to; None for the vertices.
 
         Returns:
-            Visible parts of the lobes, from 0 to 1, and their derivatives by s and t.
+            Mean visibility of each lobe, from 0 to 1, and its derivatives with respect to s and t.
         """
-        # In steps: XLA's CPU code vectorizes what has no gather in it, and repeats each step for every use in the next.
+        # Split into separate programs: XLA vectorizes CPU code only without gathers, and recomputes a value for each
+        # use.
         address, bit = _addresses(face, s, t, spread, size=self.size)
         rows = _by_vertex(address)
         if points is None:
@@ -98,7 +99,7 @@ class LobeTransport(eqx.Module):
 
 @partial(isolated, static=("size",))
 def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
-    """Bytes of the eight texels that a lobe is read from, and for the scales in bits the place in the byte."""
+    """Addresses of the bytes of the eight texels that each lobe reads and, for scales stored as bits, the bit."""
     scale = scales(size)
     number, _ = between(scale, spread)
     address, bit = [], []
@@ -117,7 +118,7 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
 
 @isolated
 def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
-    """All that a vertex reads side by side: what lies in memory together is then read together."""
+    """Groups addresses by vertex, so that each vertex reads from memory that is close together."""
     return jnp.stack(address).reshape(-1, address[0].shape[1]).T
 
 
@@ -142,7 +143,7 @@ def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
 def _decoded(
     read: tuple, corner_weight: Array | None, bit: tuple, s: Array, t: Array, spread: Array, *, size: int
 ) -> tuple[Array, Array, Array]:
-    """Value and slopes, from the eight bytes of each corner."""
+    """Visibility and its derivatives with respect to s and t, from the eight bytes of each corner."""
     scale = scales(size)
     number, upper = between(scale, spread)
     result = [jnp.zeros_like(spread)] * 3
@@ -158,7 +159,7 @@ def _decoded(
 
 
 def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array) -> Array:
-    """What a byte says at a scale: one bit, the mean of four, or a mean."""
+    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond."""
     value = byte.astype(jnp.int32)
     four = value >> (bit & 4)
     four = (four & 1) + (four >> 1 & 1) + (four >> 2 & 1) + (four >> 3 & 1)
@@ -167,7 +168,7 @@ def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array) -> Array:
 
 
 class Scales(NamedTuple):
-    """Scales of a pyramid: edge of each one's faces, its spread (mean of 1 - cos), where it starts, and all texels."""
+    """Scales of a pyramid: face edge, spread (mean of 1 - cos) and offset of each scale, and the total length."""
 
     edge: np.ndarray
     spread: np.ndarray
@@ -176,7 +177,7 @@ class Scales(NamedTuple):
 
 
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
-    """The scale below each spread, and the weight of the one above."""
+    """Index of the scale below each spread, and the weight of the scale above."""
     known = jnp.asarray(scale.spread, spread.dtype)
     number = jnp.sum(spread[..., None] >= known[1:-1], -1)
     low, high = known[number], known[number + 1]
@@ -184,7 +185,12 @@ def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
 
 
 def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:
-    """Row and column of the first of the four texels about a place, rim counted, and weights and slopes of all four."""
+    """The four texels around a point, for bilinear lookup in faces with a border.
+
+    Returns:
+        Row and column of the first texel; and for each of the four its offset, weight, and derivatives of the weight
+        with respect to s and t.
+    """
     half = edge.astype(s.dtype) / 2
     column, row = (jax.lax.stop_gradient(jnp.clip(jnp.floor((x + 1) * half + 0.5), 0, edge)) for x in (s, t))
     right, down = (s + 1) * half + 0.5 - column, (t + 1) * half + 0.5 - row
@@ -198,11 +204,11 @@ def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:
 
 @lru_cache(maxsize=8)
 def scales(size: int) -> Scales:
-    """Scales of visibility pyramids: from single texels to whole faces."""
+    """Scales of a visibility pyramid, from single texels to whole faces. `size` is the edge of the finest faces."""
     if size < 8 or size & (size - 1):
         raise ValueError(f"size must be a power of two, at least 8, got {size}")
     edge = np.array([size >> k for k in range(size.bit_length())], np.int32)
-    # A texel's box and the bilinear tent have a variance of a quarter of its solid angle along either axis.
+    # A texel's box and the bilinear tent together have a variance of a quarter of its solid angle along each axis.
     spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 4
     count = 6 * (edge[_BITS:] + 2) ** 2
     start = np.concatenate([[0] * _BITS, 6 * size * size // 8 + np.cumsum(count) - count])
@@ -219,24 +225,26 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> LobeTransport:
-    """Traces what each vertex sees, for any BRDF; six kilobytes a vertex at 6 x 64 x 64.
+    """Precomputes the visibility pyramid of every vertex by ray tracing, for any BRDF.
+
+    A pyramid takes about six kilobytes per vertex at 6 x 64 x 64 texels.
 
     Args:
-        mesh: The vertices to light.
-        size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        mesh: The mesh to light.
+        size: Edge of the light's cubemap faces in texels; a power of two, at least 8.
+        occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
 
     Returns:
-        The transport.
+        Pyramids and transfer vectors of the vertices.
 
     Raises:
-        ValueError: A size out of range, positions or normals that are not finite, no such vertices, or a store at
-            `path` made from something else.
-        BlockingIOError: The store is being written by another process.
+        ValueError: The size or a vertex index is out of range, positions or normals are not finite, or the folder holds
+            results of other inputs.
+        BlockingIOError: Another process is writing to the folder.
         RuntimeError: A worker of the executor died.
     """
     scales(size)
@@ -248,10 +256,13 @@ def precompute(
 
 
 def compress(direct: StoredVisibility) -> LobeTransport:
-    """The same from visibility that is known, without rays.
+    """Makes visibility pyramids from stored visibility, without tracing rays.
+
+    Args:
+        direct: Visibility of the vertices, from `jaxprt.visibility.precompute`.
 
     Raises:
-        ValueError: Faces of less than 8 texels.
+        ValueError: The cubemap faces have an edge of less than 8 texels.
     """
     scales(direct.size)
     frame = np.asarray(direct.frame)
@@ -266,19 +277,19 @@ def compress(direct: StoredVisibility) -> LobeTransport:
 
 
 def bits(transport: LobeTransport) -> LobeTransport:
-    """The same without means and vectors: half the bytes, for single texels alone."""
+    """The transport with only the bits, about half of its bytes: enough for the visibility of single texels."""
     finest = transport.pyramid[:, : 6 * transport.size**2 // 8]
     return LobeTransport(finest, transport.vector[:0], transport.position, transport.frame, transport.size)
 
 
 class TexelBits(eqx.Module):
-    """Visibility of single texels, one bit each, texel by texel: what many texels of a light are read from.
+    """Visibility of single texels as one bit each, ordered by texel first: fast to read for many texels of a light.
 
     Attributes:
-        bit: Those of eight texels in each byte, as `LobeTransport` has them.
+        bit: Bits of eight texels in each byte, in the order of `LobeTransport`, for all vertices.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        size: Edge of the cubemap's faces in texels.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        size: Edge of the cubemap faces in texels.
     """
 
     bit: UInt8[Array, "n v"]
@@ -292,14 +303,14 @@ class TexelBits(eqx.Module):
         return self.bit.nbytes
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
-        """Whether each vertex sees some texels, 1 or 0: whether it sees at least half of each."""
+        """1 where a vertex sees at least half of a texel, 0 elsewhere; one row for each of the given texels."""
         byte, bit = _bit(*_split(texel, self.size), self.size)
         value = self.bit.at[byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)[:, None]) & 1).astype(self.position.dtype)
 
 
 def texel_bits(transport: LobeTransport) -> TexelBits:
-    """The bits alone, turned so that those of one texel lie side by side."""
+    """The bits of a transport, transposed so that those of one texel are contiguous for all vertices."""
     finest = np.asarray(transport.pyramid)[:, : 6 * transport.size**2 // 8]
     turned = jax.device_put(np.ascontiguousarray(finest.T))
     return TexelBits(turned, transport.position, transport.frame, transport.size)
@@ -307,10 +318,10 @@ def texel_bits(transport: LobeTransport) -> TexelBits:
 
 @jit
 def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
-    """Bits and means of visibility, as `LobeTransport` has them.
+    """Visibility pyramids in the layout of `LobeTransport.pyramid`.
 
     Args:
-        seen: Visibility of each cubemap texel in sixteenths.
+        seen: Visible share of each cubemap texel in sixteenths.
 
     Raises:
         ValueError: d is not 6 n n for a power of two n of at least 8.
@@ -332,19 +343,19 @@ def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
 
 
 def _bit(face: Array, row: Array, column: Array, size: int) -> tuple[Array, Array]:
-    """Byte and bit of a texel: two by two texels to each half of a byte."""
+    """Byte and bit of a texel. Each half of a byte holds 2 x 2 texels."""
     byte = (face * (size // 2) + row // 2) * (size // 4) + column // 4
     return byte, (column // 2 % 2) * 4 + row % 2 * 2 + column % 2
 
 
 def _split(texel: Array, size: int) -> tuple[Array, Array, Array]:
-    """Face, row and column of texels by their numbers."""
+    """Face, row and column of texels, from their indices."""
     return texel // (size * size), texel // size % size, texel % size
 
 
 @dataclass(frozen=True)
 class _Job(visibility.rays.VisibilityJob):
-    """Blocks of pyramids; see `blocks.Job`."""
+    """Job that computes blocks of pyramids; see `blocks.Job`."""
 
     @property
     def header(self) -> Mapping[str, Any]:

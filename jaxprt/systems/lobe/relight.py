@@ -1,14 +1,15 @@
-"""Relighting by lobes: light, view and BRDF are all free, and each change redoes only its part.
+"""Relighting by lobes. Light, view and BRDF may all change; each change recomputes only its own part.
 
-`prefilter` blurs the light to a scale of widths, once per change of light. `view_lobes` turns a view and a table of
-lobes into places in the blurred light and what is seen there, once per change of view or BRDF. `combine` reads the
-light.
+`prefilter` blurs the light by lobes of about a dozen widths; call it again when the light changes. `view_lobes` finds,
+for each vertex and lobe, the texels of the blurred light to read and their visibility; call it again when the view or
+the BRDF changes. `combine` reads the light and sums.
 
-Light and visibility vary together over a lobe: what is seen of it is a narrower lobe beside its middle. For a normal
-distribution of variance k about a direction the mean of what is seen lies off by k grad E[V] / E[V] (Stein's lemma),
-and the slope comes with the bilinear lookups. Where a straight edge cuts the lobe, that shift tells the variance that
-is left across the edge too. So E[L V] is E[V] times the light blurred about the mean of what is seen, to that width:
-exact for light that is linear over the lobe, and never negative.
+Light L and visibility V are correlated over a lobe. The visible part of a lobe is treated as a narrower lobe around
+another direction. For a normal distribution of variance k, the mean of the visible part is shifted by k grad E[V] /
+E[V] (Stein's lemma); the gradient comes from the bilinear lookup of visibility. Assuming that the occluder is a
+straight edge, the shift also determines the variance that remains across the edge. E[L V] is then E[V] times the light
+blurred to that width, read at the shifted mean. This is exact for light that is linear over the lobe, and never
+negative.
 """
 
 import math
@@ -33,24 +34,25 @@ from jaxprt.sphere import cubemap, directions, harmonics
 from jaxprt.systems.lobe.pyramid import DEGREE, LobeTransport, Scales, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes
 
-_FIRST = 0.8  # width of the finest blur in texels of the environment
-_RATIO = 1.5  # from one width to the next
-_WIDEST = 1.3  # radians
-_COARSE = 0.75  # largest texel in widths
-REACH = 3.0  # widths that a blur sums over
-_TILE = 4  # edge of what is blurred at once, in texels
-_LEAST = 1e-3  # part of a lobe that counts as seen
-_FARTHEST = 2.5  # standard deviations by which the middle of what is seen may be off
+_FIRST = 0.8  # width of the finest blur, in texels of the environment
+_RATIO = 1.5  # ratio of successive widths
+_WIDEST = 1.3  # upper limit of widths, in radians
+_COARSE = 0.75  # largest edge of a texel, relative to the width
+REACH = 3.0  # radius of the blur kernel, in widths
+_TILE = 4  # edge of the tiles in which blurred faces are computed, in texels
+_LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
+_FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
 _TINY = 1e-12
 
 
 class LobeLight(eqx.Module):
-    """A light, blurred by von Mises-Fisher lobes of a dozen widths, each with as many texels as it needs.
+    """A light blurred by von Mises-Fisher lobes of about a dozen widths. Wider blurs are stored at lower resolution.
 
     Attributes:
-        pyramid: Radiance of all widths, each face with a rim of its neighbors' texels.
-        coefficient: SH coefficients of the light itself, for the diffuse part.
-        size: Edge of the environment's faces in texels.
+        pyramid: Texels of all widths, one after another, in units of radiance; each face has a border of its neighbors'
+            texels.
+        coefficient: SH coefficients of the unblurred light, for the diffuse part.
+        size: Edge of the environment's cubemap faces in texels.
     """
 
     pyramid: Float[Array, "c t"]
@@ -59,16 +61,16 @@ class LobeLight(eqx.Module):
 
 
 class LobeView(eqx.Module):
-    """A view: where each vertex reads the light.
+    """A view: the texels of the blurred light that each vertex reads, and their weights.
 
     Attributes:
-        place: Texels of the blurred light, eight for each lobe.
-        visible: Weight of each texel, visibility included; may be negative.
-        weight: Of each lobe, gray or per color.
-        diffuse: Albedo of the diffuse part.
-        vector: Its transfer vectors, of the vertices.
-        points: Whose view it is; None for the vertices.
-        size: Edge of the environment's faces in texels.
+        place: Indices of texels of the blurred light, eight arrays with one texel for each lobe l.
+        visible: Weights of these texels: interpolation weight times visibility.
+        weight: Weight of each lobe, gray or per color.
+        diffuse: Albedo of the diffuse part, gray or per color.
+        vector: Transfer vectors of the vertices, for the diffuse part.
+        points: Points that the view belongs to; None for the vertices.
+        size: Edge of the environment's cubemap faces in texels.
     """
 
     place: tuple[Int[Array, "l v"], ...]
@@ -94,23 +96,23 @@ def radiance(
 ) -> Float[Array, "v c"]:
     """Radiance that each vertex sends to the eye.
 
-    A small sun shines past occluders that are finer than the lobes: take the brightest texels out by
-    `jaxprt.bright_texels.split` and add `jaxprt.bright_texels.radiance` of the same transport.
+    Shadows of a small sun are lost where lobes are wider than the occluders. To keep them, take the brightest texels
+    out of the light with `jaxprt.bright_texels.split`, and add `jaxprt.bright_texels.radiance` for them.
 
     Args:
-        transport: Visibility pyramids.
-        brdf: A table of lobes, without parameters: see `jaxprt.lobe.LobeBrdf.at`.
-        light: The environment.
+        transport: Visibility pyramids, from `precompute`.
+        brdf: Table of lobes without parameters, from `tabulate`; `jaxprt.lobe.LobeBrdf.at` sets parameters.
+        light: The environment. Its cubemap must have the size of the transport's.
         eye: Position of the viewer in world units.
 
     Returns:
-        Linear radiance per vertex, in the light's units; slightly negative values occur at shadow boundaries.
-        Differentiable in the light, the eye and the table.
+        Linear radiance per vertex, in units of the light's radiance. Ringing of harmonics can make the diffuse
+        part slightly negative. Differentiable in the light, the eye and the table.
 
     Raises:
-        TypeError: The BRDF is no table of lobes, or the light no Environment.
+        TypeError: The BRDF is not a `LobeBrdf`, or the light is not an `Environment`.
         ValueError: The light has another size than the transport, the table has parameters, or the light or the eye is
-            not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
+            not finite. Values cannot be checked inside `jax.jit`, where NaN reaches the vertices that read it.
 
     Reference: Sun et al. 2007, section 4.1, with free lobes and the second term.
     """
@@ -119,13 +121,13 @@ def radiance(
 
 @require.arguments(light=_environment)
 def prefilter(light: Environment) -> LobeLight:
-    """Blurs a light to all widths; linear in it.
+    """Blurs a light by lobes of all widths. The result is linear in the light.
 
     Args:
         light: One environment.
 
     Raises:
-        ValueError: A batch of lights, faces of less than 8 texels, or a light that is not finite.
+        ValueError: The light is a batch, its faces have an edge of less than 8 texels, or it is not finite.
     """
     require.finite("the light", light.radiance)
     if light.radiance.ndim != 4 or light.radiance.shape[1] < 8:
@@ -143,19 +145,19 @@ def view_lobes(
     eye: Float[Array, "*p 3"],
     points: Points | None = None,
 ) -> LobeView:
-    """Where each vertex, or point, reads the light for a view, and what it sees there.
+    """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
     Args:
-        transport: Visibility pyramids.
-        brdf: A table of lobes.
-        parameter: Those of each vertex or point, for a table over some.
-        eye: Position of the viewer in world units, or one for each vertex or point.
-        points: Where; None for the vertices.
+        transport: Visibility pyramids, from `precompute`.
+        brdf: Table of lobes, from `tabulate`.
+        parameter: Values of each BRDF parameter at the vertices or points, if the table has parameters.
+        eye: Position of the viewer in world units: one, or one for each vertex or point.
+        points: Points at which radiance is evaluated; None for the vertices.
 
     Raises:
-        TypeError: The BRDF is no table of lobes.
-        ValueError: The number of parameters is not that of the table, or the eye is not one finite position, nor
-            one for each.
+        TypeError: The BRDF is not a `LobeBrdf`.
+        ValueError: The number of parameters differs from the table's, or the eye is not finite, or is neither one
+            position nor one for each vertex or point.
     """
     require.position("the eye", eye, each=len(transport.position if points is None else points))
     return _view_lobes(transport, brdf, parameter, eye, points)
@@ -175,7 +177,7 @@ def _view_lobes(
 def _places(
     position: Array, frame: Array, brdf: LobeBrdf, eye: Array, *parameter: Array
 ) -> tuple[Lobes, tuple[Array, ...]]:
-    """Lobes of each vertex, and face, place on it and spread of each."""
+    """Lobes of each vertex; and cubemap face, coordinates s and t on it, and spread of each lobe."""
     lobe = brdf.lookup(directions.view(frame, position, eye), *parameter)
     world = [sum(lobe.mean[j] * frame[:, j, i] for j in range(3)) for i in range(3)]
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
@@ -183,7 +185,7 @@ def _places(
 
 @partial(isolated, static=("size",))
 def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Texels of the blurred light, and what each counts."""
+    """Texels of the blurred light that each lobe reads, and their weights."""
     seen, face, s, t, spread = _seen_part(visible, face, s, t, spread, concentration)
     scale = scales(size)
     number, upper = between(scale, spread)
@@ -198,18 +200,18 @@ def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tup
 
 
 def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array, Array, Array, Array]:
-    """How much of each lobe is seen, and face, place and spread of that part."""
+    """Visibility of each lobe; and face, coordinates and spread of its visible part."""
     seen, by_s, by_t = visible
-    # Slopes on the face as a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
+    # Derivatives on the face become a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
     variance = (1 + s**2 + t**2) / (concentration * (1 - spread))
     along_s = variance * (by_s * (1 + s**2) + by_t * s * t)
     along_t = variance * (by_t * (1 + t**2) + by_s * s * t)
     part = jnp.maximum(seen, _LEAST)
-    # In standard deviations of the lobe; hardly more where next to nothing is seen.
+    # Shift in standard deviations of the lobe, limited where almost nothing is visible.
     shift = jnp.sqrt((along_s * by_s + along_t * by_t) / part**2 + _TINY)
     reach = 1 / (part * jnp.maximum(shift / _FARTHEST, 1))
     shift = jnp.minimum(shift, _FARTHEST)
-    # Beyond an edge at a, the variance is 1 - m (m + a) with the mean m = phi(a) / Phi(a); fitted over m.
+    # Variance across an edge at a: 1 - m (m + a) with mean m = phi(a) / Phi(a), here as a fit over m.
     across = 1 / (1 + shift * (2 + 0.42 * shift))
     face, s, t = cubemap.project(*cubemap.unproject(face, s + along_s * reach, t + along_t * reach))
     return seen, face, s, t, spread * (1 + across) / 2
@@ -219,15 +221,22 @@ def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array
 def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     """Radiance of a view under a light.
 
+    Args:
+        light: The result of `prefilter`.
+        view: The result of `view_lobes`.
+
+    Returns:
+        Linear radiance of each vertex or point, in units of the light's radiance.
+
     Raises:
-        ValueError: The light has another size than the transport.
+        ValueError: The light has another size than the transport of the view.
     """
     if light.size != view.size:
         raise ValueError(f"the light's faces must have the transport's {view.size} texels, got {light.size}")
     irradiance = light.coefficient.T @ view.vector
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)
-    # Colors side by side, so that a tap reads them at once; lobes one after another, so that sums stay in the cache.
+    # Colors are contiguous, so that one read gets all. Lobes are summed one by one, so that sums stay in the cache.
     rows = light.pyramid.T
 
     def lit(lobe):
@@ -242,7 +251,7 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
 
 @lru_cache(maxsize=8)
 def scales(size: int) -> Scales:
-    """Scales of the blurred light: the environment itself, and every width."""
+    """Scales of the blurred light: the environment itself, whose faces have edge `size`, and then every width."""
     texel = np.sqrt(4 * np.pi / 6) / size
     width = [texel / 2]
     while len(width) < 2 or width[-1] * _RATIO < _WIDEST:
@@ -250,7 +259,7 @@ def scales(size: int) -> Scales:
     edge = [size] + [_edge(each, size, least=4) for each in width[1:]]
     edge = np.array(edge, np.int32)
     count = 6 * (edge + 2) ** 2
-    # coth k - 1/k is as good as 1 - 1/k for the sharp ones, whose hyperbolic cotangent is 1.
+    # The mean cosine is coth k - 1/k. For sharp lobes coth k is 1 to rounding.
     sharpness = np.array(width) ** -2
     spread = 1 - 1 / np.tanh(np.minimum(sharpness, 50)) + 1 / sharpness
     return Scales(edge, spread, (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
@@ -282,22 +291,25 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLigh
 
 
 def blur(edge: int, spread: float, *, size: int) -> tuple[int, float, float]:
-    """What faces of an edge are blurred from: the edge of the source's faces, and drop and concentration of the lobe.
+    """Resolution from which a blurred scale is computed, and the lobe that blurs it.
 
     Args:
-        edge: Of the blurred faces, in texels.
-        spread: The drop of the scale, as `scales` has it.
-        size: Edge of the light's faces.
+        edge: Edge of the blurred faces in texels.
+        spread: Spread of the scale (mean of 1 - cos), from `scales`.
+        size: Edge of the light's faces in texels.
+
+    Returns:
+        Edge of the source faces in texels; spread and concentration of the blurring lobe.
     """
     source = _edge(np.sqrt(spread), size, least=8)
-    # The source's boxes and the tents of the lookup blur too.
+    # Source texels (boxes) and bilinear lookup (tents) blur too; their variance is subtracted.
     texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
     own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
     return source, own, float(mixture.concentration_of(jnp.asarray(own)))
 
 
 def _edge(width: float, size: int, *, least: int) -> int:
-    """Coarsest faces whose texels are fine enough for a width."""
+    """Edge of the coarsest faces whose texels are fine enough for a width."""
     edge = size
     while edge > least and np.sqrt(4 * np.pi / 6) / (edge // 2) <= _COARSE * width:
         edge //= 2
@@ -305,12 +317,12 @@ def _edge(width: float, size: int, *, least: int) -> int:
 
 
 def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
-    """For each width the texels [tile, m, face] that make a tile of the blurred faces, and their weights [tile, o, m].
+    """For each width, source texels [tile, m, face] of each tile of the blurred faces, and their weights [tile, o, m].
 
-    What is blurred is made in tiles, so that a small dense product makes each, and weights are the same on all faces.
-    They are kept on the light's device; in a program they are constants.
+    Each tile of blurred texels o is one small dense product with its m source texels. Weights are the same on all
+    faces. They are cached on the light's device; inside a compiled program they are constants.
     """
-    with jax.ensure_compile_time_eval():  # What a trace made could not be kept.
+    with jax.ensure_compile_time_eval():  # Traced arrays could not be cached.
         size, dtype = radiance.shape[1], str(radiance.dtype)
         if isinstance(radiance, np.ndarray | Tracer):
             return _made_blurs(size, dtype)
@@ -319,7 +331,7 @@ def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Arr
 
 @lru_cache(maxsize=4)
 def _placed_blurs(size: int, dtype: str, device: Any) -> list[tuple[Array, Array]]:
-    """On a device, but not bound to it: lights that lie on several devices are blurred there."""
+    """Weights placed on a device but not committed to it, so that lights sharded over several devices can use them."""
     with jax.default_device(device):
         return jax.device_put(_made_blurs(size, dtype))
 
@@ -350,7 +362,7 @@ def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
 
 @lru_cache(maxsize=8)
 def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
-    """For each texel those that lie to the six faces as it lies to the first."""
+    """For each texel, the six texels at the same place relative to each of the six faces as it has to the first."""
     place = np.asarray(cubemap.point(size=2), np.float64)
     axes = np.stack([place[:, 0, 1] - place[:, 0, 0], place[:, 1, 0] - place[:, 0, 0], place.mean((1, 2))], 1)
     turn = np.einsum("ji,fjk->fik", axes[0], axes)

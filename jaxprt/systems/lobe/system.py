@@ -1,4 +1,4 @@
-"""The lobe system: its four verbs."""
+"""The lobe system: `light`, `shade`, `view` and `combine` for BRDFs as lobes."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,9 +14,9 @@ from jaxprt.systems.protocol import Blend
 
 
 class LobeSystem(protocol.VertexSystem):
-    """Visibility pyramids, and a BRDF as a table of lobes. Light, view and BRDF are free.
+    """Visibility pyramids with a BRDF as a table of lobes. Light, view and BRDF may all change without precomputation.
 
-    A `Blend` weights the channels of the table, and chooses the parameters of each vertex in a table over some.
+    A `Blend` weights the channels of the BRDF table and holds the parameters of each vertex.
 
     Attributes:
         transport: Visibility pyramids, from `jaxprt.lobe.precompute`.
@@ -32,7 +32,7 @@ class LobeSystem(protocol.VertexSystem):
         require.kind("the BRDF", self.brdf, LobeBrdf, source="jaxprt.lobe.tabulate")
 
     def light(self, environment: Environment) -> LobeLight:
-        """The light blurred to a dozen widths: `jaxprt.lobe.prefilter`."""
+        """The light, blurred by lobes of about a dozen widths; see `jaxprt.lobe.prefilter`."""
         lit = prefilter(environment)
         if lit.size != self.transport.size:
             raise ValueError(
@@ -41,7 +41,7 @@ class LobeSystem(protocol.VertexSystem):
         return lit
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> LobeView:
-        """Where each vertex reads the light, and what it sees there: `jaxprt.lobe.view_lobes`."""
+        """Texels at which each vertex reads the blurred light, with visibility; see `jaxprt.lobe.view_lobes`."""
         protocol.check_blend(materials)
         if materials is None:
             return view_lobes(self.transport, self.brdf, eye=eye, points=self.points)
@@ -52,17 +52,17 @@ class LobeSystem(protocol.VertexSystem):
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
 
     def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
-        """Radiance: the blurred light read at the places of the view."""
+        """Radiance: the blurred light, read at the texels of the view and weighted."""
         require.kind("the light", light, LobeLight, source="LobeSystem.light")
         require.kind("the view", view, LobeView, source="LobeSystem.view")
         return combine(light, view)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:
-        """The blurred light depends on the environment alone."""
+        """Key of the light, which depends on the environment and its size only."""
         return LobeSystem, self.transport.size

@@ -1,10 +1,10 @@
-"""A BRDF times cosine as a few lobes on the sphere, tabulated over the view direction.
+"""BRDF x cosine as a few lobes on the sphere, tabulated over the view direction.
 
     f(wi, wo) max(0, wi_z) ~ d(wo) wi_z / pi + sum_l w_l(wo) p(wi; m_l(wo), k_l(wo))
 
-with von Mises-Fisher densities p whose means, concentrations and weights are free, fitted by EM, and a diffuse part
-beside them. Six to sixteen lobes do what takes separable BRDFs sixty-four terms. The published form, Gaussians of four
-fixed widths around the mirror direction, is `jaxprt.lobe.published.mirror_lobes`.
+Here p is a von Mises-Fisher density, and d is a diffuse part. Means m, concentrations k and weights w are free and
+fitted by expectation maximization (EM). The published form, Gaussians of four fixed widths around the mirror direction,
+is `jaxprt.lobe.published.mirror_lobes`.
 """
 
 import itertools
@@ -24,22 +24,22 @@ from jaxprt.decompose import mixture
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems.lobe import em, knots
 
-_STEPS = 4  # of EM at a time: other numbers of steps would each compile anew
-# How many times these, and the weight of neighbors in the table by which lobes are smoothed after them.
+_STEPS = 4  # EM steps per call; every other number would be compiled separately
+# Rounds of EM: the number of calls, and the weight of neighboring nodes in the smoothing after them.
 _ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0))
-_DEGREE = 24  # of the natural light by which a table is judged
+_DEGREE = 24  # of the natural light under which the error of a table is measured
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
 _TINY = 1e-12
 
 
 class Lobes(eqx.Module):
-    """Lobes of some views, in the local frame of each.
+    """Lobes l of BRDF x cosine for views v, in local frames.
 
     Attributes:
-        mean: Unit directions.
-        concentration: Of each lobe.
+        mean: Unit direction of each lobe.
+        concentration: Von Mises-Fisher concentration of each lobe.
         weight: Integral of each lobe over the sphere, gray or per color.
-        diffuse: Albedo of the diffuse part.
+        diffuse: Albedo of the diffuse part, gray or per color.
     """
 
     mean: Float[Array, "3 l v"]
@@ -48,7 +48,7 @@ class Lobes(eqx.Module):
     diffuse: Float[Array, "c v"]
 
     def evaluate(self, wi: Float[Array, "d 3"]) -> Float[Array, "c d"]:
-        """The BRDF times the cosine of wi in 1/sr; zero below the horizon. Of one view, or of one for each wi."""
+        """BRDF x cosine of wi in 1/sr, for one view or for one view per wi. It is zero below the horizon."""
         away = sum((wi[:, i] - self.mean[i]) ** 2 for i in range(3)) / 2
         density = jnp.exp(mixture.log_peak(self.concentration) - self.concentration * away)
         value = jnp.sum(self.weight * density, 1) + self.diffuse * wi[:, 2] / np.pi
@@ -56,20 +56,23 @@ class Lobes(eqx.Module):
 
 
 class LobeBrdf(eqx.Module):
-    """A table of lobes. The last axis, or the last two, are nodes of the view; axes before follow the parameters.
+    """BRDF x cosine as lobes, tabulated over the view direction and optionally over BRDF parameters.
+
+    The trailing axes *q are one axis per BRDF parameter, then the nodes of the view direction. Isotropic tables have
+    one axis of nodes, at even steps of tan(theta / 2) from the normal to the horizon, for views in the x-z plane.
+    Anisotropic tables have two, of a parabolic map.
 
     Attributes:
-        mean: Directions of the lobes. An isotropic table is over tan(theta / 2) alone, from the normal to the horizon,
-            and its x axis is the horizontal part of the view direction; others are parabolic maps.
-        scale: Logarithm of the concentration.
+        mean: Direction of each lobe.
+        scale: Logarithm of the concentration of each lobe.
         weight: Integral of each lobe over the sphere, gray or per color.
-        diffuse: Albedo of the diffuse part.
-        knot: Increasing values of each parameter at which the table was made.
-        error: Relative L2 error of the radiance without shadows under light of natural spectrum, over some views
-            between the nodes.
+        diffuse: Albedo of the diffuse part, gray or per color.
+        knot: Increasing values of each BRDF parameter at which the table has entries; empty without parameters.
+        error: Relative L2 error of radiance without shadows under light of natural spectrum, over views between the
+            nodes. NaN if unknown.
     """
 
-    holds_cosine: ClassVar = True  # Values are the BRDF times the cosine.
+    holds_cosine: ClassVar = True  # values include the cosine of the light direction
 
     mean: Float[Array, "3 l *q"]
     scale: Float[Array, "l *q"]
@@ -85,7 +88,7 @@ class LobeBrdf(eqx.Module):
 
     @property
     def isotropic(self) -> bool:
-        """Whether the table is over the view angle alone."""
+        """Whether the table depends on the view angle only, not on the azimuth."""
         return self.scale.ndim - len(self.knot) == 2
 
     @property
@@ -94,12 +97,13 @@ class LobeBrdf(eqx.Module):
         return sum(each.nbytes for each in (self.mean, self.scale, self.weight, self.diffuse))
 
     def at(self, *parameter: Float[Array, ""]) -> "LobeBrdf":
-        """The table for given parameters, which then have no axes; values outside the knots count as the nearest knot.
+        """The table at given values of its BRDF parameters, without their axes.
 
-        Differentiable in the parameters; between knots as `mean` has it.
+        Values are clamped to the range of the knots. Between knots `mean` interpolates. Differentiable in the
+        parameters.
 
         Raises:
-            ValueError: The number of parameters is not that of the table.
+            ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
             raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
@@ -110,14 +114,15 @@ class LobeBrdf(eqx.Module):
         return result
 
     def lookup(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> Lobes:
-        """Lobes for some views, interpolated between the nodes; without weight where the view is below the horizon.
+        """Lobes for given views, interpolated between the nodes. Views below the horizon get weights of zero.
 
         Args:
-            wo: Directions to the viewer.
-            parameter: The parameters of each view, for a table over some; between knots as `mean` has it.
+            wo: Unit directions to the viewer in the local frame.
+            parameter: Values of each BRDF parameter for these views, if the table has parameters. Between knots `mean`
+                interpolates.
 
         Raises:
-            ValueError: The number of parameters is not that of the table: `at` chooses them for all views alike.
+            ValueError: The number of parameters differs from the table's. `at` sets parameters for all views.
         """
         if len(parameter) != len(self.knot):
             raise ValueError(
@@ -155,7 +160,7 @@ class LobeBrdf(eqx.Module):
         return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-        """Value of the BRDF times the cosine of wi in 1/sr, as far as the lobes carry it; zero below the horizon."""
+        """BRDF x cosine of wi in 1/sr, reconstructed from the lobes. It is zero below the horizon."""
         batch = wo.shape[:-1]
         value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
         return value.T.reshape(*batch, len(self.weight))
@@ -163,14 +168,19 @@ class LobeBrdf(eqx.Module):
 
 @jit
 def mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
-    """Lobes between those along the first parameter of a table, which then has no axis.
+    """Weighted mean of the lobes along the first parameter axis of a table, which is removed.
 
         w = sum_h a_h w_h,    (m, log k) = sum_h a_h w_h (m_h, log k_h) / w
 
-    with weights a that sum to one: a BRDF in which a lobe has no light has no say where the lobe is and how wide.
+    The weights a sum to one. Directions and widths are also weighted by the lobe's own weight w_h, so that an entry in
+    which the lobe has zero weight does not affect them.
+
+    Args:
+        table: The table.
+        weight: Weight a of each entry along the first parameter axis.
 
     Raises:
-        ValueError: The weights are not one for each BRDF along the parameter.
+        ValueError: The number of weights differs from the number of entries.
     """
     if weight.shape != table.scale.shape[1:2]:
         raise ValueError(f"weights must be one for each of {table.scale.shape[1]} BRDFs, got {list(weight.shape)}")
@@ -190,32 +200,33 @@ def tabulate(
     resolution: int = 32,
     knot: Sequence[np.ndarray] = (),
 ) -> LobeBrdf:
-    """Fits lobes to a BRDF times cosine for all views.
+    """Fits lobes to BRDF x cosine for all views.
 
-    Lobes are fitted at each node of the view to samples on arcs around the mirror direction. All nodes start alike, in
-    terms of half vectors, and are drawn to their neighbors between the rounds, so that a lobe stays the same one from
-    node to node and can be interpolated. Three quarters of the lobes are no wider than about 0.7 of what a single one
-    would be: with wider ones more lobes would bring nothing where light and visibility vary. The others may be, for the
-    tails of sharp BRDFs. The energy of each node's view is kept; the last node of an isotropic table is half a degree
-    above the horizon and read as if on it.
+    At each view node, EM fits lobes to samples on arcs around the mirror direction. All nodes start with the same
+    arrangement of lobes in terms of half vectors. Between rounds of EM each node is averaged with its neighbors, so
+    that corresponding lobes of adjacent nodes can be interpolated. Three quarters of the lobes are at most about 0.7
+    times as wide as a single lobe would be, so that they resolve light and visibility that vary over the BRDF's lobe.
+    The others may be wider, to fit the tails of sharp BRDFs. The reflected energy of each node is preserved. The last
+    node of an isotropic table is half a degree above the horizon and used as if it were on it.
 
     Args:
-        brdf: A BRDF (wi, wo) -> value [*b c] in 1/sr, a model or any function; with `knot` a function of the
-            parameters that makes one.
-        lobes: Number of lobes; or
-        error: the error of the table, see `LobeBrdf`, that the lobes must reach.
-        resolution: Nodes of the view angle. Anisotropic BRDFs have maps of half that on either edge.
-        knot: For a BRDF that varies, the increasing values of each of its one or two parameters. Of those that widths
-            are powers of, as roughness and exponents are, take the logarithm: it is what widths are interpolated by.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions: a model or any function. With `knot`, a
+            function of the parameters that returns such a BRDF.
+        lobes: Number of lobes. Give either `lobes` or `error`.
+        error: Largest error of the table, see `LobeBrdf`. The number of lobes is the smallest tried that meets it.
+        resolution: Number of view angle nodes. Anisotropic BRDFs have maps with half this edge.
+        knot: Increasing values of each BRDF parameter, of which there are one or two, for a BRDF that varies over the
+            surface. For parameters of which lobe widths are a power, such as roughness or an exponent, use the
+            logarithm as parameter, because logarithms of widths are interpolated linearly.
 
     Returns:
-        The table.
+        The table, with its measured error.
 
     Raises:
-        ValueError: Neither or both of lobes and error, an option out of range, knots that do not increase, an error
-            that 32 lobes do not reach, or a BRDF with values that are negative or not finite.
+        ValueError: Neither or both of `lobes` and `error` are given, an option is out of range, knots do not increase,
+            32 lobes do not meet the error, or the BRDF returns values that are negative or not finite.
 
-    Reference: Sun et al. 2007, section 4.1, with free lobes instead of theirs.
+    Reference: Sun et al. 2007, section 4.1, with free lobes instead of fixed ones.
     """
     if (lobes is None) == (error is None):
         raise ValueError(f"give either lobes or error, got lobes={lobes} and error={error}")
@@ -243,10 +254,10 @@ def tabulate(
 
 
 def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
-    """Views at the nodes of a table, and what EM needs of a BRDF there; see `lobe_em.samples`.
+    """Views at the nodes of a table, and samples of a BRDF for each; see `jaxprt.systems.lobe.em.samples`.
 
     Raises:
-        ValueError: The BRDF is negative or not finite, or has no axis for colors.
+        ValueError: The BRDF returns values that are negative or not finite, or have no color axis.
     """
     brdf = grid.as_argument(brdf)
     return _sampled(brdf, resolution, is_isotropic(brdf), ())
@@ -260,7 +271,7 @@ def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> 
 
 
 def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
-    """One table of all parameters; gray ones serve as colored beside those with colors."""
+    """One table from those of all parameter values. Gray tables are repeated to the colors of the others."""
     size = tuple(map(len, knots))
     colors = max(len(table[2]) for table in tables)
 
@@ -276,7 +287,7 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
 
 
 def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
-    """Mean, logarithm of the concentration, weight and diffuse albedo of one BRDF on the nodes `wo` [*q 3]."""
+    """Means, logarithms of concentrations, weights and diffuse albedos of one BRDF at the view nodes `wo` [*q 3]."""
     nodes = wo.shape[:-1]
     view, (sample, mass, fixed, extent) = np.asarray(wo).reshape(-1, 3), samples
     gray, lobe, least, weight = _begin(view, sample, mass, lobes=lobes)
@@ -290,7 +301,7 @@ def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array,
 
 @partial(jit, static_argnames=("lobes",))
 def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array, mixture.Mixture, Array, Array]:
-    """The mass of all colors, lobes and their least concentrations from which EM starts, and the diffuse part's."""
+    """Initial state of EM: mass summed over colors, lobes, their concentration bounds, weight of the diffuse part."""
     gray = jnp.sum(mass, -1)
     lobe, least = em.start(wo, sample, gray, lobes=lobes)
     return gray, lobe, least, jnp.sum(gray, 1, keepdims=True) / 2
@@ -298,14 +309,14 @@ def _begin(wo: Array, sample: Array, mass: Array, *, lobes: int) -> tuple[Array,
 
 @partial(jit, static_argnames=("nodes",))
 def _end(lobe: mixture.Mixture, weight: Array, *, nodes: tuple[int, ...]) -> tuple[Array, Array, Array, Array]:
-    """The parts of a table of one BRDF: lobes that EM has found, on the nodes of the view."""
+    """The arrays of a table from the lobes that EM found at the view nodes."""
     mean = jnp.moveaxis(lobe.mean, (0, 2), (2, 0)).reshape(3, -1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
     return mean, jnp.log(lobe.concentration).T.reshape(-1, *nodes), weight[:, :-1], weight[:, -1]
 
 
 def _nodes(resolution: int, isotropic: bool) -> Float[np.ndarray, "*q 3"]:
-    """View directions of the nodes; the last ones are drawn in from the horizon, where a BRDF has no value."""
+    """View directions at the nodes. The last ones lie slightly above the horizon, where a BRDF has no value."""
     if not isotropic:
         return np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution // 2))
     radius = np.minimum(np.linspace(0, 1, resolution), 1 - 0.25 / resolution)
@@ -314,7 +325,7 @@ def _nodes(resolution: int, isotropic: bool) -> Float[np.ndarray, "*q 3"]:
 
 
 def is_isotropic(brdf: Callable) -> bool:
-    """Whether turning both directions about the normal changes nothing, at a few hundred random pairs."""
+    """Whether a BRDF is isotropic: rotates a few hundred random pairs of directions about the normal and compares."""
     height, angle, turn = np.split(np.random.default_rng(0).uniform(size=(5, 256)), [2, 4])
     height, angle = 0.05 + 0.95 * height, 2 * np.pi * angle
     angle = np.concatenate([angle, angle + 2 * np.pi * turn], 1)
@@ -322,7 +333,7 @@ def is_isotropic(brdf: Callable) -> bool:
     wi, wo = np.stack([np.tile(radius, 2) * np.cos(angle), np.tile(radius, 2) * np.sin(angle), height], -1)
     dtype = jnp.result_type(float)
     value = np.split(np.asarray(_values(brdf, wi.astype(dtype), wo.astype(dtype))), 2)
-    with np.errstate(invalid="ignore", over="ignore"):  # Values that are not finite are refused elsewhere.
+    with np.errstate(invalid="ignore", over="ignore"):  # values that are not finite are refused elsewhere
         return bool(np.linalg.norm(value[0] - value[1]) <= 1e-2 * np.linalg.norm(value[0]))
 
 
@@ -333,7 +344,7 @@ def _values(brdf: Callable, wi: Array, wo: Array) -> Array:
 
 @jit
 def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
-    """Relative error of a table without parameters under light of natural spectrum."""
+    """Relative L2 error of radiance under light of natural spectrum, for a table without parameters."""
     random = np.random.default_rng(1).uniform(size=(2, 24))
     height, angle = 0.05 + 0.95 * random[0], 2 * np.pi * random[1]
     radius = np.sqrt(1 - height**2)
@@ -352,7 +363,7 @@ def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
 
 
 def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
-    """Refuses values that are no BRDF's, and says where the first one is."""
+    """Refuses BRDF values that are negative or not finite, and reports the first pair of directions."""
     value = np.asarray(mass)
     wrong = np.argwhere(~(np.isfinite(value) & (value >= 0)))
     if wrong.size:
