@@ -1,4 +1,4 @@
-"""Lamps: light from surfaces that emit and from point lights near the objects, free in color and strength."""
+"""Lamps: emitting surfaces and point lights near the objects. Their colors and intensities may change."""
 
 from jaxprt.systems.lamps import relight, transport
 from jaxprt.systems.lamps.relight import LitByLamps

@@ -1,18 +1,20 @@
-"""What surfaces make of the light of lamps.
+"""Reflected radiance of surfaces that are lit by lamps.
 
-What a vertex sees of a lamp counts as a disk on the sphere: its mean direction d and the mean resultant length R of its
-directions are those of a disk of squared chord r^2 = 4 (1 - R). Around its mean m a von Mises-Fisher lobe of
-concentration k is a normal distribution of variance 1 / k in the chord, whose area is solid angle. So
+The visible part of a lamp is approximated by a disk on the sphere with the same mean direction d and the same mean
+resultant length R; its squared chord from center to rim is r^2 = 4 (1 - R). In the chord, a von Mises-Fisher lobe with
+mean m and concentration k is a normal distribution of variance 1 / k. So
 
     ∫ p(wi; m, k) V dwi ~ Omega / (pi r^2) P(X <= k r^2)
 
-with X noncentral chi-squared of two degrees of freedom and noncentrality k |m - d|^2.
+where Omega is the visible solid angle and X is noncentral chi-squared with two degrees of freedom and noncentrality k
+|m - d|^2.
 
-For disks larger than the lobe P is by Sankaran's approximation; for smaller ones the disk is a lobe too, and variances
-add: r^2 / 4 + 1 / k.
+For disks larger than the lobe, P is computed by Sankaran's approximation. For smaller disks, the disk is treated as a
+lobe too, and the variances r^2 / 4 and 1 / k add.
 
-Where rays carry narrow lobes, for reflections of neighbors, they meet the lamps too, which then have their own shapes:
-rays take the share of a lobe that is narrow beside the lamp, and the rest stays here.
+Where narrow lobes are traced by rays, for reflections of other surfaces, the rays also hit the lamps and show their
+true shapes. The share of a lobe that is narrow relative to the lamp is then left to the rays, and the rest is computed
+here.
 """
 
 from collections.abc import Sequence
@@ -35,18 +37,18 @@ from jaxprt.systems.lobe.narrow import share
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend, check_blend
 
-_SMALL, _LARGE = 0.5, 2.0  # squared chords in variances of a lobe between which a disk stops to be a lobe itself
-_RATHER = np.log(9.0)  # radii of a lamp from one to three standard deviations of a lobe
+_SMALL, _LARGE = 0.5, 2.0  # squared chords, in variances of the lobe, between which the two approximations blend
+_RATHER = np.log(9.0)  # the share of rays rises while the lamp's radius goes from 1 to 3 standard deviations
 _TINY = 1e-30
 
 
 class LitByLamps(eqx.Module):
-    """Vertices that lamps light: their transport, and the BRDF in lobes.
+    """Vertices lit by lamps: their transport, and a BRDF as lobes or an albedo.
 
     Attributes:
-        transport: From `jaxprt.lamps.precompute`.
-        brdf: A table from `jaxprt.lobe.tabulate`; None for what is ideally diffuse.
-        albedo: Of what is ideally diffuse, gray or a color; a blend takes its place.
+        transport: Transport from `jaxprt.lamps.precompute`.
+        brdf: Table of lobes from `jaxprt.lobe.tabulate`; None for an ideal diffuse surface.
+        albedo: Albedo of an ideal diffuse surface, gray or per color. A blend replaces it.
     """
 
     transport: LampTransport
@@ -54,7 +56,7 @@ class LitByLamps(eqx.Module):
     albedo: Float[Array, " c"] = eqx.field(converter=color, default=1.0)
 
     def __check_init__(self):
-        """Refuses transport and BRDFs of other kinds, and an albedo that is no color."""
+        """Refuses other transport and BRDFs, and an albedo that is negative or has neither one nor three colors."""
         require.kind("the transport", self.transport, LampTransport, source="jaxprt.lamps.precompute")
         if self.brdf is not None:
             require.kind("the BRDF", self.brdf, LobeBrdf, source="jaxprt.lobe.tabulate")
@@ -68,20 +70,22 @@ class LitByLamps(eqx.Module):
         points: Points | None = None,
         traced: Float[Array, " _"] | None = None,
     ) -> Float[Array, "n v c"]:
-        """Radiance that each vertex or point sends to the eye, for each lamp of radiance 1.
+        """Radiance that each vertex or point sends to the eye, per lamp, for lamps of radiance 1.
 
         Args:
-            eye: Position of the viewer in world units; one, or one for each vertex or point.
-            blend: What each vertex, or point, is made of, over the channels of the BRDF; the albedo if there is none.
-            points: Where; None for the vertices.
-            traced: How much of the narrow lobes of each vertex or point rays carry; None for nothing.
+            eye: Position of the viewer in world units: one, or one for each vertex or point.
+            blend: Weights of the BRDF's channels at each vertex or point; without a BRDF, the albedo of each. None for
+                `brdf` or `albedo` as they are.
+            points: Points at which radiance is evaluated; None for the vertices.
+            traced: Share of the narrow lobes of each vertex or point that is traced by rays; None for zero.
 
         Returns:
-            Radiance, to be multiplied by the radiance of each lamp. Differentiable in the eye, the blend and the table.
+            Radiance per lamp n, vertex and color, to be multiplied by the radiance of each lamp. Differentiable in the
+            eye, the blend and the table.
 
         Raises:
-            TypeError: The blend is no `Blend`.
-            ValueError: It is of other vertices or channels, or the eye is not one finite position.
+            TypeError: The blend is not a `Blend`.
+            ValueError: The blend has another number of vertices or channels, or the eye is not finite.
         """
         count = len(self.transport.position if points is None else points)
         require.position("the eye", eye, each=count)
@@ -91,18 +95,18 @@ class LitByLamps(eqx.Module):
         return _view(self, eye, blend, points, traced)
 
     def chord(self, points: Points | None = None) -> Float[Array, "n _"]:
-        """Squared chord of the disk that each lamp is to each vertex or point."""
+        """Squared chord, from center to rim, of the disk that approximates each lamp at each vertex or point."""
         return _chord(self.transport, points)
 
     def combine(self, radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
-        """Radiance of all lamps together.
+        """Radiance of each vertex or point, summed over lamps.
 
         Args:
-            radiance: Of each lamp; the intensity of a point light.
-            view: From `view`.
+            radiance: Radiance of each lamp, or intensity of a point light, gray or per color.
+            view: The result of `view`.
 
         Raises:
-            ValueError: They are of other numbers of lamps.
+            ValueError: The number of rows of `radiance` differs from the number of lamps.
         """
         require.length("the radiance of lamps", radiance, self.transport.lamps)
         return _combine(radiance, view)
@@ -136,7 +140,7 @@ def _view(
 
 
 def _carried(transport: LampTransport, points: Points | None) -> tuple[Array, Array, Array]:
-    """The integrals, at the vertices or at points."""
+    """The transport's integrals at the vertices, or interpolated to points."""
     solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
     if points is not None:
         solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
@@ -155,18 +159,19 @@ def _chord(transport: LampTransport, points: Points | None) -> Float[Array, "n v
 
 @jit
 def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> Float[Array, "..."]:
-    """How much of a lobe rays carry to a lamp: all of one that is narrow beside the lamp, nothing of one that is wider.
+    """Share of a lobe that rays may trace to a lamp: 1 for lobes much narrower than the lamp, 0 for wider ones.
 
     Args:
-        concentration: Of the lobe.
-        chord: Squared chord from the middle of the lamp to its rim; its axes are the last ones.
+        concentration: Concentration of each lobe.
+        chord: Squared chord from the center of the lamp to its rim. Its axes align with the last axes of
+            `concentration`.
     """
     place = jnp.clip(jnp.log(jnp.maximum(concentration * chord, _TINY)) / _RATHER, 0, 1)
     return place**2 * (3 - 2 * place)
 
 
 def _sent(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
-    """What each channel of the BRDF sends of the light of one piece of a lamp."""
+    """Radiance reflected by each channel of the BRDF, from one piece of a lamp of radiance 1."""
     solid, way, matte, whole = piece
     length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
     toward = [sum(way[j] * frame[:, i, j] for j in range(3)) / length for i in range(3)]
@@ -178,16 +183,16 @@ def _sent(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, .
 
 
 def met(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
-    """Mean density of lobes over disks, in 1/sr.
+    """Mean density of lobes over disks on the sphere, in 1/sr.
 
     Args:
         mean: Unit directions of the lobes, [3 l v].
-        concentration: Of the lobes, [l v].
-        toward: Unit directions of the middles of the disks, three of [v].
-        chord: Squared chord from the middle of each disk to its rim, [v]; 0 for a point.
+        concentration: Concentrations of the lobes, [l v].
+        toward: Unit directions of the centers of the disks: three components of shape [v].
+        chord: Squared chord from the center of each disk to its rim, [v]; 0 for a point.
 
     Returns:
-        Densities, whose integral over the disk is this times pi times the squared chord.
+        Mean densities. Times pi times the squared chord, they are the integrals of the lobes over the disks.
     """
     apart = sum((mean[i] - toward[i]) ** 2 for i in range(3))
     variance = 1 / concentration + chord / 4
@@ -197,12 +202,12 @@ def met(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array
     share = share**2 * (3 - 2 * share)
     inside = _inside(jnp.maximum(size, _SMALL), concentration * apart)
     large = inside / (np.pi * jnp.maximum(chord, _SMALL / concentration))
-    # The normal distribution ends at a chord of 2.
+    # Normalizes the normal distribution, which is cut off at a chord of 2.
     return (small + share * (large - small)) / -jnp.expm1(-2 * concentration)
 
 
 def _inside(size: Array, offset: Array) -> Array:
-    """Probability that a noncentral chi-squared variable of two degrees of freedom is no larger than some size.
+    """Probability that a noncentral chi-squared variable with two degrees of freedom is at most `size`.
 
     Reference: Sankaran, "Approximations to the non-central chi-square distribution", Biometrika 1963.
     """

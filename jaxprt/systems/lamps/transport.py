@@ -1,14 +1,14 @@
-"""Transport of light from lamps: which part of each lamp a vertex sees, and in which direction.
+"""Transport of light from lamps: the visible solid angle, irradiance and mean direction of each lamp at each vertex.
 
-A lamp of radiance 1 is to a vertex the integrals, over the directions in which the lamp is seen, of 1, of the cosine
-and of the direction. They are sums over points that lie evenly on the lamp's surface, each the middle of a disk of
-area a = A / n, by rays from the vertex:
+The transport of a lamp of radiance 1 to a vertex consists of three integrals over the directions in which the lamp is
+visible: of 1, of the cosine and of the direction. They are computed by rays from the vertex to n points that are spread
+evenly over the lamp's area A. Each point stands for a disk of area a = A / n:
 
     ∫ V dw ~ sum_j V_j a (-w_j · n_j) / (r_j^2 + a / pi)
 
-where the second term of the denominator makes a disk on its axis exact at any distance. The front of a lamp sends
-light, the side to which its normals point; its back sends none. Lamps are cut into pieces, each with integrals of its
-own, so that highlights of smooth surfaces have the lamp's shape.
+The term a / pi makes the result exact on the axis of a disk at any distance. A lamp emits on the side to which its
+normals point, and not on the other. Lamps are cut into pieces with separate integrals, so that highlights on smooth
+surfaces show the lamp's shape.
 """
 
 import os
@@ -28,25 +28,26 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lamps": 1}
-_NEAR = 1e-3  # share of the distance to a lamp within which a ray that is met has met the lamp itself
-_PLASTIC = 1.324717957244746  # of which powers make Roberts' sequence in the plane
+_NEAR = 1e-3  # a hit within this share of the distance to the lamp's point counts as a hit on the lamp itself
+_PLASTIC = 1.324717957244746  # the plastic number, whose powers give Roberts' sequence in the plane
 _MOMENTS = 5
-_CLOSE = 6.0  # radii of a sample within which lamps have more of them
-_FINER = 16  # times as many
+_CLOSE = 6.0  # distance to a lamp, in radii of a sample's disk, below which more samples are used
+_FINER = 16  # factor by which there are more samples then
 
 
 class LampTransport(eqx.Module):
-    """What vertices see of lamps of radiance 1, or of point lights of intensity 1.
+    """Visible parts of lamps of radiance 1, or of point lights of intensity 1, at each vertex.
 
     Attributes:
-        solid_angle: Solid angle of each piece m of a lamp that a vertex sees above its horizon.
-        cosine: Integral of the cosine over it: the irradiance.
-        direction: Integral of the direction over it, in the world.
+        solid_angle: Visible solid angle of each piece m of a lamp above the vertex's horizon, in sr. For a point light,
+            1 / distance^2 if it is visible.
+        cosine: Integral of the cosine over this solid angle: the irradiance.
+        direction: Integral of the unit direction over this solid angle, in the world.
         position: Vertex positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        lamp: Number of the lamp that each piece belongs to.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        lamp: Index of the lamp that each piece belongs to.
     """
 
     solid_angle: Float[Array, "m v"]
@@ -79,26 +80,26 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> LampTransport:
-    """Traces which part of each lamp the vertices of a mesh see.
+    """Precomputes the visible part of each lamp at each vertex of a mesh, by ray tracing.
 
     Args:
-        mesh: The vertices to light.
-        lamps: Surfaces that emit, each with one color and strength, and point lights.
-        samples: Points on each surface; a point light has one. Shadows have as many steps. Vertices near a lamp take
-            16 times as many; light is lost where they are nearer than about a hundredth of its width.
-        pieces: Into how many pieces each surface is cut, a power of two. More are for lamps that are large beside the
-            lobes of the BRDF: one of 35 degrees in a metal of GGX roughness .3 is 9 % off by one piece, 3 % by four
-            and .8 % by sixteen.
-        occluder: What casts shadows: the whole scene, lamps included or not; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed; this machine's cores if None.
+        mesh: The mesh to light.
+        lamps: Emitting surfaces, each with one color and intensity, and point lights.
+        samples: Number of points on each surface; soft shadows have as many levels. A point light has one. For vertices
+            near a lamp there are 16 times as many. Light is underestimated at vertices nearer to a lamp than about a
+            hundredth of its width.
+        pieces: Number of pieces into which each surface is cut, a power of two. Use more for lamps that look large
+            relative to the lobes of the BRDF.
+        occluder: Mesh that casts shadows, such as the whole scene with or without the lamps; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
 
     Raises:
-        TypeError: A lamp is neither a mesh nor a point light.
-        ValueError: There are no lamps, one has no area, pieces are no power of two or more than samples, positions or
-            normals are not finite, or the store was made from something else.
+        TypeError: A lamp is neither a `Mesh` nor a `PointLight`.
+        ValueError: There are no lamps, a lamp has no area, `pieces` is not a power of two or exceeds `samples`,
+            positions or normals are not finite, or the folder holds results of other inputs.
     """
     if not lamps:
         raise ValueError("lamps must be at least one, got none")
@@ -116,7 +117,7 @@ def precompute(
 
 
 class _Samples(NamedTuple):
-    """Points on all lamps, the area of each times the normal there, and how many points each piece has."""
+    """Sample points on all lamps, the area of each times the normal there, and the number of points of each piece."""
 
     place: np.ndarray
     area: np.ndarray
@@ -135,14 +136,14 @@ class _Samples(NamedTuple):
 
 
 def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Points that lie evenly on a surface, and the area of each times the surface's normal there.
+    """Points spread evenly over a surface, and the area of each times the surface normal there.
 
     Args:
-        lamp: The surface. Its front is on the side of the vertices' normals.
+        lamp: The surface. It emits on the side to which its vertex normals point.
         count: Number of points.
 
     Raises:
-        ValueError: The surface has no area, or is not finite.
+        ValueError: The surface has no area, or its positions are not finite.
     """
     visibility.occluder.check(lamp, "lamp")
     corner, normal = (np.asarray(each, np.float64)[np.asarray(lamp.face)] for each in (lamp.position, lamp.normal))
@@ -152,7 +153,8 @@ def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[
     if not area.sum() > 0:
         raise ValueError(f"a lamp must have an area, got one of {len(area)} triangles without any")
     total = np.cumsum(area)
-    # One point in each of so many equal shares of the area; inside of their triangles by a sequence that fills it.
+    # The area is divided into `count` equal shares with one point each. Places inside triangles follow a
+    # low-discrepancy sequence.
     triangle = np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1])
     step = 1 / _PLASTIC ** np.arange(1, 3)
     first, second = np.mod(0.5 + step[:, None] * np.arange(1, count + 1), 1)
@@ -163,12 +165,12 @@ def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[
 
 
 def _alone(light: PointLight) -> tuple[np.ndarray, np.ndarray]:
-    """A point light as one sample, whose area is zero."""
+    """A point light as one sample of zero area."""
     return np.asarray(light.position, np.float64)[None], np.zeros((1, 3))
 
 
 def _halved(place: np.ndarray, pieces: int) -> list[np.ndarray]:
-    """Numbers of points in each of some pieces, by cutting across the longest extent into halves."""
+    """Indices of the points of each piece, by repeated halving across the longest extent."""
     parts = [np.arange(len(place))]
     while len(parts) < pieces:
         halves = []
@@ -182,28 +184,28 @@ def _halved(place: np.ndarray, pieces: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class _Job(visibility.rays.VisibilityJob):
-    """Blocks of what vertices see of lamps; see `blocks.Job`."""
+    """Job that computes the visible parts of lamps for blocks of vertices; see `blocks.Job`."""
 
     coarse: _Samples
     fine: _Samples
 
     @property
     def header(self) -> Mapping[str, Any]:
-        """What the result depends on."""
+        """Settings that the result depends on."""
         return self.made_by("lamps", ALGORITHM, pieces=self.coarse.piece.tolist())
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        """Sketches of the lamps' places and sizes."""
+        """Sketches of the positions and areas of the lamps' samples, compared up to rounding."""
         return {**super().near, "lamps": sketch(np.concatenate(self.coarse[:2]))}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
-        """Shapes of one block."""
+        """Arrays of one block."""
         return {"moment": Layout((visibility.rays.BLOCK, len(self.coarse.piece), _MOMENTS), 0, "float32")}
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
-        """One block."""
+        """Computes one block."""
         part = self.part(block)
         start, normal = self.start[part], self.frame[part, 2]
         moment, rays = self._seen(start, normal, self.coarse)
@@ -214,12 +216,12 @@ class _Job(visibility.rays.VisibilityJob):
         return {"moment": moment}, rays
 
     def _is_near(self, start: np.ndarray) -> np.ndarray:
-        """Whether a sample of a lamp is so near that it should be smaller."""
+        """Whether each vertex is so near to a sample of a lamp that finer samples are needed."""
         square = np.sum((self.coarse.place - start[:, None]) ** 2, -1)
         return np.any(square < _CLOSE**2 / np.pi * np.linalg.norm(self.coarse.area, axis=1), 1)
 
     def _seen(self, start: np.ndarray, normal: np.ndarray, samples: _Samples) -> tuple[np.ndarray, int]:
-        """The integrals for some points, and the number of rays that they took."""
+        """The integrals at the given points, and the number of rays traced."""
         way = samples.place - start[:, None]
         square = np.maximum(np.sum(way**2, -1), np.float32(self.rays.nudge) ** 2)
         unit = way / np.sqrt(square)[..., None]
