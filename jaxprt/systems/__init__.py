@@ -1,4 +1,4 @@
-"""The systems, their yardstick, and single bright texels beside any of them."""
+"""The relighting systems, the reference solution, and exact summation of the brightest texels of a light."""
 
 from jaxprt.systems import (
     adaptive,

@@ -1,7 +1,7 @@
-"""Integrals over the texels of a cubemap, by smaller and smaller cells where the integrand varies.
+"""Adaptive integration over the texels of a cubemap.
 
-A cell has 4 x 4 children, each with 2 x 2 Gauss points. A child whose estimated error is too large becomes a cell. The
-first cells are 4 x 4 texels, so that their children are texels.
+A cell has 4 x 4 children, and each child is integrated with 2 x 2 Gauss points. A child whose estimated error is too
+large is subdivided: it becomes a cell. The root cells are 4 x 4 texels, so their children are texels.
 """
 
 from collections.abc import Callable
@@ -18,27 +18,27 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import linear
 from jaxprt.sphere import cubemap, haar
 
-SIDE = 4  # children along the edge of a cell
-LEVELS = 16  # visibility is counted in sixteenths
-SMALL = 1 / 64  # share of a vertex's radiance of which each cell may lose `error`
-_CHUNK = 256  # cells at once
+SIDE = 4  # number of children along the edge of a cell
+LEVELS = 16  # visibility is stored in sixteenths
+SMALL = 1 / 64  # the tolerance is relative to a cell's radiance, but at least to this share of the vertex's
+_CHUNK = 256  # number of cells integrated at once
 _FINEST = 4e-4  # edge of the smallest children, on faces of edge 2
-_CURVED = 1 / 200  # times squared second difference over value: the error; 1 / 1440 for the middle of a Gaussian
-_PEAKED = 16.0  # second difference over what the middle of a Gaussian has more than the points around it
-_GAP = 1 / np.sqrt(3)  # between the two Gauss points of an interval of length 1
-_STEEPEST = 8.0  # the largest second difference around one point, in units of its value
-_NEAR = 16.0  # two edges of a child, squared, over what one of its points stands for
+_CURVED = 1 / 200  # error estimate over (squared second difference / value); 1 / 1440 at the center of a Gaussian
+_PEAKED = 16.0  # second difference over the excess of the mirror direction's value over that of a sample
+_GAP = 1 / np.sqrt(3)  # distance of the two Gauss points of an interval of length 1
+_STEEPEST = 8.0  # largest second difference around a point, relative to its value
+_NEAR = 16.0  # squared distance of two child edges, relative to the solid angle of a Gauss point
 _TINY = 1e-30
 
 
 class Integrand(NamedTuple):
-    """What is integrated.
+    """The integrand light x BRDF x cosine.
 
     Attributes:
-        brdf: A pytree and callable; `PerVertex` for one of each vertex.
-        frame: Rows are tangent, bitangent, normal.
-        wo: Local directions to the eye.
-        light: Radiance of lights l in the texels d.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr that is a callable pytree, or `PerVertex` with one BRDF per vertex.
+        frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
+        wo: Unit directions to the viewer in these frames.
+        light: Radiance of the texels d of each light l.
     """
 
     brdf: Callable
@@ -48,13 +48,13 @@ class Integrand(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What cells are chosen by.
+    """Data that decide which cells are subdivided.
 
     Attributes:
         seen: Visible share of each texel in sixteenths.
-        weight: Reciprocal radiance of each vertex under each light.
-        peak: Mean over colors of BRDF times cosine in the mirror direction.
-        error: Relative error that is allowed.
+        weight: Reciprocal of the radiance of each vertex under each light.
+        peak: BRDF x cosine in the mirror direction, averaged over colors, in 1/sr.
+        error: Largest relative error.
     """
 
     seen: UInt8[Array, "b d"]
@@ -64,15 +64,15 @@ class Choice(NamedTuple):
 
 
 def root(size: int) -> int:
-    """Texels along the edge of the first cells."""
+    """Number of texels along the edge of a root cell."""
     return SIDE if size % SIDE == 0 else 1
 
 
 def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -> Float[Array, "*b c"]:
-    """The BRDF in pairs of directions.
+    """Values of a BRDF for pairs of directions, in 1/sr.
 
     Raises:
-        ValueError: It does not return one row for each direction.
+        ValueError: The BRDF does not return one row for each pair.
     """
     wo = jnp.broadcast_to(wo, wi.shape).reshape(-1, 3)
     found = brdf(wi.reshape(-1, 3), wo)
@@ -84,14 +84,14 @@ def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -
 def integrate(
     integrand: Integrand, choice: Choice, chosen: Bool[Array, "b f m m"], *, colors: int
 ) -> Float[Array, "b l c"]:
-    """Sums light x visibility x BRDF x cosine over the chosen first cells.
+    """Integrates light x visibility x BRDF x cosine over the chosen root cells.
 
-    Differentiable in the integrand; the choice of cells is held fixed.
+    Differentiable in the integrand, with the subdivision held fixed.
 
     Args:
         integrand: The integrand.
-        choice: What cells are chosen by.
-        chosen: Which of the first cells to integrate, on six faces.
+        choice: Data that decide which cells are subdivided.
+        chosen: For each vertex and face, which of the m x m root cells to integrate.
         colors: Number of colors of the result.
     """
     moving = [each for each in jax.tree.leaves(integrand) if _floating(each)]
@@ -142,14 +142,14 @@ def _(colors, primals, tangents):
 
 
 def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree:
-    """Adds up all chosen cells and the cells in them, depth first.
+    """Sums over all chosen root cells and their descendants, depth first.
 
     Args:
-        add: From (total, cells [k 5]) to the new total and the children [k 4 4] that become cells. Cells are vertex,
-            level, face, row, column; those beyond the last one have level -1.
-        total: Where to begin.
-        choice: Whose number of texels tells how many levels there are.
-        chosen: The first cells.
+        add: Function (total, cells [k 5]) -> (new total, whether to subdivide each child [k 4 4]). A cell is (vertex,
+            level, face, row, column); padding has level -1.
+        total: Initial value of the sum.
+        choice: Data that decide which cells are subdivided; its number of texels sets the number of levels.
+        chosen: Which of the root cells to visit.
     """
     size = haar.face_edge(choice.seen.shape[1])
     deepest = _deepest(size)
@@ -160,7 +160,7 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
     number = jnp.arange(_CHUNK, dtype=jnp.int32)
 
     def step(state):
-        """The last cells of the stack and, where these are fewer than at once, the next of the first cells."""
+        """Processes the cells on top of the stack and, if they are fewer than a chunk, the next root cells."""
         stack, top, begun, total = state
         after = begun + number - top
         cell = jnp.where((number < top)[:, None], stack[top - 1 - number], first[after])
@@ -182,12 +182,12 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
 
 
 def _deepest(size: int) -> int:
-    """Level of the cells with the smallest children; the first cells have level 0."""
+    """Level of the cells with the smallest children. Root cells have level 0."""
     return max(1, int(np.ceil(np.log(2 * root(size) / size / SIDE / _FINEST) / np.log(SIDE))))
 
 
 def _visit(fixed: tuple, colors: int) -> Callable:
-    """Makes the function of the integrand's floating leaves and some cells: what they add, and children to enter."""
+    """Makes the function (floating-point leaves of the integrand, cells) -> (sums of cells, children to subdivide)."""
     whole, choice, _ = fixed
     leaf, tree = jax.tree.flatten(whole)
     size = haar.face_edge(choice.seen.shape[1])
@@ -212,7 +212,7 @@ def _visit(fixed: tuple, colors: int) -> Callable:
         again &= ((level >= 0) & (level < deepest))[:, None, None]
         kept = clear * ((level >= 0)[:, None, None] & ~again)
         inner = jnp.broadcast_to(inner * kept[..., None], (*inner.shape[:-1], colors))
-        # Child by child, since the compiler's loop for a sum over all of them takes ten times as long.
+        # One child at a time, because the compiler's loop for a sum over all of them takes ten times as long.
         light, child = integrand.light.swapaxes(0, 1), np.ndindex(SIDE, SIDE)
         return sum(light[texel[:, i, j]] * inner[:, i, j, None] for i, j in child), again
 
@@ -220,9 +220,9 @@ def _visit(fixed: tuple, colors: int) -> Callable:
 
 
 def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
-    """The largest over lights of light times weight.
+    """Maximum over lights of light times weight.
 
-    Light by light, since the compiler's loop for a maximum over all of them takes ten times as long.
+    Lights are processed one at a time, because the compiler's loop for a maximum over all takes ten times as long.
     """
 
     def step(most, each):
@@ -232,37 +232,37 @@ def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Flo
 
 
 def _nodes(cell: Array, frame: Array, size: int) -> tuple[list[Array], Array, Array]:
-    """Components of local directions, and solid angles, of Gauss points [k 8 8]; the texels of children."""
+    """Gauss points [k 8 8] of k cells: components of local directions, and solid angles; and the children's texels."""
     _, level, face, row, column = cell.T
     level = jnp.maximum(level, 0)
     edge = (2 * root(size) / size * 0.25 ** level.astype(frame.dtype))[:, None]
     offset = (np.arange(SIDE)[:, None] + 0.5 + np.array([-_GAP, _GAP]) / 2).ravel() / SIDE
     s, t = (edge * (at[:, None] + jnp.asarray(offset, frame.dtype)) - 1 for at in (column, row))
     s, t = s[:, None, :], t[:, :, None]
-    # Component by component, which XLA fuses; products with matrices it does not.
+    # Component by component, which XLA fuses; it does not fuse matrix products.
     axes = jnp.asarray(cubemap.axes(), frame.dtype)[face]
     axis = jnp.einsum("kij,kaj->kia", frame, axes, precision="highest")[..., None, None]
     short = jax.lax.rsqrt(1 + s**2 + t**2)
     wi = [(s * axis[:, i, 0] + t * axis[:, i, 1] + axis[:, i, 2]) * short for i in range(3)]
     weight = (edge[..., None] / (2 * SIDE)) ** 2 * short**3
-    per = (SIDE ** (level if root(size) > 1 else level + 1))[:, None]  # children along the edge of a texel
+    per = (SIDE ** (level if root(size) > 1 else level + 1))[:, None]  # number of children along the edge of a texel
     y, x = (SIDE * at[:, None] + np.arange(SIDE) for at in (row, column))
     texel = ((face[:, None] * size + y // per)[:, :, None] * size) + (x // per)[:, None, :]
     return wi, weight, texel
 
 
 def _children(node: Array) -> Array:
-    """Sums over the 2 x 2 points of each child."""
+    """Sums over the 2 x 2 Gauss points of each child."""
     shape = node.shape
     return jnp.sum(node.reshape(shape[0], SIDE, 2, SIDE, 2, *shape[3:]), (2, 4))
 
 
 def _again(given: tuple, vertex: Array, choice: Choice) -> Array:
-    """Which children err too much.
+    """Whether each child has too large an error and must be subdivided.
 
-    Two Gauss points err by the fourth difference over 4320. The square of the second difference over the value stands
-    for it, as it does for a Gaussian lobe. The mirror direction is one more point: a peak between all others shows
-    there.
+    The error of two Gauss points is the fourth difference / 4320. It is estimated by the squared second difference
+    divided by the value, to which it is proportional for a Gaussian lobe. The mirror direction serves as one more
+    sample, to detect a peak between all other samples.
     """
     sent, wi, wo, weight, scale = given
     gray = jax.lax.optimization_barrier(jnp.mean(sent, -1) * jnp.maximum(wi[2], 0) * weight)

@@ -1,4 +1,4 @@
-"""The axes of arrays, by the annotations of the fields that hold them."""
+"""Names of array axes, from the type annotations of the fields that hold the arrays."""
 
 import dataclasses
 import typing
@@ -11,13 +11,13 @@ from jaxtyping import PyTree
 
 
 def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
-    """The leaves of an object of the package, in order, each with the names of its axes.
+    """Iterates over the leaves of a pytree of jaxprt, in the order of `jax.tree.leaves`, with the names of their axes.
 
-    Names are those that the field's annotation gives: `v` for vertices, `block` for blocks of stored visibility, `p`
-    and `g` for clusters of vertices. There are none where no annotation fits.
+    Names are those of the field's annotation: `v` for vertices, `block` for blocks of stored visibility, `p` and `g`
+    for clusters of vertices. The list of names is empty if no annotation fits.
 
     Args:
-        value: Transport, a system, a scene.
+        value: Transport, a system or a scene.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
         hint: Any = None
@@ -30,14 +30,14 @@ def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
                 node = node[key.idx]
             elif isinstance(key, jax.tree_util.DictKey):
                 node = node[key.key]
-            else:  # of a class that is not the package's
+            else:  # a class that does not belong to jaxprt
                 hint = None
                 break
         yield _names(hint, leaf), leaf
 
 
 def _names(hint: Any, leaf: Any) -> list[str]:
-    """Names of the axes of an array; none where the annotation does not fit it."""
+    """Names of the axes of an array by an annotation; an empty list if the annotation does not fit."""
     if not isinstance(leaf, jax.Array | np.ndarray):
         return []
     names = getattr(hint, "dim_str", "").split()

@@ -1,4 +1,4 @@
-"""The brightest texels of a light one by one, exactly: stored visibility times the BRDF itself."""
+"""Exact light from the brightest texels of an environment: stored visibility times the BRDF itself."""
 
 import itertools
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from jaxprt.systems import adaptive
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility import LEVELS
 
-_ROW = 32  # texels of which the brightest is looked at first
+_ROW = 32  # texels per row, of which only the brightest is sorted at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _FINE = 32
 _value = jit(adaptive.value)
@@ -29,36 +29,36 @@ _value = jit(adaptive.value)
 
 @runtime_checkable
 class Visibility(Protocol):
-    """What this system asks of transport: visibility of single texels."""
+    """Interface of transport that stores the visibility of single texels."""
 
     @property
     def position(self) -> Float[Array, "v 3"]:
-        """Positions in world units."""
+        """Vertex positions in world units."""
         ...
 
     @property
     def frame(self) -> Float[Array, "v 3 3"]:
-        """Rows are tangent, bitangent, normal."""
+        """Shading frame of each vertex; rows are tangent, bitangent, normal."""
         ...
 
     @property
     def size(self) -> int:
-        """Edge of the cubemap's faces in texels."""
+        """Edge of the cubemap faces in texels."""
         ...
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
-        """Share of some texels that each vertex sees."""
+        """Visible share of each of the given texels, from 0 to 1, for every vertex."""
         ...
 
 
 class BrightLight(eqx.Module):
-    """A light whose brightest texels stand apart.
+    """A light whose brightest texels are kept separately.
 
     Attributes:
-        rest: The light without them, as the other system has it.
-        texel: Numbers of the texels.
-        excess: Radiance by which each stands out.
-        seen: How much of each texel each vertex sees, in sixteenths; None before `BrightTexels.shade`.
+        rest: The rest of the light, in the form of the underlying system.
+        texel: Indices of the brightest texels.
+        excess: Radiance taken out of each of these texels.
+        seen: Visible share of each texel for every vertex, in sixteenths; None before `BrightTexels.shade`.
     """
 
     rest: PyTree
@@ -68,13 +68,13 @@ class BrightLight(eqx.Module):
 
 
 class BrightView(eqx.Module):
-    """A view of a system with single texels.
+    """A view for `BrightTexels`.
 
     Attributes:
-        rest: The view, as the other system has it.
+        rest: The view in the form of the underlying system.
         frame: Shading frames of the vertices or points; rows are tangent, bitangent, normal.
-        wo: Unit directions to the viewer, in these frames.
-        blend: What the vertices are made of, where that is free.
+        wo: Unit directions to the viewer in these frames.
+        blend: Materials of the vertices or points; None for those of the BRDF.
     """
 
     rest: PyTree
@@ -84,14 +84,15 @@ class BrightView(eqx.Module):
 
 
 class BrightTexels(VertexSystem):
-    """Any system with the brightest texels of the light summed one by one, exactly.
+    """A system that sums the brightest texels of the light exactly, and relights the rest by another system.
 
     Attributes:
-        system: What relights the rest of the light.
-        visibility: Of single texels, of the same vertices: `StoredVisibility`, or `LobeTransport`.
-        brdf: The BRDF itself; with a `Blend` one whose channels are those of the system.
-        count: Number of texels.
-        samples: Points along the edge of each, from `samples_for`.
+        system: System that relights the rest of the light.
+        visibility: Visibility of single texels for the same vertices, such as `StoredVisibility` or `LobeTransport`.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions. With a `Blend`, its channels must be those of
+            the system.
+        count: Number of texels that are summed exactly.
+        samples: Number of sample points along the edge of each texel, from `samples_for`.
     """
 
     system: System
@@ -101,7 +102,7 @@ class BrightTexels(VertexSystem):
     samples: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        """Refuses what is no system or no visibility, and visibility of other vertices."""
+        """Refuses arguments that are not a system or visibility, and visibility of other vertices."""
         source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, Visibility, source=source)
@@ -109,22 +110,22 @@ class BrightTexels(VertexSystem):
             require.length("the vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
-        """The light, split; the rest as the system has it."""
+        """Splits the light into its brightest texels and the rest, which the underlying system converts."""
         texel, excess, rest = split(environment, count=self.count)
         return BrightLight(self.system.light(rest), texel, excess)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
-        """What arrives of the rest, and how much of each texel the vertices see."""
+        """Light of the rest that arrives at the vertices, and the visibility of each bright texel."""
         rest = self.system.shade(light.rest, materials)
         return BrightLight(rest, light.texel, light.excess, _seen(self.visibility, light.texel))
 
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
-        """The view, as the system has it, and the frames and directions in which the texels are summed."""
+        """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
         position, frame = self.place(self.visibility)
         return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
 
     def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
-        """Radiance: that of the system, and that of the texels."""
+        """Radiance: the sum of that of the underlying system and that of the bright texels."""
         require.kind("the light", light, BrightLight, source="BrightTexels.light")
         require.kind("the view", view, BrightView, source="BrightTexels.view")
         seen = _seen(self.visibility, light.texel) if light.seen is None else light.seen
@@ -135,38 +136,39 @@ class BrightTexels(VertexSystem):
         return self.system.combine(light.rest, view.rest) + sent
 
     def at(self, points: Points) -> "BrightTexels":
-        """The same at points: `System.at`."""
+        """The system at points; see `System.at`."""
         return eqx.tree_at(
             lambda each: (each.points, each.system), self, (points, self.system.at(points)), is_leaf=lambda x: x is None
         )
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points where radiance is evaluated at points."""
         return self.system.vertices
 
     @property
     def shared_light(self) -> tuple | None:
-        """That of the system, and the number of texels."""
+        """Key of the light: that of the underlying system, with the number of texels."""
         rest = self.system.shared_light
         return rest and (BrightTexels, self.count, rest)
 
 
 @partial(jit, static_argnames=("count",))
 def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
-    """Takes the brightest texels out of a light, as far as they stand out.
+    """Takes the excess radiance of the brightest texels out of a light.
 
     Args:
         light: One environment.
-        count: Number of texels to take.
+        count: Number of texels.
 
     Returns:
-        Numbers of the texels; the radiance by which each stands out, in its own color, so that what is left of it has
-        the flux of the brightest texel not taken; and the environment without that.
+        Indices of the brightest texels; the radiance taken out of each, in the color of the texel; and the rest of the
+        environment. In the rest, each of these texels keeps the flux (radiance times solid angle) of the brightest
+        texel that is not one of them.
 
     Raises:
-        TypeError: The light is no Environment.
-        ValueError: The light is a batch, or as many texels as there are are asked for, or less than none.
+        TypeError: The light is not an `Environment`.
+        ValueError: The light is a batch, or `count` is negative or not below the number of texels.
     """
     require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     size, colors = light.radiance.shape[-2:]
@@ -194,29 +196,28 @@ def radiance(
     samples: int = 1,
     blend: Blend | None = None,
 ) -> Float[Array, "v e"]:
-    """Radiance that vertices send to the eye, of light from some texels.
+    """Radiance that vertices send to the eye, under light from the given texels.
 
     Args:
-        transport: Visibility of the vertices: `StoredVisibility`, or the bits of `LobeTransport`.
-        brdf: A model: a pytree that is callable, (wi, wo) -> value [*b c] in 1/sr on local directions.
-        texel: Numbers of the texels.
-        excess: Radiance of each, as `split` returns it.
+        transport: Visibility of single texels for the vertices, such as `StoredVisibility` or `LobeTransport`.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions that is a callable pytree, as the models are.
+        texel: Indices of the texels.
+        excess: Radiance of each texel, from `split`.
         eye: Position of the viewer in world units.
-        samples: Points along the edge of a texel at which the BRDF is taken: the texel's center, or a Gauss rule. A
-            BRDF that varies over a texel, like a mirror, needs more than one; `samples_for` tells how many. The time
-            grows with the square.
-        blend: What each vertex is made of, over the channels of the BRDF. If it has parameters, `brdf` is a function
-            of them that makes a BRDF, as of `jaxprt.lobe.tabulate` with knots.
+        samples: Number of points along the edge of a texel at which the BRDF is sampled: 1 is the texel's center, more
+            are a Gauss rule. A BRDF that varies over a texel, such as a mirror, needs more than one; `samples_for`
+            tells how many. The time grows with the square.
+        blend: Weights of the BRDF's channels at each vertex; None for the BRDF as it is. If the blend has parameters,
+            `brdf` must be a function of these parameters that returns a BRDF.
 
     Returns:
-        Linear radiance per vertex in the light's units; that of the grazing view where the eye is below a vertex's
-        horizon.
-        Differentiable in the BRDF's parameters, the excess and the eye.
+        Linear radiance per vertex, in units of the light's radiance. Where the eye is below a vertex's horizon, it is
+        that of a grazing view. Differentiable in the BRDF's parameters, the excess and the eye.
 
     Raises:
-        TypeError: The BRDF is a table whose values hold the cosine of the light's direction.
-        ValueError: No samples, the eye is not one position, or it or the excess is not finite. Inside `jax.jit` values
-            are not known, and NaN reaches the vertices.
+        TypeError: The BRDF is a table whose values include the cosine of the light direction.
+        ValueError: `samples` is below 1, or the eye is not one finite position, or the excess is not finite. Values
+            cannot be checked inside `jax.jit`, where NaN reaches the vertices.
 
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
@@ -231,7 +232,7 @@ def radiance(
 
 
 def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
-    """The excess as floating-point numbers, once texels and excess are those of one light of the transport's size."""
+    """Checks that texels and excess fit each other and the transport; returns the excess in floating point."""
     require.length("the rows of the excess", excess, len(texel))
     require.finite("the excess", excess)
     require.within("the texels", texel, 0, 6 * transport.size**2 - 1)
@@ -250,21 +251,21 @@ def _sent(
     size: int,
     samples: int,
 ) -> Float[Array, "p e"]:
-    """Radiance that vertices, or points, send: the sum over texels of light x BRDF x cosine x visibility.
+    """Radiance that vertices or points send: the sum over texels of light x BRDF x cosine x visibility.
 
     Args:
-        brdf: The BRDF, in 1/sr.
-        frame: Rows are tangent, bitangent, normal.
-        wo: Directions to the viewer in it.
-        light: Numbers of the texels; their radiance; and how much of each the vertices see. Only the product of the
-            last two counts, so that the second may be in sixteenths and the first divided by 16.
-        points: The points; None for the vertices.
-        blend: As in `radiance`.
-        size: Edge of the cubemap's faces in texels.
-        samples: Points along the edge of each texel.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        frame: Shading frames; rows are tangent, bitangent, normal.
+        wo: Unit directions to the viewer in these frames.
+        light: Indices of the texels, their radiance, and their visible share at the vertices. Only the product of the
+            last two matters, so shares may be in sixteenths if the radiance is divided by 16.
+        points: Points at which radiance is evaluated; None for the vertices.
+        blend: Weights of the BRDF's channels, and parameters; None for the BRDF as it is.
+        size: Edge of the cubemap faces in texels.
+        samples: Number of sample points along the edge of each texel.
     """
     texel, excess, visible = light
-    # Vertices last, which XLA's CPU code turns into vectors of them.
+    # Vertices are the last axis, over which XLA vectorizes CPU code.
     frame, wo = jnp.moveaxis(frame, 0, 2), wo.T
     parameter = () if blend is None else blend.parameter
     weight = None if blend is None else jnp.moveaxis(blend.weight, 0, 2)
@@ -288,33 +289,33 @@ def _sent(
         return value(wi, wo, *parameter) * jnp.maximum(_along(frame[2], area), 0)
 
     direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples))
-    # One after another, so that what is between stays in the processor's cache.
+    # Texels are processed one by one, so that intermediate arrays stay in the processor's cache.
     return total(lit, (direction, area, excess, visible)).T
 
 
 @jit
 def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
-    """Share of some texels that each vertex sees, in sixteenths."""
+    """Visible share of each of the given texels for every vertex, in sixteenths."""
     return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
 
 
 def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
-    """Points along the edge of a texel that `radiance` needs for a BRDF.
+    """Number of sample points along the edge of a texel that `radiance` needs for a BRDF.
 
-    Texels are laid around the mirror direction of sixteen views down to 15 degrees above the surface, and the
-    integrals of BRDF times cosine over them compared to those by 32 x 32 points. Runs on the host: call it once for a
-    BRDF, and keep the number. Inside `jax.jit` parameters are not known; take the number for the sharpest BRDF there.
+    For sixteen views, down to 15 degrees above the surface, the integrals of BRDF x cosine over texels around the
+    mirror direction are compared with those by 32 x 32 points. Runs on the host: call it once per BRDF and keep the
+    number. Inside `jax.jit`, where parameters are not known, use the number for the sharpest BRDF.
 
     Args:
-        brdf: A model, or any function (wi, wo) -> value [b c] in 1/sr on local directions.
-        size: Edge of the cubemap's faces in texels.
+        brdf: BRDF (wi, wo) -> value [b c] in 1/sr on local directions: a model or any function.
+        size: Edge of the cubemap faces in texels.
         error: Largest relative L2 error over the texels of a view.
 
     Returns:
-        The smallest number that meets the error, or the largest that is tried, 16.
+        The smallest number tried that meets the error, or 16, the largest.
 
     Raises:
-        ValueError: An error that is not positive.
+        ValueError: The error is not positive.
     """
     if not error > 0:
         raise ValueError(f"error must be positive, got {error}")
@@ -322,7 +323,7 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     place = np.concatenate([np.stack(np.meshgrid(x, x), -1).reshape(-1, 2) for x, _ in rule])
     weight = np.concatenate([np.outer(w, w).ravel() for _, w in rule])
     first = np.cumsum([0, *(len(x) ** 2 for x, _ in rule[:-1])])
-    offset = np.random.default_rng(0).uniform(-2, 2, (12, 1, 2))  # middles of texels, in texels
+    offset = np.random.default_rng(0).uniform(-2, 2, (12, 1, 2))  # centers of texels, in texels
     s, t = np.moveaxis((2 * offset + place) / size, -1, 0)[..., None]
     brdf = grid.as_argument(brdf)
     need = 0
@@ -341,16 +342,16 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
 
 
 def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "v c"]:
-    """Irradiance over pi of light from some texels: the radiance of white diffuse vertices, from any side.
+    """Irradiance / pi under light from the given texels: the radiance of diffuse vertices of albedo 1.
 
     Args:
-        transport: Visibility of the vertices.
-        texel: Numbers of the texels.
-        excess: Radiance of each, as `split` returns it.
+        transport: Visibility of single texels for the vertices, such as `StoredVisibility` or `LobeTransport`.
+        texel: Indices of the texels.
+        excess: Radiance of each texel, from `split`.
 
     Raises:
-        ValueError: Texels that the transport's cubemap does not have, or excess that is not one row for each texel or
-            not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices.
+        ValueError: A texel index is out of range, or the excess is not finite or does not have one row for each texel.
+            Values cannot be checked inside `jax.jit`, where NaN reaches the vertices.
     """
     return _irradiance(transport, texel, _checked(transport, texel, excess))
 
@@ -362,7 +363,7 @@ def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
 
 
 def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Array]:
-    """Directions of the points in some texels, and their integrals of direction, [t k 3]."""
+    """Directions of the k sample points in texels t, and the integral of direction that each stands for, [t k 3]."""
     if samples == 1:
         direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
         return direction[texel, None], area[texel, None]
@@ -378,22 +379,22 @@ def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Ar
 
 
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:
-    """Visible solid angle of some texels times the cosine."""
+    """Visible solid angle of texels times the cosine."""
     area = cubemap.vector_area(size=size).reshape(-1, 3)[texel]
     return jnp.maximum(_along(normal, area[:, None]), 0) * visible
 
 
 def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
-    """Where the largest values are, the largest first: in the rows with the largest maxima, which are few to sort."""
+    """Indices of the largest values, largest first. Only the rows with the largest maxima are sorted, which is fast."""
     rows = len(value) // _ROW
     if rows <= count or len(value) % _ROW:
         return jax.lax.top_k(value, count)[1]
     table = value.reshape(rows, _ROW)
-    row = jnp.sort(jax.lax.top_k(jnp.max(table, 1), count)[1])  # In order, so that of equal values the first is taken.
+    row = jnp.sort(jax.lax.top_k(jnp.max(table, 1), count)[1])  # in order, so that the first of equal values is taken
     place = jax.lax.top_k(table[row].ravel(), count)[1]
     return row[place // _ROW] * _ROW + place % _ROW
 
 
 def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
-    """Components along an axis of each vertex."""
+    """Components of directions along one axis of each vertex's frame."""
     return axis[0] * direction[..., 0] + axis[1] * direction[..., 1] + axis[2] * direction[..., 2]

@@ -1,7 +1,8 @@
-"""Systems, transports and scenes laid over several devices by their vertices.
+"""Systems, transports and scenes sharded over several devices by their vertices.
 
-Fields of the package's classes say what their axes are. Arrays of vertices are cut along the axis ``v`` and those of
-clusters of vertices along ``p`` or ``g``; all else lies whole on every device. The same functions then run on it.
+Type annotations of fields name the axes of arrays. Arrays of vertices are sharded along the axis ``v``, and arrays of
+clusters of vertices along ``p`` or ``g``. All other arrays are replicated on every device. The same functions run on
+sharded arrays.
 """
 
 from collections.abc import Sequence
@@ -27,11 +28,11 @@ _AXES = "v", "block", "p", "g"  # vertices, blocks of them, clusters of them
 
 
 class Padded(System):
-    """A system with spare vertices at its end, so that each device has as many, seen without them.
+    """A system padded with vertices so that each device holds the same number. Radiance is returned without padding.
 
     Attributes:
-        system: The system with its spare vertices, which repeat the last.
-        count: Number of vertices without them.
+        system: The system with padding at its end, which repeats the last vertex.
+        count: Number of vertices without padding.
     """
 
     system: VertexSystem
@@ -42,7 +43,7 @@ class Padded(System):
         return self.system.light(environment)
 
     def shade(self, light: PyTree, materials: Blend | None = None) -> PyTree:
-        """What arrives at the vertices, and at the spare ones."""
+        """Light that arrives at the vertices, padding included."""
         return self.system.shade(light, self._padded(materials))
 
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> PyTree:
@@ -50,23 +51,23 @@ class Padded(System):
         return self.system.view(eye, self._padded(materials))
 
     def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
-        """Radiance of the vertices."""
+        """Radiance of the vertices, without padding."""
         return self.system.combine(light, view)[: self.count]
 
     def at(self, points: Points) -> System:
-        """The system at points: `System.at`."""
+        """The system at points; see `System.at`."""
         if isinstance(points, Points):
             points.check(self.count)
         return self.system.at(points)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, without spare ones."""
+        """Number of vertices, without padding."""
         return self.count
 
     @property
     def shared_light(self) -> tuple | None:
-        """That of the system."""
+        """Key of the system's light."""
         return self.system.shared_light
 
     def _padded(self, materials: Blend | None) -> Blend | None:
@@ -78,23 +79,24 @@ class Padded(System):
 
 
 def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignore[reportInvalidTypeForm]
-    """Lays a transport, a system or a scene over devices, each of which gets an equal share of the vertices.
+    """Shards a transport, a system or a scene over devices, each of which gets an equal share of the vertices.
 
-    What is made of it, light, views, radiance, pictures and gradients, is computed where the vertices are. Systems
-    whose vertices do not divide get a few spare ones, which nobody sees. Other arrays that do not divide, such as those
-    of the regions of a dynamic system, lie whole on every device.
+    For example `scene = jaxprt.shard(scene, jax.devices())`. Light, views, radiance, pictures and gradients are then
+    computed on the devices that hold the vertices. A system whose number of vertices is not divisible by the number of
+    devices is padded with vertices, which do not appear in the results. Other arrays that are not divisible, such as
+    those of the regions of a dynamic system, are replicated on every device.
 
     Args:
-        value: What is laid: `scene = jaxprt.shard(scene, jax.devices())`.
-        devices: The devices, one or more.
+        value: A transport, a system or a scene.
+        devices: One or more devices.
 
     Returns:
-        The same on the devices. A system whose vertices do not divide is a `Padded` one.
+        The same object with its arrays on the devices. A system that needed padding is a `Padded` system.
 
     Raises:
-        TypeError: What is laid has no vertices.
-        ValueError: There are no devices, what is given are none, or one is given twice; or the vertices of a transport
-            do not divide.
+        TypeError: `value` has no vertices.
+        ValueError: `devices` is empty, holds something other than devices, or names one twice; or the number of
+            vertices of a transport is not divisible by that of the devices.
     """
     across = _mesh(devices)
     if not any("v" in axes for axes, _ in leaves(value)):
@@ -102,7 +104,7 @@ def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignor
     even = jax.tree.map(lambda each: _even(each, across.size), value, is_leaf=lambda x: isinstance(x, VertexSystem))
     if not isinstance(value, System):
         _check_shares(value, across.size)
-    made: dict[int, Any] = {}  # What is held twice stays one array.
+    made: dict[int, Any] = {}  # An array that occurs twice stays one array.
     every = list(leaves(even))
     for axes, leaf in every:
         if id(leaf) not in made:
@@ -118,7 +120,7 @@ def _mesh(devices: Any) -> jax.sharding.Mesh:
 
 
 def _even(value: Any, shares: int) -> Any:
-    """A system whose vertices divide."""
+    """The system, padded if its number of vertices is not divisible by the number of shares."""
     if not isinstance(value, VertexSystem) or value.points is not None:
         return value
     step = shares * (BLOCK if any("block" in axes for axes, _ in leaves(value)) else 1)
@@ -127,7 +129,7 @@ def _even(value: Any, shares: int) -> Any:
 
 
 def _padded(value: Laid, count: int, size: int) -> Laid:
-    """What has so many vertices, with more that repeat the last."""
+    """Pads the arrays of `count` vertices to `size` by repeating the last vertex."""
 
     def longer(axes: list[str], leaf: Any) -> Any:
         for name, before, after in (("v", count, size), ("block", -(-count // BLOCK), -(-size // BLOCK))):
@@ -139,7 +141,7 @@ def _padded(value: Laid, count: int, size: int) -> Laid:
 
 
 def _check_shares(value: PyTree, shares: int) -> None:
-    """Refuses a transport whose vertices do not divide."""
+    """Refuses a transport whose number of vertices is not divisible by the number of shares."""
     for axes, leaf in leaves(value):
         if "v" in axes and leaf.shape[axes.index("v")] % shares:
             raise ValueError(
@@ -149,7 +151,7 @@ def _check_shares(value: PyTree, shares: int) -> None:
 
 
 def _put(axes: list[str], leaf: Any, across: jax.sharding.Mesh) -> Any:
-    if not isinstance(leaf, jax.Array):  # Numbers and tables of the host stay there.
+    if not isinstance(leaf, jax.Array):  # NumPy arrays and Python numbers stay on the host.
         return leaf
     cut = [name for name in _AXES if name in axes and leaf.shape[axes.index(name)]]
     cut = [name for name in cut if leaf.shape[axes.index(name)] % across.size == 0][:1]

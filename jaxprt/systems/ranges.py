@@ -1,4 +1,4 @@
-"""Ranges of vertices: transport or systems that are larger than the memory, relit piece by piece."""
+"""Ranges of vertices, for relighting piece by piece when a transport or system is larger than memory."""
 
 import operator
 from typing import Any, TypeVar
@@ -17,27 +17,28 @@ Piece = TypeVar("Piece", bound=PyTree)
 
 
 def take(value: Piece, start: int, stop: int) -> Piece:
-    """A range of the vertices of a transport or a system, as one of its own.
+    """A transport or a system restricted to a range of its vertices.
 
-    The same functions run on it, and what they return are the rows of the range. Of transport that is mapped from a
-    file, as `jaxprt.files.load` makes it, only the range is read and held:
+    The same functions run on the result and return rows for the vertices of the range. If the transport is
+    memory-mapped, as `jaxprt.files.load` returns it, only the range is read into memory:
 
         for start in range(0, vertices, 1 << 16):
             rows = take(system, start, min(start + (1 << 16), vertices)).combine(light, view)
 
     Args:
         value: A transport, or a system of one mesh.
-        start: First vertex; a multiple of 64 where visibility is stored.
-        stop: The vertex after the last.
+        start: Index of the first vertex. With stored visibility it must be a multiple of 64.
+        stop: Index after the last vertex.
 
     Returns:
-        The same of fewer vertices, without what gradients by the light would take beside it
-        (`SparseTransport.with_transpose`). Ranges of one length share their compiled functions.
+        The restricted transport or system. The copy that `SparseTransport.with_transpose` adds is dropped. Ranges of
+        equal length share compiled programs.
 
     Raises:
-        TypeError: It has no vertices, or clusters of them, which a range would cut; it is a scene, a sum of parts, or a
-            system at points; or the ends are no whole numbers.
-        ValueError: The range is empty or beyond the vertices, or does not begin with a block of stored visibility.
+        TypeError: `value` has no vertices, has clusters of vertices (which a range would cut), or is a scene, a sum of
+            parts or a system at points; or `start` or `stop` is not a whole number.
+        ValueError: The range is empty or exceeds the vertices, or `start` is not a multiple of 64 with stored
+            visibility.
     """
     start, stop = operator.index(start), operator.index(stop)
     if isinstance(value, System) and not isinstance(value, VertexSystem):
@@ -64,14 +65,14 @@ def _kind(value: Any) -> str:
 
 
 def _bare(value: Any) -> Any:
-    """Sparse transport without its transpose, which has numbers of all rows."""
+    """Drops the transpose of sparse transport, which refers to all vertices."""
     if not isinstance(value, SparseTransport):
         return value
     return eqx.tree_at(lambda each: each.transpose, value, None, is_leaf=lambda each: each is None)
 
 
 def _cut(axes: list[str], leaf: Any, start: int, stop: int) -> Any:
-    """The range of one array, copied, so that what is mapped is read once."""
+    """Copies the range of one array, so that memory-mapped arrays are read once."""
     if "v" in axes:
         return jax.lax.dynamic_slice_in_dim(leaf, start, stop - start, axes.index("v"))
     if "block" in axes:

@@ -1,4 +1,4 @@
-"""Direct light integrated over every texel with the BRDF itself: slow, and the yardstick of every error here."""
+"""Reference solution for direct light: integrates the BRDF itself over every texel. Slow; errors are measured by it."""
 
 from collections.abc import Callable
 
@@ -36,32 +36,35 @@ def radiance(
     progress: bool = False,
     between: Between = None,
 ) -> Float[Array, "..."]:
-    """Radiance that vertices or points send to the eye: visibility traced, BRDF and cosine integrated over every texel.
+    """Radiance of direct light that vertices or points send to the eye, by ray tracing and adaptive integration.
 
     Args:
-        mesh: The vertices.
-        brdf: A model, or any function (wi, wo) -> value [*b c] in 1/sr on local directions, of which values below
-            the horizon do not count; a new function object, as a lambda in a loop, compiles anew. `PerVertex` has one
-            for each vertex of the mesh, or each point.
+        mesh: The mesh.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions: a model or any function. Values below the
+            horizon are not used. A new function object, such as a lambda in a loop, is compiled again. `PerVertex`
+            holds one BRDF for each vertex of the mesh, or each point.
         light: The environment, or a batch of them along leading axes.
         eye: Position of the viewer in world units.
-        occluder: What casts shadows; the mesh itself if None.
-        vertex: Numbers of the vertices asked for, or a mask; all if None.
-        points: Points on triangles of the mesh, with rays of their own, in place of vertices.
-        error: Relative error that the integrals of BRDF times cosine may cause in the radiance of each vertex, mean
-            over colors. It is an estimate: a peak of the BRDF narrower than a texel is found around the mirror
-            direction only. The light counts as constant over each texel, and visibility as a share of it, in
-            sixteenths; this error leaves theirs out. With infinity each texel counts with the BRDF at its center.
+        occluder: Mesh that casts shadows; the mesh itself if None.
+        vertex: Indices of the vertices to evaluate, or a mask; all if None.
+        points: Points on triangles of the mesh at which radiance is evaluated instead of vertices. Each has its own
+            rays.
+        error: Largest relative error of the radiance of each vertex, averaged over colors, due to integration of BRDF x
+            cosine. It is an estimate: a peak of the BRDF that is narrower than a texel is detected around the mirror
+            direction only. Light is constant over each texel, and visibility is a share of the texel in sixteenths;
+            their errors are not included. With infinity, each texel uses the BRDF at its center.
         progress: Whether to show a progress bar.
-        between: Called after each block of 64 vertices; an exception that it raises gives the work up.
+        between: Function called after each block of 64 vertices. An exception that it raises stops the computation.
 
     Returns:
-        Linear radiance [*l v c], in the light's units. Differentiable in the BRDF's parameters, the light and the eye.
+        Linear radiance [*l v c], in units of the light's radiance. Differentiable in the BRDF's parameters, the light
+        and the eye.
 
     Raises:
-        TypeError: The light is no Environment, or the BRDF a table whose values hold the cosine.
-        ValueError: No such vertices, an error that is not positive, the BRDF's values have no axis for colors, or the
-            light or the eye is not finite. Inside `jax.jit` values are not known: NaN then reaches the vertices.
+        TypeError: The light is not an `Environment`, or the BRDF is a table whose values include the cosine.
+        ValueError: A vertex index is out of range, the error is not positive, the BRDF's values have no color axis, or
+            the light or the eye is not finite. Values cannot be checked inside `jax.jit`, where NaN reaches the
+            vertices.
     """
     if not error > 0:
         raise ValueError(f"error must be positive, got {error}")
@@ -109,20 +112,20 @@ def integrate(
 ) -> Float[Array, "..."]:
     """Integral of light x BRDF x visibility x cosine over all texels.
 
-    Where the BRDF is smooth, a texel counts with the BRDF at its center and the exact integral of the cosine. Texels
-    where that errs too much are divided, as often as it takes. See `jaxprt.adaptive`.
+    Where the BRDF is smooth, its value at the texel center is multiplied by the exact integral of the cosine. Texels
+    with too large an estimated error are subdivided adaptively; see `jaxprt.systems.adaptive`.
 
     Args:
         seen: Visible share of each texel in sixteenths.
         position: Positions in world units.
-        frame: Rows are tangent, bitangent, normal.
-        brdf: A BRDF that is a pytree and callable, as the models are, or `PerVertex`.
+        frame: Shading frames; rows are tangent, bitangent, normal.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr that is a callable pytree, as the models are, or `PerVertex`.
         light: The environment, or a batch of them along leading axes.
-        eye: Position of the viewer.
-        error: As in `radiance`.
+        eye: Position of the viewer in world units.
+        error: Largest relative error of the radiance of each vertex due to integration of BRDF x cosine.
 
     Returns:
-        Linear radiance [*l b c]; that of the grazing view where the eye is below a vertex's horizon.
+        Linear radiance [*l b c]. Where the eye is below a vertex's horizon, it is that of a grazing view.
 
     Reference: Wang, Tran, Luebke 2004, equation 1.
     """
@@ -136,7 +139,7 @@ def integrate(
 
 
 def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Array, adaptive.Choice, Array]:
-    """Sums over texels that need not be divided; what cells are chosen by; and which of the first cells are."""
+    """Sums over texels that need no subdivision; data that decide about subdivision; and root cells to subdivide."""
     size = haar.face_edge(seen.shape[1])
     direction, area = (_blocks(each(size=size)) for each in (cubemap.direction, cubemap.vector_area))
     middle = jnp.mean(direction, 0)
@@ -145,8 +148,8 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
     mean = jax.lax.stop_gradient(jnp.swapaxes(jnp.mean(light, -1), 0, 1))
     light = jnp.moveaxis(light, -1, 1)
 
-    # Vertices come one after another, so that the arrays of each stay in the processor's cache. `brightest` and the
-    # sum over texels are loops for a reason: XLA computes a value again for each of its uses, except across loops.
+    # Vertices are processed one by one, so that their arrays stay in the processor's cache. `brightest` and the sum
+    # over texels are explicit loops because XLA recomputes a value for each of its uses, except across loops.
     def one(argument):
         axes, wo, level, vertex = argument
         brdf = given.brdf.of(vertex) if isinstance(given.brdf, PerVertex) else given.brdf
@@ -176,14 +179,14 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
 
 
 def _sums(light: Array, value: Array) -> Array:
-    """Sums [l c] of light [c l t] times values [t c] over texels; either may be gray, with one color."""
-    # One product for each color: with colors innermost, the compiler's loops take seven times as long.
+    """Sums [l c] over texels t of light [c l t] times values [t c]. Either may be gray, with one color."""
+    # One product per color, because the compiler's loops take seven times as long with colors as the last axis.
     pairs = np.broadcast(np.arange(len(light)), np.arange(value.shape[-1]))
     return jnp.stack([light[i] @ value[:, j] for i, j in pairs], -1)
 
 
 def _blocks(texel: Array) -> Array:
-    """Texels [6 n n *c] as [e t *c], by their place e in the first cell and the number t of that cell."""
+    """Reshapes texels [6 n n *c] to [e t *c], with place e in the root cell and index t of the root cell."""
     edge = adaptive.root(texel.shape[1])
     count = texel.shape[1] // edge
     block = texel.reshape(6, count, edge, count, edge, *texel.shape[3:])
@@ -191,29 +194,29 @@ def _blocks(texel: Array) -> Array:
 
 
 def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, error: Array) -> Array:
-    """Chooses the first cells in which the BRDF at texel centers is not exact enough.
+    """Chooses the root cells in which sampling the BRDF at texel centers is not accurate enough.
 
-    The midpoint rule errs by f'' / 24 for one function f, and by another f' g' / 12 for a product f g. The horizon
-    adds at most an eighth of a texel's edge. The mirror direction shows a peak between the centers.
+    The error of the midpoint rule is f'' / 24 for a function f, plus f' g' / 12 for a product f g. The horizon adds at
+    most an eighth of a texel's edge. The mirror direction serves as one more sample, to detect a peak between centers.
 
     Args:
-        gray: BRDF at the centers of the texels [e t], in 1/sr, mean over colors. The first axis is the place of a
-            texel in its cell, the second the number of the cell.
+        gray: BRDF at the texel centers [e t], in 1/sr, averaged over colors. The first axis is the place of a texel in
+            its root cell, the second the index of the cell.
         lean: Integral of the cosine over each texel [e t], in sr; negative below the horizon.
-        scale: Visible light of each texel [e t] over the radiance of the vertex, the largest over lights.
-        away: Vector from the mirror direction to the middle of each cell [t 3].
-        height: BRDF times cosine in the mirror direction, in 1/sr.
-        error: Relative error that is allowed.
+        scale: Visible light of each texel [e t] divided by the radiance of the vertex; the maximum over lights.
+        away: Vector from the mirror direction to the center of each cell [t 3].
+        height: BRDF x cosine in the mirror direction, in 1/sr.
+        error: Largest relative error.
 
     Returns:
-        Whether each cell [t] must be divided.
+        Whether each cell [t] must be subdivided.
     """
     if len(gray) == 1:
         return jnp.broadcast_to(error < jnp.inf, gray[0].shape)
     side, edge = adaptive.SIDE, 2 / haar.face_edge(gray.size)
     flux = jnp.maximum(lean, 0)
     miss, size, top, hidden, cut = (jnp.zeros_like(gray[0]) for _ in range(5))
-    # Texels are written out one by one, so that XLA makes one loop over cells of all that follows.
+    # Texels are written out one by one, so that XLA fuses all that follows into one loop over cells.
     for here in range(side**2):
         much, sent = scale[here], gray[here] * flux[here]
         for step, place in ((side, here // side), (1, here % side)):
@@ -221,7 +224,7 @@ def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, er
                 back, ahead = here - step, here + step
                 bend = jnp.abs(gray[back] - 2 * gray[here] + gray[ahead]) * flux[here] / 24
                 bend += jnp.abs((gray[ahead] - gray[back]) * (flux[ahead] - flux[back])) / 48
-                miss += 2 * bend * much  # for the two rows in the middle and the two outside
+                miss += 2 * bend * much  # for the two inner rows and the two outer ones
         size += sent * much
         top = jnp.maximum(top, gray[here])
         hidden += jnp.abs(height * edge**2 - sent) * much
