@@ -1,4 +1,4 @@
-"""Functions on the sphere and hemisphere: directions, disk maps, cubemaps, wavelets, spherical harmonics."""
+"""Functions on the sphere and hemisphere: directions, hemisphere maps, cubemaps, wavelets, spherical harmonics."""
 
 from jaxprt.sphere import conventions, cubemap, directions, haar, harmonics, hemisphere, lighting, products, rotation
 

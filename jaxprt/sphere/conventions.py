@@ -1,7 +1,7 @@
-"""Conventions for coefficients of real spherical harmonics, by which tools differ, and conversion between them.
+"""Conventions of different tools for coefficients of real spherical harmonics, and conversion between them.
 
-Ours: orthonormal, without the Condon-Shortley phase, in l(l+1)+m order, in a right-handed world with +y up, polar axis
-z. All conventions here are of orthonormal bases.
+The convention of jaxprt is an orthonormal basis without the Condon-Shortley phase, in l(l+1)+m order, with polar axis
+z, in a right-handed world with +y up. All conventions here use orthonormal bases.
 """
 
 import re
@@ -19,16 +19,17 @@ ORDERS = ("rising", "falling", "alternating")
 
 @dataclass(frozen=True)
 class Convention:
-    """How a tool writes coefficients of real, orthonormal spherical harmonics.
+    """The convention of a tool for coefficients of real, orthonormal spherical harmonics.
 
     Attributes:
-        condon_shortley: Whether basis functions have the factor (-1)^m: then that of l=1, m=1 is negative towards +x.
-        over_pi: Whether transfer vectors hold the 1/pi of an albedo of 1, so that their product with light is radiance;
-            otherwise it is irradiance. Light and transfer matrices do not depend on it.
-        order: Order of a band: "rising", m from -l to l, which is l(l+1)+m; "falling", from l to -l; "alternating",
-            0, 1, -1, 2, -2, ...
-        axes: Where the x, y and z of the tool's basis functions point in our world, such as "+x-z+y" of a world with z
-            up, or "+x+y-z" of a left-handed one with y up.
+        condon_shortley: Whether basis functions have the factor (-1)^m. With it, the function l=1, m=1 is negative
+            towards +x.
+        over_pi: Whether transfer vectors include the factor 1/pi of a diffuse BRDF with albedo 1. With it, their dot
+            product with the light is radiance, otherwise irradiance. It does not affect light and transfer matrices.
+        order: Order of the coefficients of a band: "rising" for m from -l to l, which is l(l+1)+m; "falling" for m from
+            l to -l; "alternating" for m = 0, 1, -1, 2, -2, ...
+        axes: Directions of the tool's x, y and z axes in the world of jaxprt: "+x-z+y" for a world with z up, or
+            "+x+y-z" for a left-handed world with y up.
     """
 
     condon_shortley: bool = False
@@ -37,7 +38,7 @@ class Convention:
     axes: str = "+x+y+z"
 
     def __post_init__(self):
-        """Refuses orders and axes that are none."""
+        """Refuses unknown orders, and axes that do not name x, y and z once each."""
         if self.order not in ORDERS:
             raise ValueError(f"the order must be one of {', '.join(ORDERS)}, got {self.order!r}")
         letters = re.fullmatch(r"[+-]([xyz])[+-]([xyz])[+-]([xyz])", self.axes)
@@ -46,17 +47,18 @@ class Convention:
 
     @property
     def turn(self) -> Float[np.ndarray, "3 3"]:
-        """Matrix from our coordinates to those of the tool: a rotation, or a mirror for left-handed axes."""
+        """Matrix from jaxprt's coordinates to the tool's: a rotation, or a reflection if the axes are left-handed."""
         signs = np.array([1.0 if sign == "+" else -1.0 for sign in self.axes[::2]])
         return signs[:, None] * np.eye(3)[["xyz".index(letter) for letter in self.axes[1::2]]]
 
     def written(self, coefficient: ArrayLike, *, axis: int = 0, world: bool = True) -> Float[np.ndarray, "..."]:
-        """Our coefficients as the tool has them.
+        """Converts coefficients from jaxprt's convention to the tool's.
 
         Args:
-            coefficient: Coefficients in l(l+1)+m order along one axis.
-            axis: That axis.
-            world: Whether they are of the world's axes, and turned to the tool's. Those of a local frame are not.
+            coefficient: SH coefficients in l(l+1)+m order along one axis.
+            axis: The axis of the coefficients.
+            world: Whether the coefficients are in world axes, which are rotated to the tool's. Use False for
+                coefficients in a local frame.
 
         Raises:
             ValueError: The number of coefficients is not a square.
@@ -64,12 +66,12 @@ class Convention:
         return _along(coefficient, axis, lambda degree: self._matrix(degree, world))
 
     def read(self, coefficient: ArrayLike, *, axis: int = 0, world: bool = True) -> Float[np.ndarray, "..."]:
-        """The tool's coefficients as ours: the inverse of `written`.
+        """Converts coefficients from the tool's convention to jaxprt's. This is the inverse of `written`.
 
         Args:
-            coefficient: Coefficients in the tool's order along one axis.
-            axis: That axis.
-            world: Whether they are of the world's axes.
+            coefficient: SH coefficients in the tool's order along one axis.
+            axis: The axis of the coefficients.
+            world: Whether the coefficients are in the tool's world axes, which are rotated to jaxprt's.
 
         Raises:
             ValueError: The number of coefficients is not a square.
@@ -77,7 +79,7 @@ class Convention:
         return _along(coefficient, axis, lambda degree: self._matrix(degree, world).T)
 
     def _matrix(self, degree: int, world: bool) -> np.ndarray:
-        """From our coefficients to the tool's; orthogonal."""
+        """Orthogonal matrix from jaxprt's coefficients to the tool's."""
         m = np.concatenate([np.arange(-l, l + 1) for l in range(degree + 1)])
         matrix = _turned(degree, self.axes) if world else np.eye(len(m))
         if self.condon_shortley:
@@ -85,8 +87,8 @@ class Convention:
         return matrix[_order(degree, self.order)]
 
 
-# As the tools evaluate their bases. Mitsuba 3 and Dr.Jit have Sloan's code (2013, "Efficient spherical harmonic
-# evaluation"), as DirectXMath has; three.js is as ours. The axes are those of the same world.
+# Conventions by which the tools evaluate their basis functions. Mitsuba 3, Dr.Jit and DirectXMath use Sloan's code
+# (2013, "Efficient spherical harmonic evaluation"). three.js has the same convention as jaxprt.
 TOOLS = {
     "jaxprt": Convention(),
     "Mitsuba 3": Convention(condon_shortley=True),
@@ -104,7 +106,7 @@ def _along(coefficient: ArrayLike, axis: int, matrix) -> np.ndarray:
 
 
 def _order(degree: int, order: str) -> np.ndarray:
-    """For each place of the tool, the place l(l+1)+m of ours."""
+    """For each coefficient in the tool's order, its index l(l+1)+m."""
     rows = []
     for l in range(degree + 1):
         rising = list(range(-l, l + 1))
@@ -119,7 +121,7 @@ def _order(degree: int, order: str) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _turned(degree: int, axes: str) -> np.ndarray:
-    """Basis functions of the tool's axes by those of ours; exactly the identity and exactly 0 where they are."""
+    """Matrix of the tool's basis functions in terms of jaxprt's, from the difference in axes. Zeros are exact."""
     if axes == Convention.axes:
         return np.eye((degree + 1) ** 2)
     node, weight = products.quadrature(2 * degree)

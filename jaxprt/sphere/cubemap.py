@@ -1,13 +1,14 @@
-"""Functions on the sphere as six square faces: texel geometry, and seamless lookups.
+"""Cubemaps: functions on the sphere as six square faces. Texel geometry and seamless lookup.
 
-Faces are +x, -x, +y, -y, +z, -z, with rows and columns as OpenGL has them. A point of a face is given by its
-column coordinate s and its row coordinate t, both from -1 at the outer edge of the first texel to 1:
+Faces are +x, -x, +y, -y, +z, -z, with rows and columns as in OpenGL. A point on a face has a column coordinate s and a
+row coordinate t, both from -1 at the outer edge of the first texel to 1 at that of the last. They increase in these
+directions:
 
     face   +x           -x            +y          -y            +z           -z
     s      -z           +z            +x          +x            +x           -x
     t      -y           -y            +z          -z            -y           -y
 
-so that a direction is proportional to s S + t T + N, with the face's three axes S, T, N.
+A direction is proportional to s S + t T + N, where S and T are these directions and N is the face's normal.
 """
 
 import functools
@@ -36,50 +37,50 @@ def direction(*, size: int) -> Float[Array, "6 n n 3"]:
     """Unit directions through the centers of the texels.
 
     Args:
-        size: Texels along the edge of a face.
+        size: Edge of a face in texels.
 
     Returns:
-        Directions in the world.
+        Unit directions in the world, one per texel.
 
     Raises:
-        ValueError: The size is below 1.
+        ValueError: `size` is below 1.
     """
     return jnp.asarray(_direction(size), jnp.result_type(float))
 
 
 def point(*, size: int) -> Float[Array, "6 n n 3"]:
-    """Centers of the texels on the cube [-1, 1]^3: directions whose coordinates are fractions of texels.
+    """Centers of the texels on the surface of the cube [-1, 1]^3.
 
     Args:
-        size: Texels along the edge of a face.
+        size: Edge of a face in texels.
 
     Returns:
-        Points in the world.
+        Points in the axes of the world, one per texel. They are directions that are not normalized.
 
     Raises:
-        ValueError: The size is below 1.
+        ValueError: `size` is below 1.
     """
     return jnp.asarray(_point(size), jnp.result_type(float))
 
 
 def axes() -> Float[np.ndarray, "6 3 3"]:
-    """The axes S, T and N of each face: s S + t T + N is the point (s, t) of the face."""
+    """The axes S, T and N of each face: s S + t T + N is the point (s, t) on the face."""
     return _FRAME.copy()
 
 
 def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
     """Exact solid angles of the texels, in steradians; they sum to 4 pi.
 
-    A rectangle on a face with a corner in its center covers arctan(s t / sqrt(1 + s^2 + t^2)).
+    A rectangle from the center of a face to the point (s, t) covers arctan(s t / sqrt(1 + s^2 + t^2)).
 
     Args:
-        size: Texels along the edge of a face.
+        size: Edge of a face in texels.
 
     Returns:
-        Solid angles.
+        Solid angles, in sr.
 
     Raises:
-        ValueError: The size is below 1.
+        ValueError: `size` is below 1.
     """
     return jnp.asarray(_solid_angle(size), jnp.result_type(float))
 
@@ -87,34 +88,33 @@ def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
 def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
     """Exact integral of the unit direction over the solid angle of each texel.
 
-    The product with a normal is thus the exact integral of the cosine over a texel that lies wholly above
-    that normal's horizon; summed over the hemisphere around an axis it is pi. This is Lambert's formula for a
-    polygon, half the sum over the edges of the angle times the normal of the edge's plane, in closed form.
+    Its dot product with a normal is the exact integral of the cosine over a texel that lies entirely above the normal's
+    horizon. It is Lambert's formula for the irradiance of a polygon, in closed form.
 
     Args:
-        size: Texels along the edge of a face.
+        size: Edge of a face in texels.
 
     Returns:
-        Vectors a little shorter than the solid angle.
+        Vectors in sr, slightly shorter than the solid angle.
 
     Raises:
-        ValueError: The size is below 1.
+        ValueError: `size` is below 1.
     """
     return jnp.asarray(_vector_area(size), jnp.result_type(float))
 
 
 @jit
 def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Float[Array, "*b 2"]]:
-    """The face that a direction meets, and where.
+    """The cubemap face that a direction hits, and the point on it.
 
-    On an edge or a corner, the first of the faces that meet there is taken. A zero direction counts as the
-    center of face +x, with finite gradients.
+    On an edge or a corner of the cube, it is the first of the faces that meet there. A zero direction gives the center
+    of face +x, with finite gradients.
 
     Args:
         direction: Directions of any length.
 
     Returns:
-        Number of the face, and the coordinates (s, t) on it, column first, in [-1, 1].
+        Index of the face, and the column and row coordinates (s, t) on it, in [-1, 1].
     """
     face, s, t = project(direction[..., 0], direction[..., 1], direction[..., 2])
     return face, jnp.stack([s, t], -1)
@@ -124,10 +124,15 @@ def coordinates(direction: Float[Array, "*b 3"]) -> tuple[Int[Array, "*b"], Floa
 def project(
     x: Float[Array, "*b"], y: Float[Array, "*b"], z: Float[Array, "*b"]
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
-    """`coordinates` of directions that are given component by component, which XLA fuses with what follows.
+    """`coordinates` for directions given by their components, which XLA fuses with the code that uses the result.
+
+    Args:
+        x: First component of the directions, of any length.
+        y: Second component.
+        z: Third component.
 
     Returns:
-        Number of the face, s and t.
+        Index of the face, column coordinate s and row coordinate t.
     """
     right, up, near = jnp.abs(x), jnp.abs(y), jnp.abs(z)
     along_x = (right >= up) & (right >= near)
@@ -145,7 +150,16 @@ def project(
 def unproject(
     face: Int[Array, "*b"], s: Float[Array, "*b"], t: Float[Array, "*b"]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
-    """Directions of any length from places on faces, or beyond their edges, by components: the inverse of `project`."""
+    """Directions, not normalized, from points on faces or beyond their edges: the inverse of `project`.
+
+    Args:
+        face: Index of the face.
+        s: Column coordinate.
+        t: Row coordinate.
+
+    Returns:
+        The components x, y and z.
+    """
     along_x, along_y = face < 2, (face >= 2) & (face < 4)
     side = jnp.where(face % 2 == 1, -1, 1).astype(s.dtype)
     x = jnp.where(along_x, side, jnp.where(along_y, s, side * s))
@@ -158,32 +172,32 @@ def unproject(
 def lookup(
     cubemap: Float[Array, "6 n n *c"], direction: Float[Array, "*b 3"], *, sharpness: int = 1
 ) -> Float[Array, "..."]:
-    """The cubemap's values in some directions: bilinear, continuous over the edges and corners of the cube.
+    """Looks a cubemap up in given directions: bilinear, and continuous over the edges and corners of the cube.
 
-    Past a face's outermost texel centers the neighboring face's texels are taken; in a corner of the cube,
-    where only three texels meet, their mean stands in for the fourth. Constants are reproduced exactly; smooth
-    functions to second order, but to first order within half a texel of the cube's edges.
+    Beyond a face's outermost texel centers, texels of the neighboring face are used. At a corner of the cube, where
+    only three texels meet, their mean replaces the fourth. Constants are reproduced exactly. Smooth functions are
+    reproduced to second order, and to first order within half a texel of the cube's edges.
 
-    Differentiable in both arguments. The gradient in the direction is one-sided on the lines between texel
-    centers; with a sharpness above 1 it is the mean of both sides where a transition begins or ends.
+    Differentiable in both arguments. On the lines between texel centers the gradient with respect to direction is that
+    of one side; with a sharpness above 1 it is the mean of both sides where a transition begins or ends.
 
     Args:
-        cubemap: Any number of values per texel.
+        cubemap: Texels with any trailing axes.
         direction: Directions of any length.
-        sharpness: The transition from texel to texel takes 1/sharpness of their distance.
+        sharpness: Values change between adjacent texels within 1 / sharpness of their distance. 1 is bilinear lookup.
 
     Returns:
-        Values [*b, *c], in the type of the cubemap.
+        Values [*b, *c], in the data type of the cubemap.
 
     Raises:
-        ValueError: The sharpness is below 1.
+        ValueError: `sharpness` is below 1.
     """
     if sharpness < 1:
         raise ValueError(f"sharpness must be at least 1, got {sharpness}")
     n = cubemap.shape[1]
     padded = pad(cubemap)
     face, place = coordinates(direction)
-    place = (place.astype(cubemap.dtype) + 1) * (n / 2) + 0.5  # In texels; the border's first center is at 0.
+    place = (place.astype(cubemap.dtype) + 1) * (n / 2) + 0.5  # in texels; the border's first center is at 0
     corner = jnp.clip(jnp.floor(place), 0, n)
     weight = place - jax.lax.stop_gradient(corner)
     if sharpness > 1:
@@ -198,19 +212,19 @@ def lookup(
 
 
 def border_index(*, size: int) -> Int32[np.ndarray, "6 m m"]:
-    """For every face with a border of one texel around it, where each texel comes from.
+    """For every face with a border of one texel, the index of the texel that each texel copies.
 
-    The border holds the texels of the neighboring faces that touch the edge. In its four corners, where the
-    cube has no texel, stands the corner texel of the face on the left or right, the next in the border.
+    The border copies the texels of the neighboring faces along the edge. Its four corners, where a cube has no texel,
+    copy the adjacent border texel of the face on the left or right.
 
     Args:
-        size: Texels along the edge of a face.
+        size: Edge of a face in texels.
 
     Returns:
-        Indices into the 6 size^2 texels in their order; m is size + 2.
+        Indices into the 6 size^2 texels in their order, with m = size + 2.
 
     Raises:
-        ValueError: The size is below 1.
+        ValueError: `size` is below 1.
     """
     return _border_index(size).copy()
 
@@ -222,7 +236,7 @@ def _mix(first: Array, second: Array, weight: Array) -> Array:
 
 
 def pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
-    """The faces with a border of one texel; its corners are means of the three texels that meet."""
+    """Adds a border of one texel from the neighboring faces to each face. Its corners are means of three texels."""
     n = cubemap.shape[1]
     texel, index = cubemap.reshape(6 * n * n, *cubemap.shape[3:]), _border_index(n)
     outer, inner = np.array([0, n + 1]), np.array([1, n])
@@ -273,11 +287,11 @@ def _solid_angle(size: int) -> np.ndarray:
 def _vector_area(size: int) -> np.ndarray:
     _check(size)
 
-    def tangential(s, t):  # Of s / (1 + s^2 + t^2)^2, which is the s component times the solid angle's density.
+    def tangential(s, t):  # antiderivative of s / (1 + s^2 + t^2)^2, the s component times solid angle per area
         length = np.sqrt(1 + s**2)
         return -np.arctan(t / length) / length / 2
 
-    def forward(s, t):  # Of 1 / (1 + s^2 + t^2)^2.
+    def forward(s, t):  # antiderivative of 1 / (1 + s^2 + t^2)^2
         return -(s * tangential(s, t) + t * tangential(t, s))
 
     parts = [tangential, lambda s, t: tangential(t, s), forward]
@@ -291,7 +305,7 @@ def _border_index(size: int) -> np.ndarray:
     half = 1 / size
     center = (2 * np.arange(-1, size + 1) + 1) / size - 1
     t, s = np.meshgrid(center, center, indexing="ij")
-    # Fold what lies past an edge onto the neighbor, columns first: its center is half a texel past the edge.
+    # Fold texels beyond an edge onto the neighboring face, columns first: their centers are half a texel past the edge.
     past_column, past_row = np.abs(s) > 1, np.abs(t) > 1
     folded = past_column | past_row
     limit = 1 - half
@@ -300,7 +314,7 @@ def _border_index(size: int) -> np.ndarray:
     local = np.stack([s, t, np.where(folded, limit, 1)], axis=-1)
     world = np.einsum("ija,fac->fijc", local, _FRAME)
 
-    # Inside, neither s nor t reaches 1 and N wins; in the border S or T is the only one at 1.
+    # Inside a face neither s nor t reaches 1, so N is the largest axis; in the border S or T is the only one at 1.
     axis = np.abs(world).argmax(axis=-1)
     forward = np.take_along_axis(world, axis[..., None], axis=-1)[..., 0]
     face = 2 * axis + (forward < 0)

@@ -1,4 +1,4 @@
-"""Unit vectors and the shading frames made of them."""
+"""Unit vectors, tangents, shading frames and local view directions."""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +6,15 @@ from jaxtyping import Array, Float
 
 from jaxprt.compile import jit
 
-_GRAZING = 0.01  # least cosine of a view
-_PARALLEL = 32  # Rounding errors: a tangent this close to the normal has no direction of its own.
+_GRAZING = 0.01  # smallest cosine of a view direction
+_PARALLEL = 32  # A tangent within this many rounding errors of the normal counts as parallel to it.
 
 
 @jit
 def normalize(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
-    """Scales vectors to unit length, however short or long they are.
+    """Scales vectors of any length to unit length, without overflow or underflow.
 
-    The zero vector, and what the arithmetic cannot tell from it, becomes (0, 1, 0) with zero gradient.
+    Zero and denormal vectors become (0, 1, 0) with zero gradient.
 
     Args:
         vector: Any finite vectors.
@@ -34,11 +34,11 @@ def normalize(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 
 @jit
 def tangent(normal: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
-    """The tangent that belongs to a normal where the surface brings none: s of Wang's equation 7.
+    """Tangent for a normal where the surface provides none: s of Wang's equation 7.
 
-    It is the x axis under the shortest turn from +y to the normal: smooth everywhere but at (0, -1, 0), where
-    every tangent is a limit. There, and within 4e-10 of it (1e-77 in float64), it is (1, 0, 0) with zero gradient.
-    Elsewhere it is accurate to rounding, however near.
+    It is the x axis after the shortest rotation from +y to the normal. It is smooth everywhere except at (0, -1, 0),
+    where it has no limit. There, and within 4e-10 of it (1e-77 in float64), it is (1, 0, 0) with zero gradient.
+    Elsewhere it is accurate to rounding.
 
     Args:
         normal: Unit normals.
@@ -64,10 +64,10 @@ def tangent(normal: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 
 @jit
 def frame(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Rotations from the world to the local frame: ``frame @ w_world`` is local, the normal its z axis.
+    """Shading frames: rotations from the world to local frames, with the normal as z. ``frame @ w_world`` is local.
 
-    The tangent is made orthogonal to the normal. Where it is zero or parallel to the normal, the normal's own
-    ``tangent`` takes its place, and the gradient follows that.
+    The tangent is made orthogonal to the normal. Where it is zero or parallel to the normal, it is replaced by
+    ``tangent(normal)``, and so is its gradient.
 
     Args:
         normal: Unit normals.
@@ -81,17 +81,24 @@ def frame(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[
     limit = (_PARALLEL * jnp.finfo(normal.dtype).eps) ** 2
     parallel = jnp.sum(across**2, axis=-1, keepdims=True) < limit
     across = normalize(jnp.where(parallel, _tangent(normal), across))
-    # Once more: a tangent near the normal has lost digits to cancellation.
+    # Again, because a tangent near the normal lost digits to cancellation.
     across = normalize(_reject(across, normal))
     return jnp.stack([across, jnp.cross(normal, across), normal], axis=-2)
 
 
 @jit
 def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> Float[Array, "*b d 3"]:
-    """Turns the same world directions into every local frame.
+    """Rotates world directions to every local frame.
 
-    Component by component, which XLA fuses with what follows; a matrix product with an inner dimension of three
-    takes its CPU code eight times as long.
+    The products are written out by component, which XLA fuses with the code that uses the result. Its CPU code for a
+    matrix product with an inner dimension of three takes eight times as long.
+
+    Args:
+        frame: Shading frames; rows are tangent, bitangent, normal.
+        direction: Directions in the world, the same for all frames.
+
+    Returns:
+        The directions in each local frame.
     """
     axes = jnp.expand_dims(frame, -1)
     local = [sum(direction[:, j] * axes[..., i, j, :] for j in range(3)) for i in range(3)]
@@ -102,18 +109,18 @@ def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> F
 def view(
     frame: Float[Array, "*v 3 3"], position: Float[Array, "*v 3"], eye: Float[Array, "3"] | Float[Array, "*v 3"]
 ) -> Float[Array, "*v 3"]:
-    """Local unit directions to the eye, raised to 0.6 degrees above the horizon where they are lower.
+    """Unit directions to the eye in local frames, raised to at least 0.6 degrees above the horizon.
 
-    A vertex can look away from the eye while a triangle around it is visible: at every silhouette. Interpolation over
-    the triangle then needs a radiance there, that of the grazing view; black would draw a dark rim.
+    At silhouettes, a vertex can face away from the eye while one of its triangles is visible. Interpolation over the
+    triangle then needs a radiance at this vertex: that of a grazing view. A radiance of zero would draw a dark rim.
 
     Args:
-        frame: Rows are tangent, bitangent, normal.
-        position: Points in world units.
-        eye: Position of the viewer, one for all points or one for each.
+        frame: Shading frames; rows are tangent, bitangent, normal.
+        position: Positions in world units.
+        eye: Position of the viewer in world units: one for all positions, or one for each.
 
     Returns:
-        Unit directions. Where the eye is straight behind a point, the direction lies along its tangent.
+        Unit directions. Where the eye is exactly behind a point, the direction is that of the tangent, raised likewise.
     """
     offset = [eye[..., i] - position[..., i] for i in range(3)]
     local = normalize(jnp.stack([sum(frame[..., i, j] * offset[j] for j in range(3)) for i in range(3)], -1))
@@ -126,7 +133,7 @@ def view(
     return jnp.where(low[..., None], flat, local)
 
 
-_tangent = tangent  # The argument of ``frame`` hides the function.
+_tangent = tangent  # an argument of ``frame`` has the same name
 
 
 def _axis(index: int, dtype: jnp.dtype) -> Float[Array, "3"]:
@@ -134,11 +141,11 @@ def _axis(index: int, dtype: jnp.dtype) -> Float[Array, "3"]:
 
 
 def _scaled(vector: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Array]:
-    """Vectors over their largest component, so that squares neither overflow nor vanish; and which are zero."""
+    """Vectors over their largest component, so that squares neither overflow nor underflow; and which are zero."""
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
     tiny = jnp.finfo(vector.dtype).tiny
     zero = size < tiny
-    size = jnp.minimum(size, 1 / tiny)  # Its reciprocal, by which XLA may multiply, must not vanish.
+    size = jnp.minimum(size, 1 / tiny)  # XLA may multiply by its reciprocal, which must not underflow
     return jnp.where(zero, 0, vector / jnp.where(zero, 1, size)), zero
 
 

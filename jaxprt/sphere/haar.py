@@ -1,7 +1,7 @@
-"""Two-dimensional orthonormal Haar wavelets on square images, all levels, in the square (non-standard) form.
+"""Orthonormal two-dimensional Haar wavelet transform of square images, over all levels, in the non-standard form.
 
-Coefficients lie where PyWavelets' `coeffs_to_array` puts them: the mean times n in the corner, each level's
-details around it.
+Coefficients have the layout of PyWavelets' `coeffs_to_array`: the mean times n in the corner, surrounded by the details
+of each level.
 """
 
 import math
@@ -16,13 +16,13 @@ from jaxprt.compile import jit
 def forward(image: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
     """Transforms each image to Haar coefficients.
 
-    The transform is orthonormal: inner products and norms are kept.
+    The transform is orthonormal: it preserves inner products and norms.
 
     Args:
-        image: Square images with edges a power of two; channels last.
+        image: Square images whose edge n is a power of two, with channels c last.
 
     Returns:
-        Coefficients in the image's units.
+        Haar coefficients, in the units of the image.
 
     Raises:
         ValueError: The edge is not a power of two.
@@ -42,7 +42,10 @@ def forward(image: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
 
 @jit
 def inverse(coefficient: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
-    """Inverse, and transpose, of `forward`.
+    """Inverse of `forward`, which is also its transpose.
+
+    Args:
+        coefficient: Haar coefficients.
 
     Raises:
         ValueError: The edge is not a power of two.
@@ -68,7 +71,7 @@ def _edge(shape: tuple[int, ...]) -> int:
 
 
 def area(*, size: int) -> Float[Array, "n n"]:
-    """Share of the image that each coefficient's basis function covers: 1 for the mean, 4 / size^2 for the finest."""
+    """Share of the image that each basis function covers: 1 for the mean, 4 / size^2 for the finest wavelets."""
     place = jnp.arange(_edge((size, size, 1)))
     level = jnp.where(place > 0, jnp.floor(jnp.log2(jnp.maximum(place, 1) + 0.5)), 0)
     coarse = jnp.maximum(level[:, None], level[None, :])
@@ -76,10 +79,10 @@ def area(*, size: int) -> Float[Array, "n n"]:
 
 
 def face_edge(count: int) -> int:
-    """Edge n of the six faces that hold `count` = 6 n n coefficients.
+    """Edge n of cubemap faces with `count` = 6 n n texels or coefficients.
 
     Raises:
-        ValueError: The count is not of that form with n a power of two.
+        ValueError: `count` is not 6 n n for a power of two n.
     """
     n = math.isqrt(max(count, 0) // 6)
     if n < 1 or 6 * n * n != count or n & (n - 1):

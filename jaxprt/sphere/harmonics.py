@@ -1,7 +1,8 @@
-"""Real spherical harmonics (SH): evaluation, projection of cubemaps, zonal kernels, windows, and disks of light.
+"""Real spherical harmonics (SH): evaluation, projection of cubemaps, zonal kernels, windows, and circular lights.
 
-The basis is orthonormal, without the Condon-Shortley phase, its polar axis z. Function (l, m) has index l(l+1)+m,
-so that all up to a degree, the largest l, are (degree+1)^2. The first nine, of a unit direction (x, y, z):
+The basis is orthonormal, without the Condon-Shortley phase, with polar axis z. Function (l, m) has index l(l+1)+m. The
+degree is the largest l; there are (degree+1)^2 functions up to a degree. The first nine, for a unit direction (x, y,
+z), are:
 
     index   l   m   function
       0     0   0   sqrt(1 / 4 pi)
@@ -14,9 +15,9 @@ so that all up to a degree, the largest l, are (degree+1)^2. The first nine, of 
       7     2   1   sqrt(15 / 4 pi) x z
       8     2   2   sqrt(15 / 16 pi) (x^2 - y^2)
 
-A zonal kernel, a function of the angle to an axis, is given by one factor per band l: what its convolution
-multiplies the band with, which is 2 pi times the integral of k(t) P_l(t) over the cosine t. Windows against ringing
-are such factors too; ``convolve`` applies either.
+A zonal kernel k is a function of the angle to an axis. It is given by one factor per band l, by which convolution with
+the kernel multiplies the band: 2 pi times the integral of k(t) P_l(t) over the cosine t. Windows against ringing are
+factors per band too. ``convolve`` applies either.
 """
 
 import functools
@@ -33,22 +34,22 @@ from jaxtyping import Array, Float, Num
 from jaxprt.compile import jit
 from jaxprt.sphere import cubemap
 
-_NEWTON_STEPS = 12  # The worst of thousands of spectra, with shares from 0.9 to 1e-6, has all digits after ten.
+_NEWTON_STEPS = 12  # ten steps converged for all of thousands of spectra, with shares from 0.9 to 1e-6
 
-_UNROLLED = 8  # Beyond this degree the recurrence is a loop: compiling 50 steps one by one took twenty seconds.
+_UNROLLED = 8  # above this degree the recurrence is a loop; compiling 50 unrolled steps took twenty seconds
 
 
 def degree_of(count: int) -> int:
-    """The largest l of a number of coefficients.
+    """The degree, or largest l, of a given number of SH coefficients.
 
     Args:
-        count: How many coefficients there are.
+        count: Number of coefficients, (degree+1)^2.
 
     Returns:
-        The degree, of which there are (degree+1)^2.
+        The degree.
 
     Raises:
-        ValueError: The count is not the square of a positive number.
+        ValueError: `count` is not the square of a positive integer.
     """
     root = math.isqrt(max(count, 0))
     if root < 1 or root**2 != count:
@@ -58,37 +59,37 @@ def degree_of(count: int) -> int:
 
 @functools.partial(jit, static_argnames="degree")
 def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b lm"]:
-    """The basis functions in some directions.
+    """Evaluates the basis functions for given directions.
 
-    By recurrences in the Cartesian components, without trigonometry. The result is a polynomial in them, which is
-    what is differentiated: the gradient is finite everywhere, the poles included, and its tangential part is the
-    gradient on the sphere. Off the sphere the polynomial has no further meaning.
+    They are computed by recurrences in the Cartesian components, without trigonometric functions. The result is a
+    polynomial in the components and differentiated as such: the gradient is finite everywhere, including the poles, and
+    its tangential part is the gradient on the sphere. The radial part of the gradient has no meaning.
 
     Args:
         direction: Unit directions.
-        degree: The largest l.
+        degree: Highest degree l.
 
     Returns:
-        Values in l(l+1)+m order, (degree+1)^2 for each direction.
+        (degree+1)^2 values for each direction, in l(l+1)+m order.
 
     Raises:
         ValueError: The degree is negative.
     """
-    direction = direction.astype(jnp.result_type(direction.dtype, float))  # Whole numbers would round the basis.
+    direction = direction.astype(jnp.result_type(direction.dtype, float))  # integers would round the basis
     value = basis(jnp, direction, degree) if degree <= _UNROLLED else _basis_by_scan(direction, degree)
     return jnp.moveaxis(value, 0, -1)
 
 
 @jit
 def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 3"]) -> Float[Array, "..."]:
-    """The function that the coefficients stand for, in some directions.
+    """Reconstructs the function given by SH coefficients, for given directions.
 
     Args:
-        coefficient: Coefficients in l(l+1)+m order.
-        direction: Unit directions; see ``evaluate`` on gradients.
+        coefficient: SH coefficients in l(l+1)+m order, with any trailing axes.
+        direction: Unit directions. ``evaluate`` describes their gradients.
 
     Returns:
-        Values [*b, *c] in the coefficients' units.
+        Values [*b, *c].
 
     Raises:
         ValueError: The number of rows is not a square.
@@ -101,21 +102,22 @@ def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 
 def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
     """SH coefficients of a cubemap: the integral of basis times radiance over the sphere.
 
-    Each texel counts as constant, and the basis is integrated over its solid angle by Gauss points, as many as make
-    the quadrature exact to about 1e-12; so the result is that of the piecewise constant function. Mirror images in
-    the coordinate planes are added and subtracted first, which leaves an eighth of the products, and of the table.
+    Radiance is constant over each texel. The basis functions are integrated over the texel's solid angle by Gauss
+    quadrature, exact to about 1e-12, so the result is the projection of the piecewise constant function. Texels that
+    are mirror images in the coordinate planes are added and subtracted first, which reduces products and tables to an
+    eighth.
 
     Args:
-        radiance: A cubemap with any trailing axes.
-        degree: The largest l.
+        radiance: Texels of a cubemap, with any trailing axes.
+        degree: Highest degree l.
 
     Returns:
-        Coefficients in the radiance's units times sr^1/2.
+        SH coefficients in l(l+1)+m order, in units of the radiance times sr^1/2.
 
     Raises:
-        ValueError: The degree is negative, or the edge is 0.
+        ValueError: The degree is negative, or the cubemap has no texels.
     """
-    radiance = radiance.astype(jnp.result_type(radiance.dtype, float))  # Whole numbers would round the basis.
+    radiance = radiance.astype(jnp.result_type(radiance.dtype, float))  # integers would round the basis
     size, channel = radiance.shape[1], radiance.shape[3:]
     index, place, table = _projection(size, degree)
     folded = radiance.reshape(6 * size * size, -1)[index]
@@ -131,10 +133,16 @@ def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "l
 
 
 def basis(xp: ModuleType, direction: Any, degree: int) -> Any:
-    """Basis functions [lm, *b] by NumPy or JAX.
+    """Basis functions [lm, *b], computed with the array library `xp`, NumPy or JAX.
 
-    sin(theta)^m cos(m phi) and sin(theta)^m sin(m phi) are the real and imaginary parts of (x + iy)^m; what remains
-    is a polynomial in z with a recurrence over l, which is stable upwards. One band, all m at once, in each step.
+    sin(theta)^m cos(m phi) and sin(theta)^m sin(m phi) are the real and imaginary parts of (x + iy)^m. The other factor
+    is a polynomial in z with a recurrence over l, which is stable for increasing l. Each step computes one band, for
+    all m.
+
+    Args:
+        xp: `numpy` or `jax.numpy`.
+        direction: Unit directions [*b, 3].
+        degree: Highest degree l.
     """
     if degree < 0:
         raise ValueError(f"degree must be at least 0, got {degree}")
@@ -166,7 +174,7 @@ def basis(xp: ModuleType, direction: Any, degree: int) -> Any:
 
 
 def _basis_by_scan(direction: Array, degree: int) -> Array:
-    """The same by loops, over rows that hold all m up to the degree."""
+    """`basis` by loops, over rows that hold all m from 0 to the degree."""
     x, y, z = (direction[..., i] for i in range(3))
 
     def multiply(power, _):
@@ -191,7 +199,7 @@ def _basis_by_scan(direction: Array, degree: int) -> Array:
 
 @functools.lru_cache(maxsize=16)
 def _recurrence(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tables [l, m]: row l of the polynomials in z is forward z (row l-1) - backward (row l-2) + start."""
+    """Tables [l, m] for the polynomials in z: row l = forward z (row l-1) - backward (row l-2) + start."""
     l, m = np.arange(degree + 1.0)[:, None], np.arange(degree + 1.0)
     forward = np.sqrt(np.where(m < l, (4 * l**2 - 1) / np.where(m < l, l**2 - m**2, 1), 0))
     backward = forward * np.sqrt(np.where(m < l - 1, ((l - 1) ** 2 - m**2) / (4 * (l - 1) ** 2 - 1), 0))
@@ -205,20 +213,20 @@ def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np
     """Tables for ``project``.
 
     Returns:
-        For the eight octants [2, 2, 2], signs + and - of x, y and z, the texels that meet them; the place of each
-        coefficient among those sorted by parity; and for each parity, even or odd in x, y and z, the integral of
-        the basis over the part of each texel in the octant +++.
+        The texels in each of the eight octants [2, 2, 2], by the signs + and - of x, y and z; the position of each
+        coefficient after sorting by parity; and for each parity, even or odd in x, y and z, the integrals of the basis
+        functions over the part of each texel in the octant +++.
     """
     with jax.ensure_compile_time_eval():
         point = np.asarray(cubemap.point(size=size), np.float64).reshape(-1, 3)
     edge = np.unique(np.clip(2 * np.arange(size + 1) / size - 1, 0, None))
     low, high = edge[:-1], edge[1:]
-    # Where the size is odd, the middle texel lies half in the octant, and its center on the border.
+    # If the size is odd, the middle texel lies half in the octant, with its center on the octant's border.
     middle = (2 * np.arange(size) + 1) / size - 1
     middle = np.maximum(middle[-len(low) :], 0)
     octant = _three_faces(*np.meshgrid(middle, middle, indexing="ij"))
 
-    def key(place):  # Twice the distance from the corner of the cube, in texels: whole numbers.
+    def key(place):  # twice the distance from the corner of the cube in texels, an integer
         whole = np.rint((place + 1) * size).astype(np.int64)
         return whole @ (2 * size + 1) ** np.arange(3)
 
@@ -226,7 +234,8 @@ def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np
     sign = np.stack(np.meshgrid([1, -1], [1, -1], [1, -1], indexing="ij"), axis=-1)
     index = order[np.searchsorted(key(point)[order], key(sign[..., None, :] * octant))]
 
-    # The phase of the highest harmonic over a texel sets the points: 1e-12 or better for all sizes and degrees.
+    # The number of Gauss points follows from the phase of the highest harmonic over a texel: 1e-12 or better for all
+    # sizes and degrees.
     count = 4 + math.ceil(3 * (degree + 2) / size)
     node, weight = np.polynomial.legendre.leggauss(count)
     table = np.zeros(((degree + 1) ** 2, len(octant)))
@@ -246,22 +255,21 @@ def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np
 
 
 def _three_faces(s: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Points (1, s, t), (t, 1, s) and (s, t, 1), one after the other."""
+    """Points (1, s, t), (t, 1, s) and (s, t, 1), concatenated."""
     local = np.stack([np.ones_like(s), s, t], axis=-1).reshape(-1, 3)
     return np.concatenate([np.roll(local, turn, axis=-1) for turn in range(3)])
 
 
 @jit
 def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> Float[Array, "lm *c"]:
-    """Multiplies every band by the factor of a zonal kernel, or of a window.
+    """Multiplies every band by the factor of a zonal kernel or a window.
 
     Args:
-        coefficient: Coefficients in l(l+1)+m order.
-        factor: One factor for each band, from `cosine`, `phong`, `hann`, `lanczos`, `natural` or
-            `least_laplacian`.
+        coefficient: SH coefficients in l(l+1)+m order, with any trailing axes.
+        factor: One factor for each band, from `cosine`, `phong`, `hann`, `lanczos`, `natural` or `least_laplacian`.
 
     Raises:
-        ValueError: The number of rows is not a square, or the factors are not of as many bands.
+        ValueError: The number of coefficients is not a square, or the number of factors is not degree + 1.
 
     Reference: the Funk-Hecke theorem; Ramamoorthi and Hanrahan 2001.
     """
@@ -273,7 +281,7 @@ def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> 
 
 
 def cosine(*, degree: int) -> Float[Array, " l"]:
-    """Factors of the clamped cosine max(0, cos): pi, 2 pi / 3, pi / 4, 0, -pi / 24, ...
+    """Factors of the clamped cosine max(0, cos): pi, 2 pi / 3, pi / 4, 0, -pi / 24, ... up to band `degree`.
 
     Reference: Ramamoorthi and Hanrahan 2001, equation 8.
     """
@@ -289,13 +297,13 @@ def cosine(*, degree: int) -> Float[Array, " l"]:
 
 @functools.partial(jit, static_argnames="degree")
 def phong(exponent: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b l"]:
-    """Factors of the Phong lobe (n + 1) / 2 pi max(0, cos)^n, whose integral is one.
+    """Factors of the normalized Phong lobe (n + 1) / (2 pi) max(0, cos)^n.
 
     Args:
-        exponent: n, any number from 0.
-        degree: The largest l.
+        exponent: Exponent n, any number from 0.
+        degree: Highest degree l.
 
-    Reference: the integral of t^n P_l(t) over [0, 1] falls by (n - l + 2) / (n + l + 1) from l - 2 to l.
+    Reference: the ratio of the integrals of t^n P_l(t) and t^n P_(l-2)(t) over [0, 1] is (n - l + 2) / (n + l + 1).
     """
     factor = [jnp.ones_like(exponent), (exponent + 1) / (exponent + 2)]
     for l in range(2, degree + 1):
@@ -304,39 +312,39 @@ def phong(exponent: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b l"]:
 
 
 def hann(*, degree: int) -> Float[Array, " l"]:
-    """Hann's window, (1 + cos(pi l / (degree + 1))) / 2."""
+    """Factors of the Hann window, (1 + cos(pi l / (degree + 1))) / 2."""
     return jnp.asarray((1 + np.cos(np.pi * np.arange(degree + 1) / (degree + 1))) / 2, jnp.result_type(float))
 
 
 def lanczos(*, degree: int) -> Float[Array, " l"]:
-    """Lanczos's window, sinc(l / (degree + 1)): the mildest of the three."""
+    """Factors of the Lanczos window, sinc(l / (degree + 1)). It is milder than the Hann window."""
     return jnp.asarray(np.sinc(np.arange(degree + 1) / (degree + 1)), jnp.result_type(float))
 
 
 def natural(*, degree: int) -> Float[Array, " l"]:
-    """Size of each band of natural light, 1 / (l + 1/2), in relative units.
+    """Standard deviation of the coefficients of natural light in each band, 1 / (l + 1/2), in relative units.
 
-    Reference: the power spectra of natural illumination fall about so: Dror, Willsky, Adelson 2004.
+    Reference: Dror, Willsky, Adelson 2004, for the power spectra of natural illumination, which fall about like this.
     """
     return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
 def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) -> Float[Array, " l"]:
-    """The window that rings least for what it changes: 1 / (1 + lambda l^2 (l+1)^2).
+    """Factors of the window 1 / (1 + lambda l^2 (l+1)^2), which reduces ringing with the least change of the function.
 
-    It minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere; lambda
-    is such that the squared Laplacian, summed over channels, falls to a share of what it was.
+    The window minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere.
+    lambda is chosen so that the squared Laplacian, summed over channels, falls to a given share.
 
     Args:
-        coefficient: What will be windowed.
-        kept: Share of its squared Laplacian that remains, from 0 to 1. 0 keeps the mean alone.
+        coefficient: SH coefficients of the function to be windowed.
+        kept: Share of the squared Laplacian that remains, from 0 to 1. 0 keeps the mean only.
 
     Returns:
-        One factor for each band, for `convolve`; ones where there is no Laplacian to reduce. Inside `jax.jit`, where
-        the share is not known, NaN for a negative one.
+        One factor for each band, for `convolve`. All are 1 if the function is constant. Inside `jax.jit`, where `kept`
+        cannot be checked, a negative share gives NaN.
 
     Raises:
-        ValueError: The share is not from 0 to 1.
+        ValueError: `kept` is not between 0 and 1.
 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
@@ -357,14 +365,14 @@ def _least_laplacian(coefficient: Array, kept: Array) -> Array:
     spectrum = spectrum / jnp.where(some, total, 1)
 
     def step(strength, _):
-        # Newton's method for 1 / sqrt(what remains), which is a line for one band and concave for several: from 0
-        # it climbs to the root and never passes it, quickly however small the share.
+        # Newton's method for 1 / sqrt(remaining share), which is linear in the strength for one band and concave for
+        # several. From 0 it approaches the root from below, quickly for any share.
         factor = 1 / (1 + strength * weight)
         remains = jnp.where(some, jnp.sum(spectrum * factor**2), kept)
         slope = jnp.where(some, jnp.sum(spectrum * factor**3 * weight), 1)
         return strength + remains / slope * (jnp.sqrt(remains / some_kept) - 1), None
 
-    # Nothing remains in the limit of an infinite strength.
+    # A share of 0 is the limit of infinite strength.
     some_kept = jnp.where(kept == 0, 1, kept)
     strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
     factor = 1 / (1 + jnp.maximum(strength, 0) * weight)
@@ -373,15 +381,15 @@ def _least_laplacian(coefficient: Array, kept: Array) -> Array:
 
 @functools.partial(jit, static_argnames="degree")
 def disc(direction: Float[Array, "*b 3"], angle: Float[Array, "*b"], *, degree: int) -> Float[Array, "*b lm"]:
-    """Coefficients of circular lights of radiance one.
+    """SH coefficients of circular lights of radiance 1.
 
-    In closed form, 2 pi sin^2(a) P_l'(cos a) / (l (l + 1)) times the basis in the light's direction; accurate for
-    lights as small as the sun and smaller.
+    The closed form is 2 pi sin^2(a) P_l'(cos a) / (l (l + 1)) times the basis functions in the direction of the light.
+    It is accurate also for lights as small as the sun or smaller.
 
     Args:
-        direction: Unit directions of the lights' centers.
-        angle: Their angular radii a in radians, from 0 to pi.
-        degree: The largest l.
+        direction: Unit directions to the centers of the lights.
+        angle: Angular radius a of each light in radians, from 0 to pi.
+        degree: Highest degree l.
 
     Reference: Kautz, Sloan, Snyder 2002, section 3 ("circular light sources"); Legendre's differential equation.
     """
@@ -396,5 +404,5 @@ def disc(direction: Float[Array, "*b 3"], angle: Float[Array, "*b"], *, degree: 
 
 
 def _band(degree: int) -> np.ndarray:
-    """Band of each coefficient."""
+    """Band l of each coefficient."""
     return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)

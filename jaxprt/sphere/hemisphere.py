@@ -1,7 +1,7 @@
-"""Maps between the upper hemisphere and the unit square, bilinear lookup in such maps, and integrals over it.
+"""Maps of the upper hemisphere to the unit square, bilinear lookup in such maps, and quadrature over the hemisphere.
 
-Texture coordinates are in [0, 1], first coordinate along columns; texel (row, column) of an n x n map has its
-center at ((column + 1/2) / n, (row + 1/2) / n).
+Texture coordinates are in [0, 1]; the first runs along columns. The center of texel (row, column) of an n x n map is at
+((column + 1/2) / n, (row + 1/2) / n).
 """
 
 from functools import lru_cache, partial
@@ -15,7 +15,7 @@ from jaxprt.sphere import directions
 
 _TINY = 1e-12
 _LEAST = 1e-20
-_CROWD = 4  # power by which nodes crowd around the middle of `arcs`
+_CROWD = 4  # power by which the nodes of `arcs` are concentrated around the middle
 
 
 @jit
@@ -23,10 +23,11 @@ def disk_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     """Orthographic projection of local directions, ((d.s + 1) / 2, (d.t + 1) / 2).
 
     Args:
-        direction: Unit directions in the local frame; those below the horizon fall on their mirror image's place.
+        direction: Unit directions in the local frame. Those below the horizon get the coordinates of their mirror
+            image.
 
     Returns:
-        Texture coordinates; the hemisphere fills the inscribed disk.
+        Texture coordinates. The hemisphere fills the inscribed disk.
 
     Reference: Wang, Tran, Luebke 2004, equation 7.
     """
@@ -35,9 +36,9 @@ def disk_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
 
 @jit
 def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
-    """Inverse of `disk_coordinates`; points outside the disk give the nearest horizontal direction.
+    """Inverse of `disk_coordinates`. Points outside the disk give the nearest direction at the horizon.
 
-    The gradient at and beyond the rim is that of the horizontal direction, so it is finite everywhere.
+    At and beyond the rim the gradient is that of the horizontal direction, so it is finite everywhere.
     """
     xy = 2 * coordinates - 1
     square = jnp.sum(xy**2, -1, keepdims=True)
@@ -49,9 +50,9 @@ def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
 
 @jit
 def polar_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
-    """Polar map (atan2(d.s, d.t), sqrt(1 - d.n)), the angle scaled from a full turn to [0, 1].
+    """Polar coordinates (atan2(d.s, d.t), sqrt(1 - d.n)), with the azimuth scaled from a full turn to [0, 1].
 
-    At the normal the angle is 0 and the gradient is zero.
+    At the normal the azimuth is 0 and the gradient is zero.
 
     Reference: Wang, Tran, Luebke 2004, equation 8.
     """
@@ -76,11 +77,11 @@ def polar_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
 
 @jit
 def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
-    """Parabolic map d.xy / (1 + d.z), scaled from [-1, 1] to [0, 1].
+    """Parabolic coordinates d.xy / (1 + d.z), scaled from [-1, 1] to [0, 1].
 
     Args:
-        direction: Unit directions in the local frame; those below the horizon are projected to its plane, so that
-            coordinates and gradients are finite everywhere.
+        direction: Unit directions in the local frame. Those below the horizon are projected to the horizontal plane, so
+            that coordinates and gradients are finite everywhere.
 
     Reference: Heidrich and Seidel 1998; Kautz, Sloan, Snyder 2002, section 3.
     """
@@ -89,7 +90,7 @@ def parabolic_coordinates(direction: Float[Array, "*b 3"]) -> Float[Array, "*b 2
 
 @jit
 def parabolic_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
-    """Inverse of `parabolic_coordinates`; points outside the disk give directions below the horizon."""
+    """Inverse of `parabolic_coordinates`. Points outside the disk give directions below the horizon."""
     xy = 2 * coordinates - 1
     square = jnp.sum(xy**2, -1, keepdims=True)
     return jnp.concatenate([2 * xy, 1 - square], -1) / (1 + square)
@@ -97,17 +98,17 @@ def parabolic_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3
 
 @jit
 def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
-    """Bilinear lookup between texel centers, constant beyond the outermost centers.
+    """Bilinear lookup between texel centers, with constant values beyond the outermost centers.
 
-    What is right at the rim of the disk is the map's business: texels outside the disk hold the values of the
-    nearest directions inside (see `texel_direction`).
+    At the rim of the disk, lookup also reads texels outside the disk. Maps store values of the nearest directions
+    inside there; see `texel_direction`.
 
     Args:
-        texel: A map with any trailing axes.
-        coordinates: Texture coordinates; values outside [0, 1] read the border.
+        texel: Texels of a map, with any trailing axes.
+        coordinates: Texture coordinates. Values outside [0, 1] are clamped.
 
     Returns:
-        Interpolated values, [*b *c], in the map's units; differentiable in both arguments.
+        Interpolated values [*b *c], differentiable in both arguments.
     """
     n = texel.shape[0]
     place = jnp.clip(coordinates * n - 0.5, 0, n - 1)
@@ -125,20 +126,20 @@ def lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> 
 
 @jit
 def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"]) -> Float[Array, "..."]:
-    """Bilinear lookup in a polar map: periodic in the angle, and continued across the normal.
+    """Bilinear lookup in a polar map, periodic in azimuth and continuous across the normal.
 
-    The row before the first is the first one half a turn on, which is where a path through the normal leads. Beyond
-    the last row, at the horizon, the map is constant.
+    The row before the first is the first row shifted by half a turn, because a path through the normal continues on the
+    opposite side. Beyond the last row, at the horizon, the map is constant.
 
     Args:
-        texel: A map with any trailing axes.
-        coordinates: From `polar_coordinates`; the first in [0, 1].
+        texel: Texels of a polar map, with any trailing axes.
+        coordinates: Coordinates from `polar_coordinates`, the first in [0, 1].
 
     Returns:
-        Interpolated values, [*b *c], in the map's units; differentiable in both arguments.
+        Interpolated values [*b *c], differentiable in both arguments.
     """
     n = texel.shape[0]
-    # Half a turn is not a whole number of texels where n is odd.
+    # If n is odd, half a turn is not a whole number of texels.
     opposite = (jnp.roll(texel[:1], n // 2, 1) + jnp.roll(texel[:1], n - n // 2, 1)) / 2
     tall = jnp.concatenate([opposite, texel, texel[-1:]])
     around = jnp.concatenate([tall[:, -1:], tall, tall[:, :1]], 1)
@@ -147,10 +148,10 @@ def polar_lookup(texel: Float[Array, "n n *c"], coordinates: Float[Array, "*b 2"
 
 @partial(jit, static_argnames=("resolution",))
 def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
-    """Directions at which an n x n disk map is sampled: one per texel, outside the disk too.
+    """Directions of the texels of an n x n disk map, including texels outside the disk.
 
-    A texel whose center lies outside the disk stands for a direction a quarter of a texel inside the rim, so that
-    bilinear lookup up to the horizon never meets an undefined texel.
+    A texel whose center lies outside the disk gets a direction a quarter of a texel inside the rim, so that bilinear
+    lookup up to the horizon never reads an undefined texel.
     """
     center = (jnp.arange(resolution) + 0.5) / resolution
     xy = 2 * jnp.stack(jnp.meshgrid(center, center), -1) - 1
@@ -161,9 +162,9 @@ def texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
 
 @partial(jit, static_argnames=("resolution",))
 def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
-    """Directions at which an n x n parabolic map is sampled: one per texel, those outside the disk drawn in.
+    """Directions of the texels of an n x n parabolic map, including texels outside the disk.
 
-    Like `texel_direction`, for `parabolic_coordinates`.
+    Centers outside the disk, or within a quarter of a texel of the rim, are moved to a quarter of a texel inside it.
     """
     center = (jnp.arange(resolution) + 0.5) / resolution
     xy = 2 * jnp.stack(jnp.meshgrid(center, center), -1) - 1
@@ -173,16 +174,16 @@ def parabolic_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
 
 
 def polar_texel_direction(*, resolution: int) -> Float[Array, "n n 3"]:
-    """Directions at the centers of the texels of an n x n polar map; all lie above the horizon."""
+    """Directions of the texels of an n x n polar map. All lie above the horizon."""
     center = (jnp.arange(resolution) + 0.5) / resolution
     return polar_direction(jnp.stack(jnp.meshgrid(center, center), -1))
 
 
 @partial(jit, static_argnames=("resolution",))
 def texel_area(*, resolution: int) -> Float[Array, "n n"]:
-    """Area of each texel of a disk map: (2 / n)^2 where its center lies inside the unit disk, else 0.
+    """Area of each texel of a disk map: (2 / n)^2 if its center lies inside the unit disk, else 0.
 
-    dx dy = cos(theta) d omega on the orthographic disk, so these are the weights of a cosine-weighted integral.
+    On the orthographic disk dx dy = cos(theta) d omega, so areas are the weights of cosine-weighted integrals.
     """
     center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
     inside = center[:, None] ** 2 + center[None, :] ** 2 < 1
@@ -191,9 +192,9 @@ def texel_area(*, resolution: int) -> Float[Array, "n n"]:
 
 @partial(jit, static_argnames=("resolution",))
 def parabolic_texel_area(*, resolution: int) -> Float[Array, "n n"]:
-    """Solid angle of each texel of a parabolic map whose center lies inside the unit disk, else 0.
+    """Solid angle of each texel of a parabolic map if its center lies inside the unit disk, else 0.
 
-    Unlike `texel_area` without the cosine, which no map makes a constant here: d omega = 4 dx dy / (1 + x^2 + y^2)^2.
+    Unlike `texel_area`, it does not include the cosine: d omega = 4 dx dy / (1 + x^2 + y^2)^2.
     """
     center = 2 * (jnp.arange(resolution) + 0.5) / resolution - 1
     square = center[:, None] ** 2 + center[None, :] ** 2
@@ -201,7 +202,7 @@ def parabolic_texel_area(*, resolution: int) -> Float[Array, "n n"]:
 
 
 def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
-    """Integral of cos(theta) d omega over each texel of a polar map, as `texel_area` is for a disk map; exact."""
+    """Exact integral of cos(theta) d omega over each texel of a polar map."""
     square = (jnp.arange(resolution + 1) / resolution) ** 2
     # d omega = 2 y dy d phi and cos(theta) = 1 - y^2; y^2 - y^4 / 2 is the integral of 2 y (1 - y^2).
     ring = jnp.diff(square - square**2 / 2) * (2 * jnp.pi / resolution)
@@ -210,24 +211,24 @@ def polar_texel_area(*, resolution: int) -> Float[Array, "n n"]:
 
 @partial(jit, static_argnames=("rings", "sectors"))
 def arcs(middle: Float[Array, "3"], *, rings: int, sectors: int) -> tuple[Float[Array, "d 3"], Float[Array, " d"]]:
-    """Quadrature over the upper hemisphere of what has a peak around one direction.
+    """Quadrature over the upper hemisphere for functions with a peak around one direction.
 
-    Nodes lie on arcs from that direction to the horizon, at Gauss-Legendre points in the fourth root of 1 - cos of
-    the angle: they crowd around it, so that a peak three degrees wide costs no more of them than a wide one, and what
-    is smooth above the horizon is smooth along each arc.
+    Nodes lie on arcs from that direction to the horizon, at Gauss-Legendre points in the fourth root of 1 - cos of the
+    angle. They are dense around the direction, so that a peak three degrees wide needs no more nodes than a wide one.
+    Along each arc the integrand is smooth if it is smooth above the horizon.
 
     Args:
-        middle: A unit vector above the horizon or on it.
-        rings: Number of nodes on an arc.
+        middle: Unit direction of the peak, above the horizon or on it.
+        rings: Number of nodes on each arc.
         sectors: Number of arcs.
 
     Returns:
-        Unit directions and the solid angle that each stands for.
+        Unit directions of the nodes, and the solid angle of each in sr.
     """
     place, weight = (jnp.asarray(each, middle.dtype)[:, None] for each in _arc(rings))
     angle = 2 * np.pi * (np.arange(sectors) + 0.5) / sectors
     cosine, sine = jnp.asarray(np.cos(angle), middle.dtype), jnp.asarray(np.sin(angle), middle.dtype)
-    # Rows: level, uphill, middle; at the pole any level direction will do.
+    # rows: horizontal, upwards, middle; at the normal any horizontal direction serves
     across, up, _ = directions.frame(middle, jnp.cross(jnp.array([0, 0, 1], middle.dtype), middle))
     rise = sine * up[2]
     whole = 1 + rise / jnp.sqrt(jnp.maximum(middle[2] ** 2 + rise**2, _LEAST))  # 1 - cos at the horizon
@@ -240,7 +241,7 @@ def arcs(middle: Float[Array, "3"], *, rings: int, sectors: int) -> tuple[Float[
 
 @lru_cache(maxsize=8)
 def _arc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on [0, 1] that crowd around 0."""
+    """Nodes and weights on [0, 1], with nodes concentrated around 0."""
     place, weight = np.polynomial.legendre.leggauss(rings)
     t = (place + 1) / 2
     return t**_CROWD, weight / 2 * _CROWD * t ** (_CROWD - 1)

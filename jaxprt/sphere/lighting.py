@@ -1,6 +1,7 @@
-"""What the harmonics of a light tell at once: irradiance, and the directional light that fits best.
+"""Irradiance and approximating directional lights, from the SH coefficients of a light.
 
-Coefficients are those of `jaxprt.sphere.harmonics`: of radiance, orthonormal, in l(l+1)+m order. Nothing is clamped.
+Coefficients are those of radiance in the orthonormal basis of `jaxprt.sphere.harmonics`, in l(l+1)+m order. Results are
+not clamped.
 """
 
 import jax.numpy as jnp
@@ -10,22 +11,22 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit
 from jaxprt.sphere import harmonics
 
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of Rec. 709
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of Rec. 709
 
 
 @jit
 def irradiance(coefficient: Float[Array, "lm *c"], normal: Float[Array, "*b 3"]) -> Float[Array, "..."]:
-    """Irradiance of surfaces without shadows, by their normals: the light convolved with the clamped cosine.
+    """Irradiance without shadows for given normals: the light convolved with the clamped cosine.
 
-    Times albedo / pi it is the radiance of an ideal diffuse surface. Nine coefficients hold almost all of it, because
-    the clamped cosine has no odd bands beyond 1 and its even ones fall as l^(-5/2).
+    Irradiance times albedo / pi is the radiance of an ideal diffuse surface. Nine coefficients determine almost all of
+    it, because the clamped cosine has no odd bands above 1 and its even bands fall as l^(-5/2).
 
     Args:
-        coefficient: Coefficients of the light, gray or in colors.
-        normal: Unit normals, in the frame of the light.
+        coefficient: SH coefficients of the light, gray or with any trailing axes such as colors.
+        normal: Unit normals, in the same frame as the light.
 
     Returns:
-        Irradiance [*b, *c], in the light's units times sr.
+        Irradiance [*b, *c], in units of radiance times sr.
 
     Raises:
         ValueError: The number of coefficients is not a square.
@@ -38,16 +39,16 @@ def irradiance(coefficient: Float[Array, "lm *c"], normal: Float[Array, "*b 3"])
 
 @jit
 def dominant_direction(coefficient: Float[Array, "lm *c"]) -> Float[Array, "3"]:
-    """The direction that most light comes from: the mean of directions, weighted by radiance, scaled to length 1.
+    """Dominant direction of a light: the mean of directions weighted by radiance, normalized.
 
-    It is the direction of the linear band, of the luminance where there are three colors, of the mean otherwise.
+    It is the direction of the linear band (l = 1). With three colors, their luminance is used, otherwise their mean.
 
     Args:
-        coefficient: Coefficients of the light, of degree 1 or more.
+        coefficient: SH coefficients of the light, of degree 1 or more.
 
     Returns:
-        A unit vector; zero where the linear band is exactly zero, as without light, and then its derivatives are zero
-        too. Of light that is the same from everywhere but for rounding, the direction means nothing.
+        A unit vector. It is zero, with zero derivatives, where the linear band is exactly zero, for example without
+        light. If light is uniform up to rounding, the direction is meaningless.
 
     Raises:
         ValueError: The degree is below 1, or the number of coefficients is not a square.
@@ -67,24 +68,23 @@ def dominant_direction(coefficient: Float[Array, "lm *c"]) -> Float[Array, "3"]:
 
 @jit
 def directional_light(coefficient: Float[Array, "lm *c"]) -> tuple[Float[Array, "3"], Float[Array, "*c"]]:
-    """The directional light that fits best: its direction, and the color that brings it nearest to the light.
+    """The directional light in the dominant direction that approximates a light best by least squares.
 
-    The light E delta(s - d) has coefficients E y_i(d). The color E is what minimizes their squared difference to the
-    coefficients that are given, which is the difference of the two lights up to their degree; E is in closed form,
-    4 pi / (degree + 1)^2 times the light's reconstruction at d.
+    A directional light E delta(s - d) has SH coefficients E y_i(d). The irradiance E minimizes their squared difference
+    from the given coefficients. In closed form, E is 4 pi / (degree + 1)^2 times the light's reconstruction at d.
 
     Args:
-        coefficient: Coefficients of the light, of degree 1 or more.
+        coefficient: SH coefficients of the light, of degree 1 or more.
 
     Returns:
-        The unit direction to the light, of `dominant_direction`, and the irradiance that it makes on a surface which
-        faces it. Both are zero where the direction is.
+        The unit direction to the light, from `dominant_direction`; and its irradiance on a surface that faces it. Both
+        are zero if there is no dominant direction.
 
     Raises:
         ValueError: The degree is below 1, or the number of coefficients is not a square.
 
-    Reference: Sloan 2008, "Stupid spherical harmonics tricks". His normalization, radiance of a white surface that
-    faces the light, is E = 16 pi / 17 at degree 2.
+    Reference: Sloan 2008, "Stupid spherical harmonics tricks". He normalizes by the radiance of a white surface that
+    faces the light, for which E is 16 pi / 17 at degree 2.
     """
     direction = dominant_direction(coefficient)
     there = _where_directed(direction, harmonics.reconstruct(coefficient, direction))
@@ -95,18 +95,20 @@ def directional_light(coefficient: Float[Array, "lm *c"]) -> tuple[Float[Array, 
 def directional_and_ambient(
     coefficient: Float[Array, "lm *c"],
 ) -> tuple[Float[Array, "3"], Float[Array, "*c"], Float[Array, "*c"]]:
-    """The directional light and the constant light whose sum fits best: `directional_light` with a second color.
+    """The sum of a directional and a constant (ambient) light that approximates a light best by least squares.
 
-    With n = (degree + 1)^2 coefficients, m the mean radiance and r the light's reconstruction in the direction, the
-    irradiance is 4 pi (r - m) / (n - 1), and the constant radiance (n m - r) / (n - 1).
+    Let n = (degree + 1)^2 be the number of coefficients, m the mean radiance, and r the light's reconstruction in the
+    dominant direction. The irradiance of the directional light is 4 pi (r - m) / (n - 1), and the radiance of the
+    constant light is (n m - r) / (n - 1).
 
     Args:
-        coefficient: Coefficients of the light, of degree 1 or more.
+        coefficient: SH coefficients of the light, of degree 1 or more.
 
     Returns:
-        The unit direction to the directional light, of `dominant_direction`; the irradiance that it makes on a surface
-        which faces it; and the radiance of the constant light, which makes pi times that. A color may be negative
-        where light comes from several sides. Without a direction the constant light is the mean, and the other zero.
+        The unit direction to the directional light, from `dominant_direction`; its irradiance on a surface that faces
+        it; and the radiance of the constant light, whose irradiance is pi times that. Either may be negative where
+        light comes from several sides. Without a dominant direction, the constant light is the mean and the directional
+        light is zero.
 
     Raises:
         ValueError: The degree is below 1, or the number of coefficients is not a square.
@@ -121,7 +123,7 @@ def directional_and_ambient(
 
 
 def _where_directed(direction: Array, value: Array) -> Array:
-    """Zero without a direction."""
+    """The value, or zero if there is no dominant direction."""
     return jnp.where(jnp.any(direction != 0), value, 0)
 
 

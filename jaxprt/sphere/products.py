@@ -1,12 +1,12 @@
-"""Products of functions that are given by spherical harmonics, and integrals of three of them.
+"""Products of functions given by SH coefficients, and integrals of triple products.
 
 The product of functions of degrees a and b has degree a + b. All functions here evaluate it at the nodes of a
-quadrature that is exact for what they integrate, so the coefficients are exact to rounding. In the usual notation
+quadrature that is exact for their integrands, so the coefficients are exact to rounding. In the usual notation
 
     product(f, g)_k = sum_ij Gamma_ijk f_i g_j,      operator(f)_kj = sum_i Gamma_ijk f_i,
     Gamma_ijk = ∫ y_i y_j y_k,  the integrals of three basis functions (Gaunt coefficients).
 
-The sparse sums over Gamma that are usual take as many operations at degree 4 and more from there.
+The usual sparse sums over Gamma take about as many operations at degree 4, and more at higher degrees.
 """
 
 from functools import lru_cache, partial
@@ -21,12 +21,12 @@ from jaxprt.sphere import harmonics
 
 @lru_cache(maxsize=8)
 def quadrature(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and weights whose sums are exact integrals of harmonics up to a degree.
+    """Quadrature on the sphere that integrates all spherical harmonics up to a degree exactly.
 
-    Gauss points in z, and equal steps of azimuth.
+    It has Gauss points in z and equal steps of azimuth.
 
     Args:
-        degree: The largest l of what is integrated: of products, the sum of the degrees of their factors.
+        degree: Highest degree l of the integrand. For a product, it is the sum of the factors' degrees.
 
     Returns:
         Unit directions [q, 3] and weights [q], which sum to 4 pi, in float64.
@@ -40,23 +40,25 @@ def quadrature(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 @partial(jit, static_argnames="degree")
 def product(first: Float[Array, "i *c"], second: Float[Array, "j *#c"], *, degree: int) -> Float[Array, "k *c"]:
-    """Coefficients of the product of two functions, up to a degree.
+    """SH coefficients of the product of two functions, up to a degree.
 
-    Multiplies light by visibility, an albedo map by irradiance, or a window by a light. Linear in each argument.
+    For example, light times visibility, or an albedo map times irradiance. Linear in each argument.
 
     Args:
-        first: Coefficients in l(l+1)+m order, with any trailing axes.
-        second: Those of the other function, of any degree; its trailing axes broadcast against those of the first.
-        degree: The largest l of the result. The sum of both degrees holds all of the product; less truncates it.
+        first: SH coefficients of the first function in l(l+1)+m order, with any trailing axes.
+        second: SH coefficients of the second function, of any degree. Its trailing axes broadcast to those of the
+            first.
+        degree: Highest degree l of the result. The sum of both degrees gives the whole product; a lower degree
+            truncates it.
 
     Returns:
-        Coefficients of the projection of the product, (degree+1)^2 rows.
+        (degree+1)^2 coefficients of the projected product.
 
     Raises:
         ValueError: The number of rows of a factor is not a square, or the degree is negative.
 
-    Reference: Snyder 2006, "Code generation and factoring for fast evaluation of low-order spherical harmonic
-    products and squares", which has the sparse sums; Ng, Ramamoorthi, Hanrahan 2004 for triple products.
+    Reference: Snyder 2006, "Code generation and factoring for fast evaluation of low-order spherical harmonic products
+    and squares", for the sparse sums; Ng, Ramamoorthi, Hanrahan 2004 for triple products.
     """
     of_first, of_second = harmonics.degree_of(first.shape[0]), harmonics.degree_of(second.shape[0])
     values = _tables(of_first, of_second, degree)
@@ -67,14 +69,14 @@ def product(first: Float[Array, "i *c"], second: Float[Array, "j *#c"], *, degre
 
 @partial(jit, static_argnames="degree")
 def operator(coefficient: Float[Array, "i *c"], *, degree: int) -> Float[Array, "k j *c"]:
-    """The matrix that multiplies functions of a degree by a function, and projects back to that degree.
+    """Matrix that multiplies functions of a degree by a given function and projects the product to that degree.
 
-    `operator(f, degree=n) @ g` is `product(f, g, degree=n)` for g of degree n: one function that multiplies many. It
-    is symmetric. That of visibility is a transfer matrix in the world's frame.
+    `operator(f, degree=n) @ g` equals `product(f, g, degree=n)` for g of degree n. Use it to multiply many functions by
+    one. The matrix is symmetric. The matrix of visibility is a transfer matrix in the world frame.
 
     Args:
-        coefficient: Coefficients of the function; what is beyond twice the degree changes nothing.
-        degree: Degree of what it multiplies, and of the result.
+        coefficient: SH coefficients of the given function. Bands above twice `degree` have no effect.
+        degree: Degree of the functions that are multiplied, and of the result.
 
     Raises:
         ValueError: The number of rows is not a square, or the degree is negative.
@@ -92,12 +94,12 @@ def operator(coefficient: Float[Array, "i *c"], *, degree: int) -> Float[Array, 
 def triple(
     first: Float[Array, "i *c"], second: Float[Array, "j *#c"], third: Float[Array, "k *#c"]
 ) -> Float[Array, "*c"]:
-    """The integral of the product of three functions over the sphere: light times visibility times BRDF, say.
+    """Integral of the product of three functions over the sphere, such as light x visibility x BRDF.
 
     Args:
-        first: Coefficients in l(l+1)+m order, with any trailing axes.
-        second: Those of the second function; trailing axes broadcast against those of the first.
-        third: Those of the third.
+        first: SH coefficients of the first function in l(l+1)+m order, with any trailing axes.
+        second: SH coefficients of the second function. Its trailing axes broadcast to those of the first.
+        third: SH coefficients of the third function. Its trailing axes broadcast to those of the first.
 
     Raises:
         ValueError: The number of rows of a factor is not a square.
@@ -110,7 +112,7 @@ def triple(
 
 @lru_cache(maxsize=16)
 def _tables(first: int, second: int, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The basis at the nodes for two degrees [q, i], [q, j], and the weighted one [k, q] of the result."""
+    """Basis functions at the nodes for both factors, [q, i] and [q, j], and weighted for the result, [k, q]."""
     node, weight = quadrature(first + second + max(degree, 0))
     one, other, back = (harmonics.basis(np, node, each) for each in (first, second, degree))
     return one.T, other.T, back * weight

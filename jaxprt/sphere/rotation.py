@@ -1,18 +1,20 @@
-"""Rotation of functions on the sphere, given by their SH coefficients.
+"""Rotation of functions on the sphere that are given by SH coefficients.
 
-A rotation R takes f to s -> f(R^T s). Its matrix D(R) on the coefficients is orthogonal and has one block per band.
-R is split into turns about z, y and z, and the turn about y into one about z between fixed quarter turns about x;
-turns about z mix pairs of coefficients, and the quarter turns are sparse constants. Cosines and sines of the angles
-come from the matrix and those of their multiples from a recurrence: there is no trigonometry.
+A rotation R maps f to s -> f(R^T s). Its matrix D(R) on the coefficients is orthogonal and has one block per band. R is
+decomposed into Euler angles: rotations about z, y and z. The rotation about y is a rotation about z between fixed
+quarter turns about x. Rotations about z mix pairs of coefficients, and the quarter turns are constant sparse matrices.
+Cosines and sines of the angles come from the entries of R, and those of multiples of the angles from a recurrence, so
+no trigonometric function is called.
 
-Derivatives with respect to R know only turns: moving R by dR counts as the turn by w, where w x is the antisymmetric
-part of dR R^T, and D changes by (w_x L_x + w_y L_y + w_z L_z) D with the three generators, whose bands have entries
-beside the diagonals only. This is the derivative of the function that maps any matrix to the rotation nearest to it
-(its polar factor) and then rotates; the gradient lies in the tangent space of the rotations at R. It holds at every
-rotation, the identity, half turns and fixed poles included, and so do second derivatives along turns.
+Derivatives with respect to R are defined for rotations: a change dR of the matrix counts as the infinitesimal rotation
+w whose cross-product matrix is the antisymmetric part of dR R^T. It changes D by (w_x L_x + w_y L_y + w_z L_z) D, where
+the generators L have nonzero entries next to the diagonals only. This is the derivative of the function that replaces
+any matrix by the nearest rotation (its polar factor) and then rotates. The gradient lies in the tangent space of the
+rotations at R. It is valid at every rotation, including the identity, half turns and rotations about the poles, and so
+are second derivatives along rotations.
 
-Mirrors, whose determinant is -1, are -1 times a proper rotation: s -> f(-s) changes the sign of the odd bands, and the
-rest is turned. Matrices must be orthogonal to rounding; for others the result has no meaning.
+A reflection, with determinant -1, is -1 times a proper rotation. It changes the sign of odd bands, by s -> f(-s), and
+rotates. Matrices must be orthogonal to rounding; for other matrices the result is meaningless.
 
 Reference: Kautz, Sloan, Snyder 2002, appendix.
 """
@@ -29,8 +31,8 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit
 from jaxprt.sphere import harmonics
 
-# Up to this degree every sum is written out, which is fast and compiles in two seconds; beyond, compiling takes
-# minutes, and whole bands are multiplied.
+# Up to this degree every sum is written out, which is fast and compiles in two seconds. Above it compiling would take
+# minutes, so whole bands are multiplied by matrices.
 _UNROLLED = 6
 
 
@@ -38,15 +40,15 @@ _UNROLLED = 6
 def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) -> Float[Array, "lm *c"]:
     """Rotates a spherical function given by its SH coefficients.
 
-    The result represents s -> f(R^T s), so rotate(evaluate(s), R) == evaluate(R s). Differentiable in both arguments
-    at every rotation; the module says what the derivative with respect to a matrix means.
+    The result represents s -> f(R^T s), so rotate(evaluate(s), R) == evaluate(R s). Differentiable in both arguments at
+    every rotation; the docstring of this module defines the derivative with respect to a matrix.
 
     Args:
-        coefficient: Coefficients in l(l+1)+m order; (degree+1)^2 rows.
-        rotation: A rotation matrix, or one of a mirror.
+        coefficient: (degree+1)^2 SH coefficients in l(l+1)+m order, with any trailing axes.
+        rotation: Matrix of a rotation or a reflection.
 
     Returns:
-        Coefficients in the same units.
+        Rotated coefficients in the same units.
 
     Raises:
         ValueError: The number of rows is not a square.
@@ -58,14 +60,14 @@ def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) ->
 
 @jit
 def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 3 3"]) -> Float[Array, "lm c w"]:
-    """Rotates by many rotations at once, in the layout that is fastest: vertices last.
+    """Rotates by many rotations at once, such as those of all vertices. They are the last axis, which is fastest.
 
     Args:
-        coefficient: Coefficients of one function for all, [lm, c], or of one function for each rotation, [lm, c, w].
-        rotation: Rotation matrices, or those of mirrors.
+        coefficient: SH coefficients: one function for all rotations, [lm, c], or one for each, [lm, c, w].
+        rotation: Matrices of rotations or reflections.
 
     Returns:
-        Rotated coefficients.
+        Rotated coefficients for each rotation.
 
     Raises:
         ValueError: The number of rows is not a square, or the counts of functions and rotations differ.
@@ -82,14 +84,14 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
 def about_z(
     coefficient: Float[Array, "lm *c"], cosine: Float[Array, "*v"], sine: Float[Array, "*v"]
 ) -> Float[Array, "lm *d"]:
-    """Rotates about z, by angles given by their cosine and sine: orders m and -m of each band mix.
+    """Rotates about z by angles given by their cosine and sine. This mixes orders m and -m of each band.
 
-    A polynomial in cosine and sine, differentiable as such. Off the unit circle order m is also scaled by the radius to
-    the power of |m|.
+    The result is a polynomial in cosine and sine, and differentiated as such. If (cosine, sine) is not of unit length,
+    order m is also scaled by its length to the power of |m|.
 
     Args:
-        coefficient: Coefficients in l(l+1)+m order.
-        cosine: Cosine of each angle; its axes broadcast against the last ones of the coefficients.
+        coefficient: SH coefficients in l(l+1)+m order.
+        cosine: Cosine of each angle. Its axes broadcast against the last axes of the coefficients.
         sine: Sine of each angle.
 
     Raises:
@@ -104,23 +106,29 @@ def about_z(
 
 @functools.partial(jit, static_argnames="degree")
 def matrix(rotation: Float[Array, "3 3"], *, degree: int) -> Float[Array, "lm lm"]:
-    """D(R) itself, with Y(R s) = D(R) Y(s): orthogonal, one block per band."""
+    """Rotation matrix D(R) of SH coefficients, with Y(R s) = D(R) Y(s). It is orthogonal, with one block per band.
+
+    Args:
+        rotation: Matrix of a rotation or a reflection.
+        degree: Highest degree l of the harmonics.
+    """
     return rotate(jnp.eye((degree + 1) ** 2, dtype=rotation.dtype), rotation)
 
 
 @functools.partial(jit, static_argnames="degree")
 def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array, "*b lm lm"]:
-    """D(R) for degrees up to 2, as polynomials in the entries of R.
+    """Rotation matrix D(R) of SH coefficients for degrees up to 2, as polynomials in the entries of R.
 
-    Band 1 is R with its axes in the order y, z, x. A function of band 2 is s^T Q s with Q symmetric and without
-    trace, so that its block is made of products of two entries. Differentiable as the polynomial that it is.
+    The block of band 1 is R with its axes in the order y, z, x. A function of band 2 is s^T Q s with a symmetric,
+    trace-free matrix Q, so the entries of its block are sums of products of two entries of R. Derivatives are those of
+    the polynomials.
 
     Args:
-        rotation: Rotation matrices, or those of mirrors.
-        degree: The largest l, 0 to 2.
+        rotation: Matrices of rotations or reflections.
+        degree: Highest degree l of the harmonics, 0 to 2.
 
     Raises:
-        ValueError: The degree is above 2.
+        ValueError: The degree is negative or above 2.
 
     Reference: Kautz, Sloan, Snyder 2002, appendix, first method.
     """
@@ -135,7 +143,7 @@ def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array,
     return result[..., : (degree + 1) ** 2, : (degree + 1) ** 2]
 
 
-# Band 2 as quadratic forms, scaled to unit norm: x y, y z, 3 z^2 - 1, x z, x^2 - y^2.
+# Basis functions of band 2 as quadratic forms of unit norm: x y, y z, 3 z^2 - 1, x z, x^2 - y^2.
 _QUADRATIC = np.zeros((5, 3, 3))
 for _row, (_i, _j) in ((0, (0, 1)), (1, (1, 2)), (3, (0, 2))):
     _QUADRATIC[_row, _i, _j] = _QUADRATIC[_row, _j, _i] = math.sqrt(1 / 2)
@@ -145,7 +153,7 @@ _QUADRATIC[4] = np.diag([1, -1, 0]) / math.sqrt(2)
 
 @functools.partial(jax.custom_jvp)
 def _rotated(coefficient: Array, rotation: Array) -> Array:
-    """Coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the end of *c."""
+    """Rotates coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the last axes of *c."""
     degree = harmonics.degree_of(coefficient.shape[0])
     shape = jnp.broadcast_shapes(coefficient.shape[1:], rotation.shape[2:])
     hand = _hand(rotation)
@@ -172,13 +180,13 @@ def _rotated_jvp(primal, tangent):
 
 
 def _hand(rotation: Array) -> Array:
-    """1 for proper rotations and -1 for mirrors: the sign of the determinant."""
+    """Sign of the determinant: 1 for rotations and -1 for reflections."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     return jnp.where(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0, -1, 1).astype(rotation.dtype)
 
 
 def _turn_rows(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
-    """Rows of all bands, every sum written out over its few terms."""
+    """Rotated rows of all bands, with every sum written out over its nonzero terms."""
 
     def about_z(row, angle):
         (cosine, sine), l = angle, len(row) // 2
@@ -199,13 +207,13 @@ def _turn_rows(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma
 
 
 def _about_z(row: Array, angle: tuple[Array, Array]) -> Array:
-    """One band turned about z by an angle of `_signed_multiples`."""
+    """One band rotated about z, with cosines and sines from `_signed_multiples`."""
     cosine, sine = (part[(len(part) - len(row)) // 2 :][: len(row)] for part in angle)
     return row * cosine + row[::-1] * sine
 
 
 def _turn_bands(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma: tuple) -> list[Array]:
-    """The bands by matrix products; cosines and sines are of m = -degree to degree."""
+    """Rotated bands by matrix products. Cosines and sines are those of m = -degree to degree times the angles."""
     result = []
     for l in range(harmonics.degree_of(len(coefficient)) + 1):
         quarter = jnp.asarray(_quarter_turn(l), coefficient.dtype)
@@ -217,7 +225,7 @@ def _turn_bands(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamm
 
 
 def _generate_rows(coefficient: Array, turn: list[Array]) -> Array:
-    """(w_x L_x + w_y L_y + w_z L_z) on coefficients [lm, *c], for a turn w of three arrays [*v]; written out."""
+    """Applies w_x L_x + w_y L_y + w_z L_z to coefficients [lm, *c], for an infinitesimal rotation w of arrays [*v]."""
     # Broadcast once, so that the transpose sums over the channels once.
     x, y, z = (jnp.broadcast_to(part, coefficient.shape[1:]) for part in turn)
     result = []
@@ -232,7 +240,7 @@ def _generate_rows(coefficient: Array, turn: list[Array]) -> Array:
 
 
 def _generate(coefficient: Array, turn: list[Array]) -> Array:
-    """The same, all rows at once: L_y shifts them by one, L_z reverses bands, and L_x does both."""
+    """`_generate_rows` for all rows at once: L_y shifts rows by one, L_z reverses bands, and L_x does both."""
     reverse, entry = _generators(harmonics.degree_of(len(coefficient)))
     entry = jnp.asarray(entry, coefficient.dtype).reshape(5, -1, *(1,) * (coefficient.ndim - 1))
     reversed_ = coefficient[reverse]
@@ -247,7 +255,7 @@ def _generate(coefficient: Array, turn: list[Array]) -> Array:
 
 @functools.lru_cache(maxsize=16)
 def _generators(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the rows with every band reversed; and entries: L_x below and above, L_y below and above, L_z."""
+    """Indices of the rows with every band reversed; and the entries of L_x and L_y below and above, and of L_z."""
     reverse, entry = [], np.zeros((5, (degree + 1) ** 2))
     for l in range(degree + 1):
         for m in range(-l, l + 1):
@@ -260,10 +268,10 @@ def _generators(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
-    """The entries of L_x and L_y in row m: L_y has them in columns m' beside m, L_x in columns -m'.
+    """Nonzero entries of the generators L_x and L_y in row m: of L_y in columns m' = m +- 1, of L_x in columns -m'.
 
     Returns:
-        For each such m' its number, the entry of L_x in column -m', and that of L_y in column m'.
+        For each m': m' itself, the entry of L_x in column -m', and the entry of L_y in column m'.
     """
     entry = []
     for other in (m - 1, m + 1):
@@ -279,8 +287,8 @@ def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
 def _euler_angles(rotation: Array) -> list[tuple[Array, Array]]:
     """Cosine and sine of alpha, beta, gamma with R = R_z(alpha) R_y(beta) R_z(gamma).
 
-    With the poles fixed or exchanged any alpha will do. Near there alpha is taken from tiny entries and is inaccurate,
-    which does no harm since gamma is what then remains to be turned.
+    If the rotation fixes or exchanges the poles, alpha is arbitrary. Near such rotations alpha is inaccurate, because
+    it comes from tiny entries; this does not matter, because gamma compensates for it.
     """
     alpha = _unit(rotation[0, 2], rotation[1, 2])
     cosine, sine = alpha
@@ -293,7 +301,7 @@ def _euler_angles(rotation: Array) -> list[tuple[Array, Array]]:
 
 
 def _unit(x: Array, y: Array) -> tuple[Array, Array]:
-    """Scales (x, y) to unit length; (1, 0) where squares vanish."""
+    """Scales (x, y) to unit length. The result is (1, 0) where the squares underflow."""
     square = x**2 + y**2
     zero = square < jnp.finfo(x.dtype).tiny
     scale = jax.lax.rsqrt(jnp.where(zero, 1, square))
@@ -311,7 +319,7 @@ def _multiples(cosine: Array, sine: Array, degree: int) -> tuple[list[Array], li
 
 
 def _signed_multiples(cosine: Array, sine: Array, degree: int, axes: int) -> tuple[Array, Array]:
-    """Cosines, and sines of the opposite sign, of -degree to degree times an angle, to go with arrays of many axes."""
+    """Cosines and negated sines of -degree to degree times an angle, with axes that broadcast to `axes` axes."""
 
     def step(power, _):
         a, b = power
@@ -325,10 +333,10 @@ def _signed_multiples(cosine: Array, sine: Array, degree: int, axes: int) -> tup
 
 @functools.lru_cache(maxsize=128)
 def _quarter_turn(l: int) -> np.ndarray:
-    """D of the turn about x that takes z to y, for one band: the exponential of a quarter circle times L_x.
+    """Block D of one band for the quarter turn about x that maps z to y: the exponential of pi / 2 times L_x.
 
-    The eigenvalues of i L_x are whole numbers, so that only its eigenvectors are rounded. The turn keeps parity in x
-    and exchanges those in y and z, so that a quarter of its entries are not zero.
+    The eigenvalues of i L_x are integers, so only its eigenvectors have rounding errors. The rotation preserves parity
+    in x and exchanges parity in y and z, so three quarters of the entries are zero.
     """
     generator = np.zeros((2 * l + 1, 2 * l + 1))
     for m in range(-l, l + 1):
