@@ -267,8 +267,8 @@ def compress(
 
     Returns:
         Indices of the coefficients; modes and cores, scaled to a largest entry of 1 to fit half precision; weights; and
-            two lists of squared errors relative to the squared norm, under light of natural spectrum: after 0, 1, ...
-            components, and after all components and 0, 1, ... modes.
+        two lists of squared errors relative to the squared norm, under light of natural spectrum: after 0, 1, ...
+        components, and after all components and 0, 1, ... modes.
     """
     size = haar.face_edge(seen.shape[1])
     importance = jnp.tile(haar.area(size=size).ravel(), 6) ** SPECTRUM

@@ -103,13 +103,13 @@ def sample_error(
 
     Returns:
         The error in 1/sr, and the error relative to the root mean square of the BRDF with the same weights. The latter
-            is zero if both are zero.
+        is zero if both are zero.
 
     Raises:
         ValueError: `samples` is below 1.
 
     Reference: Wang, Tran, Luebke 2004, section 4.3. The paper does not state the distribution of its samples; uniform
-        sampling is our choice.
+    sampling is our choice.
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")

@@ -119,7 +119,7 @@ def factor_normalized(
             not finite or have no color axis.
 
     Reference: Kautz and McCool 1999, "Interactive rendering with arbitrary BRDFs using separable approximations", for
-        the decomposition with any norm. The norm, and colors in the view map only, are our choices.
+    the decomposition with any norm. The norm, and colors in the view map only, are our choices.
     """
     direction, area = texels(resolution, coordinates)
     light_map, view_map, error = _normalized(tabulate(brdf, direction), area)
