@@ -123,7 +123,7 @@ def precompute(
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:
-    """The part in the form that systems take. Refuses a part that its system does not support, before tracing rays."""
+    """The `Shading` of the part. Refuses a part that its system does not support, before tracing rays."""
     shading = of_part(part, roughness=roughness)
     try:
         check(recipe, shading)

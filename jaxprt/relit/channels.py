@@ -1,4 +1,4 @@
-"""Converts a part of a scene to the form that systems take: a mesh with shading frames, and a BRDF with weights.
+"""Converts a part of a scene to the input of the systems: a mesh with shading frames, and a BRDF with weights.
 
 A metallic-roughness material is a sum of fixed gray BRDFs whose weights are textures; see
 `jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, which a system tabulates or factors
@@ -68,7 +68,7 @@ class ShininessFamily(eqx.Module):
 
 
 class Shading(eqx.Module):
-    """A part of a scene in the form that systems take.
+    """A part of a scene as input of the systems.
 
     Attributes:
         mesh: The part's mesh, with normals from the normal map and tangents along the anisotropy.
@@ -106,7 +106,7 @@ class Appearance(eqx.Module):
 
 
 def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shading:
-    """Converts a part of a scene to the form that systems take.
+    """Converts a part of a scene to a `Shading`, the input of the systems.
 
     A texture of anisotropy is replaced by its mean, with a warning.
 
@@ -188,7 +188,7 @@ def appearance(part: Part, shading: Shading, material: TexturedMaterial | BlinnP
 
     Args:
         part: The part.
-        shading: The part in the form that systems take, from `of_part`.
+        shading: The `Shading` of the part, from `of_part`.
         material: The new material.
 
     Raises:
@@ -218,7 +218,7 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
 
     Args:
         part: The part.
-        shading: The part in the form that systems take, from `of_part`.
+        shading: The `Shading` of the part, from `of_part`.
         material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's own
             material.
         points: Points on the part's triangles.

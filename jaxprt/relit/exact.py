@@ -91,7 +91,7 @@ def exact_pixels(
 
     Args:
         scene: The scene.
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
         camera: The camera.
         pixels: Number of pixels, chosen at random among those that show the scene; all if None.
@@ -157,7 +157,7 @@ def exact_picture(
 
     Args:
         scene: The scene.
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
         camera: The camera.
         progress: Whether to show progress bars.

@@ -40,7 +40,7 @@ def curvature(shading: Shading, system: System) -> float:
     harmonic.
 
     Args:
-        shading: The part in the form that systems take. Channels are weighted by their mean weights.
+        shading: The `Shading` of the part. Channels are weighted by their mean weights.
         system: The system of the part.
 
     Returns:

@@ -90,7 +90,7 @@ def make(
 
     Args:
         scene: The scene.
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         systems: The systems of the parts. If one has a table of lobes, it is used.
         targets: For each part, what casts shadows, and where and how to compute.
     """

@@ -99,7 +99,7 @@ def measure(
         direct: The systems of all parts, for direct light.
         system: The system whose bytes and times are reported; it includes bounces if there are any.
         scene: The scene.
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
     """
     size, mesh = checked(environments, 1.0, 1.0), scene.mesh

@@ -48,7 +48,7 @@ class PictureView(eqx.Module):
         mesh: The mesh of all parts.
         system: The system of all parts.
         camera: The camera.
-        surface: The parts in the form in which pictures shade them.
+        surface: One `Surface` for each part.
         canvas: The points that are shaded, and their pixels.
         part: The points of each part that the picture shows.
         lamp: Radiance of each lamp; None without lamps.
@@ -133,7 +133,7 @@ def make(
     Args:
         mesh: The mesh of all parts; its regions are the indices of the parts.
         system: The system of all parts.
-        surfaces: The parts in the form in which pictures shade them.
+        surfaces: One `Surface` for each part.
         camera: The camera.
         lamp: Radiance of each lamp; None without lamps.
         samples: Number of coverage samples of each pixel: 4 or 1.

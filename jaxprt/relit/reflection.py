@@ -56,7 +56,7 @@ def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartB
     """Precomputes the light that all parts reflect onto each other and themselves.
 
     Args:
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
 
@@ -82,7 +82,7 @@ def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathli
     """For each part, its lobes if its reflections are traced; None if harmonics represent its reflections well enough.
 
     Args:
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         systems: The systems of the parts. If one has a table of lobes, it is used.
         folder: Folder that stores tables that are made here; None stores nothing.
     """
@@ -106,7 +106,7 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
     The estimate treats all surfaces as diffuse, with the mean albedo of their parts.
 
     Args:
-        shadings: Each part in the form that systems take.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments. The result is the largest fraction under any of them.
 
     Returns:

@@ -58,7 +58,7 @@ class Sample:
     """Some vertices of a part, points on the triangles between them, and the reference radiance of the points.
 
     Attributes:
-        shading: The part in the form that systems take.
+        shading: Mesh, BRDF and channel weights of the part.
         target: The vertices of the sample, and their visibility.
         vertex_ratio: Number of vertices of the part, divided by that of the sample.
         points: Points at which recipes are compared. Their corners are indices into the vertices of the sample.

@@ -70,7 +70,7 @@ class RelitScene(System):
     Attributes:
         scene: The scene.
         direct: The systems of the parts, for direct light.
-        shading: Mesh, BRDF and weights of each part, in the form that systems take.
+        shading: Mesh, BRDF and channel weights of each part.
         bounces: The system of light that the parts reflect onto each other; None without bounces.
         lamps: Emitting parts and point lights; None if there are none. `bounces` does not include their light.
         mesh: The mesh of all parts, with the original normals (without normal maps).
@@ -258,7 +258,7 @@ class RelitScene(System):
         return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
 
     def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
-        """The parts in the form in which pictures shade them."""
+        """One `Surface` for each part."""
         given = self.appearances(materials)
         with tracing.now(self.curvature):
             curvature = list(self.curvature)

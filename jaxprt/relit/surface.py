@@ -19,12 +19,12 @@ from jaxprt.systems.protocol import Blend, System
 
 
 class Surface(eqx.Module):
-    """A part of a scene in the form in which pictures shade it.
+    """A part of a scene with everything that its shading requires.
 
     Attributes:
         part: The part.
         first: Index of its first vertex in the mesh of all parts.
-        shading: The part in the form that systems take.
+        shading: Mesh, BRDF and channel weights of the part.
         system: The system of direct light from the environment.
         reflecting: How it reflects light from other surfaces; None without bounces.
         lit: How it reflects light from lamps; None without lamps.

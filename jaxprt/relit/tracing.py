@@ -279,7 +279,7 @@ def _sharp(surfaces: Sequence[Surface]) -> list[int]:
 
 
 def flattened(surface: Surface) -> Surface:
-    """The part in the form that rays read: it reflects by harmonics alone, and its emission is hidden."""
+    """The part as rays see it: it reflects by harmonics alone, and its emission is hidden."""
     part = surface.reflecting
     return dataclasses.replace(surface, reflecting=part.plain if isinstance(part, SharpPart) else part, glows=False)
 

@@ -316,13 +316,17 @@ def combine(
 
 @partial(jit, static_argnames=("edge",))
 def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
-    """Radiance of the texels of coarser faces: light is shared by the four texels around it, by its distances.
+    """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
 
-    So a small sun is where it is, to second order; kept in one texel alone it would be in its middle. Constant light
-    stays as it is; flux is kept within 2.5 % for faces of 8 x 8, 5 % for those of 4 x 4.
+    A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
+    Constant light is preserved. Flux is preserved within 2.5 % for faces of 8 x 8 texels, and 5 % for 4 x 4.
+
+    Args:
+        radiance: Radiance of the fine texels.
+        edge: Edge of the coarse faces in texels.
 
     Raises:
-        ValueError: The coarse faces' edge does not divide the light's.
+        ValueError: The edge of the coarse faces does not divide that of the light's.
     """
     size = radiance.shape[1]
     if edge < 1 or size % edge:
