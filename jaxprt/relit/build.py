@@ -40,8 +40,7 @@ def precompute(
     """Precomputes a scene for relighting: traces visibility at its vertices and fits the BRDFs of its parts.
 
     All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all parts. Their colors
-    and
-    strengths may change after precomputation.
+    and strengths may change after precomputation.
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.

@@ -91,7 +91,6 @@ def drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Fl
     sky = background(environment, canvas.ray)
     colors = max([sky.shape[-1], *(each.shape[-1] for each in rows)])
     flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
-    color = jnp.concatenate(
-        [*flat, jnp.zeros((1, colors), sky.dtype)]
-    )  # One more color, so that the list is not empty if nothing is seen.
+    # One more color, so that the list is not empty if nothing is seen.
+    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])
     return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)

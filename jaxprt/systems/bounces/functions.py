@@ -313,7 +313,6 @@ def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
     light, view = (np.asarray(each, np.float64) for each in (brdf.light_map, brdf.view_map))
     rows = view * np.sqrt(np.mean(light**2, (1, 2, 3), keepdims=True))
     _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
-    axis = axis * np.where(
-        axis.sum(1, keepdims=True) < 0, -1, 1
-    )  # Fix the signs, which rounding would decide otherwise.
+    # Fix the signs, which rounding would decide otherwise.
+    axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)
     return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)
