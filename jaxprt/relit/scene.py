@@ -244,8 +244,13 @@ class RelitScene(System):
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
-        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point. The
-        arguments are those of `picture`, which also gives the errors.
+        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point. `picture`
+        gives the errors.
+
+        Args:
+            camera: The camera; `self.camera` if None.
+            materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
+            samples: Number of coverage samples of each pixel: 4, or 1 for no anti-aliasing.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 
