@@ -1,4 +1,4 @@
-"""Scenes made ready to be relit, by any of the systems."""
+"""Precomputes scenes and relights them, with any of the systems."""
 
 from jaxprt.relit import build, channels, exact, measuring, planning, probes, recipes, refinement, scene
 from jaxprt.relit.build import precompute

@@ -1,4 +1,4 @@
-"""Makes scenes ready."""
+"""Precomputes scenes for relighting."""
 
 import os
 import pathlib
@@ -37,45 +37,48 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> RelitScene:
-    """Makes a scene ready to be relit: traces what its vertices see, and fits the BRDFs of its parts.
+    """Precomputes a scene for relighting: traces visibility at its vertices and fits the BRDFs of its parts.
 
-    All parts cast shadows on each other. Parts that emit, and point lights, light all parts; their colors and strengths
-    may change afterwards.
+    All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all parts. Their colors
+    and strengths may change after precomputation.
 
     Args:
-        scene: The scene, from `jaxprt.load_scene` or made of `jaxprt.Part`.
-        system: "lobe", "harmonic" or "separable"; or sizes of one, such as `jaxprt.relit.Lobes(lobes=8)`; or one of
-            these for each part, by its name.
-            If None, `jaxprt.plan` chooses for each part what meets the error with the fewest bytes.
-        error: Relative L2 error of the radiance of each part, for the plan.
-        environments: Lights that the error must hold for, for the plan; see `jaxprt.plan`.
-        rate: Frames per second with new light and new view, for the plan.
-        bounces: How many times parts reflect light onto each other and themselves: a number, or "all" for as many times
-            as it brings light; if None as many as the plan finds worth it, and none with `system`. Light that is
-            reflected more than twice is diffuse.
-        rays: With bounces, how many rays each vertex or point of a part sends for its reflections, if these are too
-            sharp for the harmonics of reflected light; 0 for harmonics alone. See `RelitScene.with_rays`.
-        roughness: Least and largest roughness of the materials that parts with a `TexturedMaterial` or a `BlinnPhong`
-            may get later, beside those that they have. Needs `system`, "lobe" or "harmonic". Takes time to fit, and
-            memory in tables.
-        size: Edge of the light's cubemap faces in texels, a power of two; that of the plan's lights if None, or 64.
-        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed; this machine's cores if None. A `jaxprt.visibility.Part` computes its part
-            of all that can be begun, for machines that share nothing but the path.
+        scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
+        system: Name of a system ("lobe", "harmonic" or "separable"), or a recipe with its own parameters, such as
+            `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the name of each part to one of these. If None,
+            `jaxprt.plan` chooses the system with the fewest bytes that meets `error`, for each part.
+        error: Largest relative L2 error of the radiance of each part. Only used by the plan.
+        environments: Environments under which the error must hold; see `jaxprt.plan`. Only used by the plan.
+        rate: Frames per second, each with a new light and a new view. Only used by the plan.
+        bounces: Number of times that light is reflected between surfaces, or "all" for as many as contribute. If None,
+            the plan decides; with a given `system` there are no bounces. Bounces after the second are treated as
+            diffuse.
+        rays: Number of reflection rays that each vertex or point of a sharp part sends. A part is sharp if its
+            reflections are too sharp for the low-order harmonics that represent reflected light. 0 uses harmonics
+            alone. Only used with bounces; see `RelitScene.with_rays`.
+        roughness: Smallest and largest roughness that parts with a `TexturedMaterial` or a `BlinnPhong` may have after
+            precomputation, in addition to the roughness they have now. Requires `system` to be "lobe" or "harmonic". A
+            range costs fitting time and table memory.
+        size: Edge of the light's cubemap faces in texels, a power of two. If None, that of the plan's lights, or 64
+            without a plan.
+        path: Folder in which finished work is stored. A call that was interrupted resumes from there.
+        executor: Executor that computes the blocks of work. If None, all cores of this machine. A
+            `jaxprt.visibility.Part` computes only its share of the blocks, for machines that have nothing in common but
+            `path`.
         progress: Whether to show progress bars.
 
     Returns:
-        The scene, ready for `radiance` and `picture`.
+        The precomputed scene, with the methods `radiance` and `picture`.
 
     Raises:
-        TypeError: No scene, a system of another kind, bounces that are no whole number, or a material that no system
-            can have.
-        ValueError: There is no such system or part, the size is no power of two, bounces are less than 0 or a word
-            other than "all", roughness is not two numbers from 0 to 1, the smaller one first, or is given without a
-            system, a part's material is not one that its system can have, or the store at `path` was made from
-            something else.
-        NotADirectoryError: There is a file at `path`.
-        jaxprt.visibility.UnfinishedError: The executor's part is done, and other parts are not.
+        TypeError: `scene` is not a `Scene`; `system` is not a name, a recipe or a dictionary; `bounces` is not a whole
+            number; or a part has a material that no system supports.
+        ValueError: There is no system or part of the given name; `size` is not a power of two; `bounces` is negative or
+            a word other than "all"; `roughness` is not two increasing numbers from 0 to 1, or is given without a
+            system; the system of a part does not support its material; or the store at `path` was made from other
+            inputs.
+        NotADirectoryError: `path` is a file.
+        jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
@@ -105,21 +108,21 @@ def precompute(
     for part, shading, target in zip(scene.parts, shadings, targets, strict=True):
         try:
             systems.append(recipes[part.name].make(shading, target))
-        except UnfinishedError as others:  # The next part of the scene does not wait for this one.
+        except UnfinishedError as others:  # Go on with the next part of the scene.
             unfinished.append(others)
     if unfinished:
         raise UnfinishedError("; ".join(map(str, unfinished)))
     lit = lamps.make(scene, shadings, systems, targets)
     reflected = None
     if bounces:
-        # One store for any number of bounces: more go on from fewer.
+        # One store serves any number of bounces: a larger number resumes from a smaller one.
         reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
     lobes = reflection.sharp(shadings, systems, folder) if bounces and rays else None
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:
-    """The part as systems take it, refused before any rays are traced if its system cannot have it."""
+    """The `Shading` of the part. Refuses a part that its system does not support, before tracing rays."""
     shading = of_part(part, roughness=roughness)
     try:
         check(recipe, shading)
@@ -129,10 +132,10 @@ def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) 
 
 
 def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
-    """The plan, made once for a folder."""
+    """The plan of a scene, made once for a folder."""
     if folder is None:
         return _plan(scene, None, **options)
-    # Where several processes share the folder, one makes the plan and the others take it.
+    # If several processes share the folder, one of them makes the plan and the others load it.
     with filelock.FileLock(folder / ".plan.lock"):
         return _plan(scene, folder, **options)
 
@@ -158,7 +161,7 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
 
 
 def _recipe(system, name: str, scene: Scene) -> Recipe:
-    """The recipe of a part."""
+    """The recipe of the part of a name."""
     if isinstance(system, Mapping):
         names = [part.name for part in scene.parts]
         missing, unknown = (set(a) - set(b) for a, b in ((names, system), (system, names)))
@@ -174,5 +177,5 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
 
 
 def _file_name(name: str) -> str:
-    """The name of a part in those of files: letters and digits, not too many."""
+    """A name for the files of a part: its letters and digits, at most 40."""
     return "".join(letter if letter.isalnum() else "_" for letter in name)[:40]

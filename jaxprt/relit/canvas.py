@@ -1,4 +1,4 @@
-"""What is shaded in a picture: its points in rows, and the picture of their colors."""
+"""The points of a picture that are shaded, in rows of few lengths, and the picture that their colors make."""
 
 from collections.abc import Sequence
 
@@ -15,18 +15,17 @@ from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
 
-CHUNK = 1 << 13  # points that are shaded at once
+CHUNK = 1 << 13  # number of points that are shaded together
 _FEWEST = 1 << 10
 
 
 class Canvas(eqx.Module):
-    """What is shaded in a picture, and where it goes.
+    """The points of a picture that are shaded, and where their colors go.
 
     Attributes:
         pixels: The points that are shaded.
-        order: Number of each point's color in the list of all colors, row after row.
-        ray: Unit directions in the world from the eye through the centers of the pixels; the light behind the scene is
-            read along them.
+        order: Index of each point's color in the list of all colors, row after row.
+        ray: Unit direction in world space from the eye through the center of each pixel, to look up the background.
     """
 
     pixels: Pixels
@@ -35,7 +34,7 @@ class Canvas(eqx.Module):
 
 
 def rows_of(chosen: Array | np.ndarray) -> Int[Array, "m p"]:
-    """Numbers of the points that are chosen, in rows of few lengths, so that programs serve many pictures."""
+    """Indices of the chosen points, in rows of few different lengths, so that pictures share compiled programs."""
     if isinstance(chosen, Tracer):
         count = len(chosen)
         index = jnp.nonzero(chosen, size=count, fill_value=-1)[0]
@@ -44,28 +43,35 @@ def rows_of(chosen: Array | np.ndarray) -> Int[Array, "m p"]:
         count = len(index)
     row = CHUNK if count > CHUNK else max(_FEWEST, 1 << max(count - 1, 0).bit_length())
     rows = -(-count // row)
-    # Not by JAX where the number of points is known: that would compile for each number.
+    # NumPy, if the number of points is known: JAX would compile for each number.
     pad = jnp.pad if isinstance(index, Tracer) else np.pad
     return jnp.asarray(pad(index, (0, rows * row - count), constant_values=-1).reshape(rows, row))
 
 
 @jit
 def points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, index: Int[Array, " p"]) -> Points:
-    """Some points of a part of a picture, whose first vertex has a number in the mesh; padding lies on that vertex.
+    """Some points of a picture that lie on one part. Padding (index -1) lies on the first vertex of the part.
 
-    A program by itself, so that those that shade do not know how many points the picture has, and serve all pictures.
+    This is a compiled program by itself, so that the programs that shade do not depend on the picture's number of
+    points.
+
+    Args:
+        pixels: The points of the picture.
+        face: Triangles of the mesh of all parts.
+        first: Index of the part's first vertex in that mesh.
+        index: Indices of the points; -1 in padding.
     """
     own = jnp.maximum(index, 0)
     padding = index < 0
     corner = face[jnp.maximum(pixels.triangle[own], 0)].T - first
-    # On a vertex, so that its colors are finite.
+    # Padding lies on a vertex, so that its colors are finite.
     weight = jnp.where(padding, jnp.asarray([[1.0], [0], [0]], pixels.barycentric.dtype), pixels.barycentric[own].T)
     slope = jnp.where(padding, 0, jnp.moveaxis(pixels.slope[own], 0, -1))
     return Points(jnp.where(padding, 0, corner), weight, slope)
 
 
 def lay_out(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
-    """The canvas of some points. `index` has their numbers in the order in which they are shaded, -1 in padding."""
+    """The canvas of some points. `index` holds their indices in the order in which they are shaded, -1 in padding."""
     every = [each.ravel() for each in index]
     count = len(pixels.triangle)
     if any(isinstance(each, Tracer) for each in every):
@@ -81,9 +87,10 @@ def lay_out(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
 
 @jit
 def drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Float[Array, "h w c"]:
-    """The picture of the points with these colors, in rows as they were shaded, in front of the light."""
+    """The picture of points with the given colors, in rows as they were shaded, in front of the environment."""
     sky = background(environment, canvas.ray)
     colors = max([sky.shape[-1], *(each.shape[-1] for each in rows)])
     flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
-    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])  # Not empty where nothing is seen.
+    # One more color, so that the list is not empty if nothing is seen.
+    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])
     return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)

@@ -1,4 +1,4 @@
-"""The triangles of scenes, kept for the rays of reflections."""
+"""Casts reflection rays against the triangles of a scene, whose ray-tracing structures are cached."""
 
 import collections
 import threading
@@ -16,14 +16,14 @@ from jaxprt.systems.bounces.traced import Rays
 from jaxprt.visibility import Occluder, point_starts, start_points
 from jaxprt.visibility.hits import first_fronts
 
-_KEPT = 4  # scenes whose triangles Embree holds
+_KEPT = 4  # number of scenes that are cached
 
 
 class Caster:
-    """The triangles of a scene, as rays meet them.
+    """The triangles of a scene, ready for ray casting.
 
     Args:
-        mesh: The mesh of all parts; its regions are their numbers.
+        mesh: The mesh of all parts; its regions are the indices of the parts.
     """
 
     def __init__(self, mesh: Mesh):
@@ -33,17 +33,17 @@ class Caster:
 
     @cached_property
     def start(self) -> Float[np.ndarray, "v 3"]:
-        """Where the rays of vertices start."""
+        """Origins of the rays of each vertex."""
         return start_points(self.mesh, self.occluder)
 
     def cast(
         self, rays: Rays, first: int, points: Points | None
     ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
-        """The triangle that each ray meets, -1 for none, the weights of its corners, and where the rays start.
+        """The triangle that each ray hits (-1 for none), barycentric weights of the hit, and origins of the rays.
 
         Args:
-            rays: The rays that start from vertices or points of a part.
-            first: Number of the part's first vertex.
+            rays: Rays that start from vertices or points of a part.
+            first: Index of the part's first vertex.
             points: The points; None for the vertices.
         """
         way, chance = np.asarray(rays.direction, np.float32), np.asarray(rays.chance)
@@ -56,7 +56,7 @@ class Caster:
         ray, own = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
         found, weight = first_fronts(self.occluder, self.normal, start[own], np.ascontiguousarray(way[ray, own]))
-        # A ray that starts below its own triangle, or below one around its own vertex, meets that.
+        # Ignore hits of the ray's own triangle, or of a triangle around its own vertex: the origin may lie below it.
         met = self.face[found]
         itself = np.all(met == corner[own], 1) if points is not None else np.any(met == corner[own], 1)
         triangle[ray, own], barycentric[ray, own] = np.where(itself, -1, found), weight
@@ -68,7 +68,7 @@ _LOCK = threading.Lock()
 
 
 def caster(mesh: Mesh) -> Caster:
-    """The triangles of a scene, in Embree's form, which is kept for the last few scenes."""
+    """The `Caster` of a mesh. Those of the last few scenes are cached."""
     key = id(mesh.position)
     with _LOCK:
         alive, kept = _CASTERS.get(key, (lambda: None, None))

@@ -1,8 +1,8 @@
-"""What a part of a scene is to a system: a mesh with shading frames, a BRDF of channels, and their weights.
+"""Converts a part of a scene to the input of the systems: a mesh with shading frames, and a BRDF with weights.
 
-A metallic-roughness material is a sum of fixed gray BRDFs with textures as weights, see
-`jaxprt.brdf.MetallicRoughness.terms`. The fixed ones are the channels of one BRDF, which a system tabulates or factors
-once. Where roughness varies, they are tabulated over its logarithm.
+A metallic-roughness material is a sum of fixed gray BRDFs whose weights are textures; see
+`jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, which a system tabulates or factors
+once. If roughness varies, they are tabulated over its logarithm.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
 
-_SMOOTHEST = 1e-3**0.5  # roughness below which GGX stays as it is
-_STEP = 1.5  # from one tabulated roughness to the next, at most
-_EQUAL = 1e-3  # roughness, anisotropy and normals that vary less are equal
-_RARE = 0.02  # least typical weight of a channel, relative to the largest
-_NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # of the terms of MetallicRoughness
-_BARE = (3,)  # the term of a material that is ideally diffuse
+_SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
+_STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
+_EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
+_RARE = 0.02  # smallest scale of a channel, relative to the largest
+_NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # names of the terms of MetallicRoughness
+_BARE = (3,)  # the only term of a Lambertian material
 
 
 class RoughnessFamily(eqx.Module):
-    """Terms of `MetallicRoughness` as channels, for any roughness: a function that makes a BRDF.
+    """Maps a roughness to the BRDF whose channels are terms of `MetallicRoughness`.
 
     Attributes:
-        term: Which of the terms.
-        scale: Factor of each.
+        term: Indices of the terms that are channels.
+        scale: Factor of each channel.
         anisotropy: Strength of the anisotropy, along the tangent.
     """
 
@@ -48,39 +48,39 @@ class RoughnessFamily(eqx.Module):
     anisotropy: Float[Array, ""]
 
     def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
-        """The BRDF of a roughness, given its natural logarithm."""
+        """The BRDF for the natural logarithm of a roughness."""
         each = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
         return Channels(tuple(each[k] for k in self.term), self.scale)
 
 
 class ShininessFamily(eqx.Module):
-    """Diffuse base and lobe of `BlinnPhong` as channels, for any exponent: a function that makes a BRDF.
+    """Maps a roughness to the BRDF whose channels are the diffuse base and the lobe of `BlinnPhong`.
 
     Attributes:
-        scale: Factor of each.
+        scale: Factor of each channel.
     """
 
     scale: Float[Array, " k"]
 
     def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
-        """The BRDF of a roughness, the square root of 2 / (exponent + 2), given its natural logarithm."""
+        """The BRDF for the natural logarithm of a roughness, the square root of 2 / (exponent + 2)."""
         return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)
 
 
 class Shading(eqx.Module):
-    """A part of a scene, as systems take it.
+    """A part of a scene as input of the systems.
 
     Attributes:
-        mesh: The part's mesh, with normals of the normal map and tangents along the anisotropy.
-        brdf: The BRDF, with as many channels as `blend` has weights. With `knot` it is a function that makes one: a
-            `RoughnessFamily`, or a `ShininessFamily`.
-        exact: The BRDF of every vertex, for the exact sum.
-        knot: Logarithms of roughness at which to tabulate; empty where roughness does not vary.
-        blend: Weights of each vertex, and logarithms of its roughness; None for a part whose material is a BRDF that
-            stays.
-        emitted: Radiance that the surface emits; None for none.
-        term: Which of the terms of `MetallicRoughness` the channels are.
-        scale: Factor of each channel, by which the weights are divided.
+        mesh: The part's mesh, with normals from the normal map and tangents along the anisotropy.
+        brdf: The BRDF, with one channel for each weight of `blend`. If `knot` is not empty, it is a function from the
+            logarithm of roughness to a BRDF: a `RoughnessFamily` or a `ShininessFamily`.
+        exact: The BRDF at every vertex, for the exact sum over all texels.
+        knot: Logarithms of roughness at which to tabulate the BRDF; empty if roughness does not vary.
+        blend: Weights of the channels at each vertex, and the logarithm of roughness there if it varies. None for a
+            part with a BRDF that cannot change.
+        emitted: Radiance that the surface emits; None if it does not emit.
+        term: Indices of the terms of `MetallicRoughness` that are channels.
+        scale: Factor of each channel. The weights of `blend` are divided by it.
     """
 
     mesh: Mesh
@@ -94,11 +94,11 @@ class Shading(eqx.Module):
 
 
 class Appearance(eqx.Module):
-    """A material at the vertices of a part, for the system that the part was precomputed with.
+    """A material evaluated at the vertices of a part, in the form that the part's system takes.
 
     Attributes:
-        blend: What the system takes; None for a part whose material is a BRDF.
-        emitted: Radiance that the surface emits; None for none.
+        blend: Weights of the BRDF's channels; None for a part with a BRDF that cannot change.
+        emitted: Radiance that the surface emits; None if it does not emit.
     """
 
     blend: Blend | None
@@ -106,17 +106,17 @@ class Appearance(eqx.Module):
 
 
 def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shading:
-    """A part of a scene, as systems take it.
+    """Converts a part of a scene to a `Shading`, the input of the systems.
 
     A texture of anisotropy is replaced by its mean, with a warning.
 
     Args:
         part: The part.
-        roughness: Least and largest roughness of materials that it may have later, beside those of its own; of
-            `BlinnPhong` the square root of 2 / (exponent + 2).
+        roughness: Smallest and largest roughness that the part's material may have after precomputation, in addition to
+            the roughness it has now. For `BlinnPhong`, roughness is the square root of 2 / (exponent + 2).
 
     Raises:
-        TypeError: The material is a BRDF of another form: a table that holds the cosine, or one BRDF for each vertex.
+        TypeError: The material is one BRDF for each vertex, or a table that already includes the cosine.
     """
     if not isinstance(part.material, TexturedMaterial):
         if isinstance(part.material, PerVertex):
@@ -147,7 +147,7 @@ def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shad
 
 
 def _shiny(mesh: Mesh, brdf: BlinnPhong, roughness: tuple[float, float]) -> Shading:
-    """A part of Blinn-Phong whose colors and exponent may change; one that stays where no roughness is given."""
+    """A part with a Blinn-Phong material. Its colors and exponent may change only if a range of roughness is given."""
     own = jnp.exp(_log_roughness(brdf.exponent))
     knot = _knots(jnp.append(own, jnp.array(roughness)), least=min(_SMOOTHEST, float(own)))
     if not knot:
@@ -163,7 +163,7 @@ def _log_roughness(exponent: Array) -> Array:
 
 
 def _shiny_blend(brdf: BlinnPhong, scale: Array, count: int) -> Blend:
-    """The same weights for so many vertices or points."""
+    """The weights of a Blinn-Phong material, the same for every vertex or point."""
     weight = jnp.stack([jnp.broadcast_to(each, (3,)) for each in (brdf.diffuse, brdf.specular)]) / scale[:, None]
     roughness = jnp.broadcast_to(_log_roughness(brdf.exponent), (count,))
     return Blend(jnp.broadcast_to(weight, (count, *weight.shape)), (roughness,))
@@ -180,21 +180,22 @@ def _shiny_appearance(part: Part, shading: Shading, brdf: BlinnPhong) -> Appeara
 
 
 def appearance(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Appearance:
-    """Another material on a part that was precomputed.
+    """Evaluates a new material at the vertices of a precomputed part.
 
-    Textures of color, metallic, specular and emission, and within the range that was precomputed of roughness, may be
-    anything. Inside `jax.jit`, where values are not known, vertices that need what was not precomputed get NaN.
-    Derivatives leave out terms that were not precomputed.
+    Textures of color, metallic, specular and emission may have any values. Roughness must be in the precomputed range.
+    Inside `jax.jit`, where values are unknown, vertices that need something that was not precomputed get NaN.
+    Derivatives ignore terms that were not precomputed.
 
     Args:
         part: The part.
-        shading: From `of_part`.
-        material: The material.
+        shading: The `Shading` of the part, from `of_part`.
+        material: The new material.
 
     Raises:
-        ValueError: The material takes texture coordinates that the mesh does not have, or has a term, a roughness, an
-            anisotropy or a normal map that were not precomputed.
-        TypeError: A metallic-roughness material for a part of Blinn-Phong, or the other way around.
+        ValueError: The material uses texture coordinates that the mesh lacks, or has a term, a roughness, an anisotropy
+            or a normal map that was not precomputed.
+        TypeError: The part was precomputed with a Blinn-Phong material and the new one is metallic-roughness, or vice
+            versa.
     """
     shiny = isinstance(shading.brdf, ShininessFamily)
     if isinstance(material, BlinnPhong) != shiny:
@@ -213,13 +214,14 @@ def appearance(part: Part, shading: Shading, material: TexturedMaterial | BlinnP
 
 
 def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
-    """A material at points of a part, its textures averaged over the points' pixels.
+    """Evaluates a material at points of a part. Its textures are averaged over the pixel of each point.
 
     Args:
         part: The part.
-        shading: From `of_part`.
-        material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's.
-        points: On the part's triangles.
+        shading: The `Shading` of the part, from `of_part`.
+        material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's own
+            material.
+        points: Points on the part's triangles.
     """
     if isinstance(material, Appearance):
         return jax.tree.map(points.carry, material)
@@ -236,9 +238,9 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | None]:
-    """The BRDF of points of a part for the exact sum, and what they emit.
+    """The BRDF at points of a part for the exact sum over all texels, and the radiance that the points emit.
 
-    Textures are averaged over the points' pixels, and read at points of no picture.
+    Textures are averaged over the pixel of each point. At points that do not belong to a picture they are sampled.
     """
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None
@@ -247,7 +249,7 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
 
 
 def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
-    """Whether the terms and the roughness of each vertex were precomputed; refuses those that were not, if known."""
+    """Whether the terms and the roughness of each vertex were precomputed. If values are known, refuses others."""
     missing = np.setdiff1d(np.arange(len(_NAMES)), shading.term)
     needed = jnp.any(new.coefficient()[:, missing] != 0, (0, 2))
     if _known(needed) and np.any(np.asarray(needed)):
@@ -270,25 +272,25 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
 
 
 def roughness_range(shading: Shading) -> tuple[Array, Array]:
-    """Least and largest roughness that a part was precomputed for."""
+    """Smallest and largest roughness that a part was precomputed for."""
     if not shading.knot:
         old = _old(shading).roughness
         return jnp.min(old), jnp.max(old)
     (knot,) = shading.knot
-    # What is smoother than the first knot has the BRDF of that.
+    # Smaller roughness is treated as that of the first knot.
     least, most = jnp.exp(knot[0]), jnp.exp(knot[-1])
     return jnp.where(least <= _SMOOTHEST + _EQUAL, 0, least), most
 
 
 def exponent_range(shading: Shading) -> tuple[float, float]:
-    """Least and largest exponent that a part of Blinn-Phong was precomputed for."""
+    """Smallest and largest exponent that a Blinn-Phong part was precomputed for."""
     (knot,) = shading.knot
     least, most = (2 * np.exp(-2 * knot[each]) - 2 for each in (-1, 0))
     return max(float(least), 0.0), float(most)
 
 
 def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRoughness) -> None:
-    """Refuses another anisotropy and other normals than the precomputed frames and tables have, where known."""
+    """Refuses an anisotropy or normals that differ from the precomputed ones, if their values are known."""
     if not _known(surface, shading):
         return
     before, now = (float(each.anisotropy[0]) for each in (_old(shading), new))
@@ -315,7 +317,7 @@ def _old(shading: Shading) -> MetallicRoughness:
 
 
 def _known(*value: Any) -> bool:
-    """Whether JAX traces none of the arrays."""
+    """Whether no array is traced by JAX."""
     return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
 
 
@@ -329,7 +331,7 @@ def _emitted(surface: Surface) -> Float[Array, "v 3"] | None:
 
 
 def _material(surface: Surface) -> MetallicRoughness:
-    """The material of every vertex, its anisotropy one number along the tangent."""
+    """The material at every vertex. Its anisotropy is the mean strength, along the tangent."""
     ones = jnp.ones_like(surface.roughness)
     return MetallicRoughness(
         base_color=surface.base_color,
@@ -354,7 +356,7 @@ def _warn_of_varying_anisotropy(name: str, surface: Surface) -> None:
 
 
 def _knots(roughness: Float[Array, " v"], *, least: float = _SMOOTHEST) -> tuple[np.ndarray, ...]:
-    """Logarithms of roughness between the least and the largest; none where these are equal."""
+    """Logarithms of roughness between the smallest and the largest; none if these are equal."""
     low, high = (max(float(each), least) for each in (jnp.min(roughness), jnp.max(roughness)))
     if high - low <= _EQUAL:
         return ()
@@ -363,7 +365,7 @@ def _knots(roughness: Float[Array, " v"], *, least: float = _SMOOTHEST) -> tuple
 
 
 def _turned(mesh: Mesh, surface: Surface) -> Mesh:
-    """The mesh with the normals of the normal map, and tangents along the direction of anisotropy."""
+    """The mesh with normals from the normal map, and tangents along the anisotropy."""
     flat = bool(np.all(np.asarray(surface.normal) == [0, 0, 1]))
     straight = bool(np.all(np.asarray(surface.direction) == [1, 0])) or not np.any(np.asarray(surface.anisotropy))
     if flat and straight:

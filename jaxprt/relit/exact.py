@@ -1,4 +1,4 @@
-"""The exact picture, from the sum over all texels: some of its pixels, to measure by, and one to look at."""
+"""Reference pictures in direct light, by the sum over all texels: some pixels to measure errors, or a whole picture."""
 
 import dataclasses
 import math
@@ -24,20 +24,21 @@ from jaxprt.scene.points import Points, on_triangles
 from jaxprt.systems import reference
 from jaxprt.visibility import blocks
 
-_SIDE = 4  # places along the edge of a pixel
-_MOST = 1 << 14  # points of a picture to look at: half a minute of two cores
-_COARSE = 64  # points of a picture for each vertex, from which on vertices are too few to be interpolated between
+_SIDE = 4  # number of coverage places along the edge of a pixel
+_MOST = 1 << 14  # largest number of points of a whole picture: half a minute on two cores
+_COARSE = 64  # largest number of points for each vertex at which radiance is interpolated between vertices
 
 
 class ExactPixels(NamedTuple):
-    """Some pixels of the exact picture in direct light.
+    """Reference values of some pixels of a picture in direct light.
 
     Attributes:
-        pixel: Numbers of the pixels, row * width + column.
-        part: Number of the part in its middle.
-        color: Linear radiance under each light.
-        weight: Pixels of the picture that each stands for.
-        error: Relative L2 under each light that the number of points may leave, by halves of them.
+        pixel: Indices of the pixels, row * width + column.
+        part: Index of the part at the center of each pixel.
+        color: Linear radiance of each pixel under each light.
+        weight: Number of pixels of the picture that each one represents.
+        error: Estimated relative L2 error of the values under each light, due to the limited number of points. It is
+            estimated from the difference between two halves of the points.
     """
 
     pixel: Int[np.ndarray, " n"]
@@ -47,7 +48,7 @@ class ExactPixels(NamedTuple):
     error: Float[np.ndarray, " l"]
 
     def relative_l2(self, picture: Float[ArrayLike, "h w c"], *, light: int = 0) -> tuple[float, float]:
-        """Relative L2 error of a picture under one of the lights, and its standard error by the choice of pixels."""
+        """Relative L2 error of a picture under one light, and its standard error due to the random choice of pixels."""
         row = np.reshape(picture, (-1, self.color.shape[-1]))[self.pixel]
         right = self.color[light]
         scale = np.sqrt(self.weight)[:, None]
@@ -60,11 +61,11 @@ class ExactPixels(NamedTuple):
 
 
 class ExactPicture(NamedTuple):
-    """An exact picture in direct light, to look at.
+    """A whole reference picture in direct light.
 
     Attributes:
-        camera: From where: the camera that was asked for, or one of fewer pixels.
-        color: Linear radiance under each light.
+        camera: The requested camera, or the same one with fewer pixels.
+        color: Linear radiance of the picture under each light.
     """
 
     camera: Camera
@@ -83,21 +84,23 @@ def exact_pixels(
     progress: bool = False,
     between: Between = None,
 ) -> ExactPixels:
-    """Pixels of a picture, exact but for the number of points: the yardstick of pictures.
+    """Computes reference values of some pixels of a picture. Their only error is due to the number of points per pixel.
 
-    What a pixel shows is found at 4 x 4 places. Of each surface some of these are shaded, with rays of their own.
+    Coverage is found on a grid of 4 x 4 places in each pixel. For each visible part, some of these are chosen at
+    random, rays are traced from them, and their radiance is the exact sum over all texels.
 
     Args:
         scene: The scene.
-        shadings: What its parts are to systems.
-        environments: Lights of one size.
-        camera: From where.
-        pixels: How many of those that show the scene, by chance; all if None.
-        importance: How likely each of them is one, up to a factor; of each part alike many if None.
-        points: Of each pixel and part that are shaded, by chance. One costs some milliseconds.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        environments: Environments of one size.
+        camera: The camera.
+        pixels: Number of pixels, chosen at random among those that show the scene; all if None.
+        importance: Probability of choosing each pixel, up to a factor. If None, every part gets the same number of
+            pixels.
+        points: Number of points that are shaded for each pixel and part, chosen at random. One takes some milliseconds.
         progress: Whether to show progress bars.
-        between: Called after each stage and after each block of 64 points, by several threads; an exception that it
-            raises gives the work up.
+        between: Function that is called after each stage and after each block of 64 points, by several threads. If it
+            raises an exception, the computation stops.
     """
     mesh, lights = scene.mesh, Environment(jnp.stack([each.radiance for each in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
@@ -146,19 +149,19 @@ def exact_picture(
     progress: bool = False,
     between: Between = None,
 ) -> ExactPicture:
-    """The picture by the exact sum at each of its shading points, with rays of their own.
+    """Computes a whole reference picture: the exact sum over all texels, with rays traced from each shading point.
 
-    Parts that are ideally diffuse have the sum at their vertices, interpolated, as systems' pictures have; unless
-    these are more than points, or fewer than one for each 8 x 8 pixels. Where other parts have more than 16,384
-    points, the picture has half the pixels along its edges, or a third, and so on.
+    Lambertian parts are summed at their vertices and interpolated, as in the pictures of systems. This is not done if
+    they have more vertices than points, or more than 64 points for each vertex. If the other parts have more than
+    16,384 points, the width and height of the picture are divided by 2, 3 or more.
 
     Args:
         scene: The scene.
-        shadings: What its parts are to systems.
-        environments: Lights of one size.
-        camera: From where.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        environments: Environments of one size.
+        camera: The camera.
         progress: Whether to show progress bars.
-        between: As in `exact_pixels`.
+        between: Function that is called between steps of the work, as in `exact_pixels`.
     """
     shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
@@ -202,7 +205,7 @@ def _sum(
     progress: bool,
     **options: Any,
 ) -> np.ndarray:
-    """`reference.radiance` of points or of vertices of some numbers, on all cores."""
+    """`reference.radiance` at points, or at the vertices of some indices, on all cores."""
 
     def some(number: int, own: np.ndarray) -> np.ndarray:
         told, model = progress and number == 0, brdf
@@ -217,13 +220,20 @@ def _sum(
 
     count = len(place)
     parts = np.array_split(np.arange(count), min(blocks.cores(), max(count // 64, 1)))
-    # The threads of numpy's products would wait by spinning.
+    # The threads of NumPy's matrix products would busy-wait.
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
         return np.concatenate(list(pool.map(some, range(len(parts)), parts)), 1)
 
 
 class _Shown(NamedTuple):
-    """What a picture shows: its points, the part of each, -1 in padding, triangles, and the parts' first vertices."""
+    """What a picture shows.
+
+    Attributes:
+        pixels: Its points.
+        owner: Index of the part of each point; -1 in padding.
+        face: Triangles of the mesh of all parts.
+        first: Index of the first vertex of each part.
+    """
 
     pixels: Pixels
     owner: Int[np.ndarray, " p"]
@@ -239,21 +249,21 @@ class _Shown(NamedTuple):
         return cls(pixels, owner, face, np.cumsum([0, *(len(part.mesh.position) for part in scene.parts)])[:-1])
 
     def points(self, index: Int[np.ndarray, " m"], part: int) -> Points:
-        """Some points, all of one part."""
+        """The points of some indices, all of one part."""
         corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
         weight, slope = (np.asarray(each)[index] for each in (self.pixels.barycentric, self.pixels.slope))
         return Points(*map(jnp.asarray, (corner.T, weight.T, np.moveaxis(slope, 0, -1))))
 
 
 def _is_smooth(shading: Shading, shown: _Shown, part: int) -> bool:
-    """Whether the radiance of a part is summed at its vertices: it is ideally diffuse, and they are fine enough."""
+    """Whether to sum the radiance of a part at its vertices: it is Lambertian, and its vertices are dense enough."""
     index = np.flatnonzero(shown.owner == part)
     vertices = len(np.unique(shown.face[np.asarray(shown.pixels.triangle)[index]]))
     return isinstance(shading.brdf, Lambert) and vertices <= len(index) <= _COARSE * vertices
 
 
 def _some(own: np.ndarray, count: int) -> np.ndarray:
-    """At most so many in each row, by chance, and as far apart as their quarters of the pixel let them be."""
+    """Chooses at most `count` places in each row at random, spread over the quarters of the pixel."""
     random = np.random.default_rng(1)
     half = _SIDE // 2
     turn = random.random((len(own), 2, 2, half * half)).argsort(-1).reshape(len(own), 2, 2, half, half)
@@ -264,7 +274,11 @@ def _some(own: np.ndarray, count: int) -> np.ndarray:
 
 
 def _halves(row: Int[np.ndarray, " m"], place: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Cuts the points of each row in two: by diagonals of the pixel, which changes across it do not tell apart."""
+    """Divides the points of each row into two halves, along the diagonals of the pixel.
+
+    Both halves have the same mean place, so that a linear change of radiance across the pixel is not taken for an
+    error.
+    """
     half = _SIDE // 2
     side = (place // _SIDE // half + place % _SIDE // half) % 2
     apart = np.bincount(row, side) * np.bincount(row, 1 - side) > 0
@@ -272,14 +286,14 @@ def _halves(row: Int[np.ndarray, " m"], place: Int[np.ndarray, " m"]) -> Int[np.
 
 
 def _mean(value: Float[np.ndarray, "l m c"], row: np.ndarray, rows: int) -> Float[np.ndarray, "l n c"]:
-    """Means of values that belong to the same row; zero of none."""
+    """Mean of the values of each row; zero for a row without values."""
     total = np.zeros((rows, value.shape[0], value.shape[2]))
     np.add.at(total, row, value.swapaxes(0, 1))
     return total.swapaxes(0, 1) / np.maximum(np.bincount(row, minlength=rows), 1)[:, None]
 
 
 def _squares(fine: np.ndarray) -> np.ndarray:
-    """Values of a picture [h w *c] side by side for each coarse pixel: [pixel, place, *c]."""
+    """Groups the values of a fine picture [h w *c] by coarse pixels: [pixel, place, *c]."""
     rows, columns = fine.shape[0] // _SIDE, fine.shape[1] // _SIDE
     each = fine.reshape(rows, _SIDE, columns, _SIDE, *fine.shape[2:]).swapaxes(1, 2)
     return each.reshape(rows * columns, _SIDE**2, *fine.shape[2:])
@@ -288,7 +302,7 @@ def _squares(fine: np.ndarray) -> np.ndarray:
 def _chosen(
     shown: Int[np.ndarray, " p"], parts: int, count: int | None, importance: ArrayLike | None
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Some of the pixels that show parts, and how many each stands for."""
+    """The chosen pixels among those that show parts, and the number of pixels that each represents."""
     every = np.flatnonzero(shown >= 0)
     if count is None or count >= len(every):
         return every, np.ones(len(every))

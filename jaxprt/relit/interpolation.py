@@ -1,7 +1,7 @@
-"""What interpolating radiance between vertices errs by: where pictures need radiance at pixels.
+"""Estimates the error of interpolating radiance between vertices. Pictures use it to decide where to shade pixels.
 
-Radiance of a glossy surface varies with the direction in which it mirrors the eye. Interpolated over a step of angle d
-it errs by d^2 / 12 of its second derivative, in the root of the mean square over a triangle.
+The radiance of a glossy surface varies with the mirror direction of the eye. If it is interpolated linearly over a
+change of that direction by angle d, the RMS error over a triangle is d^2 / 12 times its second derivative.
 """
 
 from collections.abc import Callable
@@ -21,29 +21,30 @@ from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import HarmonicSystem
 from jaxprt.systems.protocol import System
 
-_DEGREE = 128  # of the harmonics that BRDFs are looked at by
+_DEGREE = 128  # degree of the harmonics that represent BRDFs
 _RINGS, _SECTORS = 96, 64
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
-# Of an isotropic field 3/8 of the squared Laplacian is the square of a second derivative.
+# In an isotropic field the squared second derivative along one direction is 3/8 of the squared Laplacian.
 _ALONG = np.sqrt(3 / 8) / 12
-_WITHIN = 24 * 0.02  # share of the radiance by which a pixel's mean may differ from its middle, times 24
-_RIM = 0.15  # change of the cosine within a pixel, over itself and this
-_MATTE = 0.83  # curvature up to which a surface is about diffuse
-_EDGE_ON = 1e-6  # square pixels
+_WITHIN = 24 * 0.02  # allowed relative difference of a pixel's mean from its center, times 24
+_RIM = 0.15  # allowed change of the cosine within a pixel, relative to the cosine plus this
+_MATTE = 0.83  # curvature up to which a surface counts as diffuse
+_EDGE_ON = 1e-6  # smallest area of a projected triangle in square pixels
 
 
 def curvature(shading: Shading, system: System) -> float:
-    """Root mean square of the Laplacian of a part's radiance over the mirror direction, over that of its radiance.
+    """RMS Laplacian of a part's radiance as a function of the mirror direction, divided by the RMS radiance.
 
-    Under light of natural spectrum, C_l = (l + 1/2)^-2, from a view of 37 degrees, by the zonal harmonics of BRDF times
-    cosine about the mirror direction; as far as the system has harmonics.
+    The light has the natural power spectrum C_l = (l + 1/2)^-2. The view is at 37 degrees from the normal. BRDF times
+    cosine is represented by zonal harmonics about the mirror direction, up to the degree of the system if it is
+    harmonic.
 
     Args:
-        shading: The part; channels count with their mean weights.
-        system: Its system.
+        shading: The `Shading` of the part. Channels are weighted by their mean weights.
+        system: The system of the part.
 
     Returns:
-        In 1 / radian^2.
+        The ratio in 1 / radian^2.
     """
     brdf: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     wo = jnp.asarray(_VIEW)
@@ -55,7 +56,7 @@ def curvature(shading: Shading, system: System) -> float:
     mass = value.mean(-1) * np.asarray(area) * np.maximum(np.asarray(wi)[:, 2], 0)
     cosine = np.clip(np.asarray(wi, np.float64) @ np.asarray(mirror, np.float64), -1, 1)
     degree = np.arange(_DEGREE + 1)
-    # The coefficients of a Legendre series with 1 at one degree evaluate to the polynomial of that degree.
+    # Each column of the Vandermonde matrix is the Legendre polynomial of one degree.
     zonal = mass @ np.polynomial.legendre.legvander(cosine, _DEGREE)
     inner = system.system if isinstance(system, BrightTexels) else system
     if isinstance(inner, HarmonicSystem):
@@ -77,11 +78,11 @@ def error(
     """Relative error of radiance that is interpolated over each triangle, at most 1.
 
     Args:
-        position: Vertices.
-        normal: Their normals.
-        face: Triangles.
+        position: Positions of the vertices.
+        normal: Normals of the vertices.
+        face: Vertex indices of the triangles.
         eye: Position of the viewer.
-        curvature: From `curvature`, of each vertex.
+        curvature: Result of `curvature` for the part of each vertex.
     """
     toward = directions.normalize(eye - position)
     mirror = 2 * jnp.sum(normal * toward, -1, keepdims=True) * normal - toward
@@ -92,15 +93,16 @@ def error(
 
 @jit
 def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Array, " f"]:
-    """Triangles whose radiance varies within a pixel by more than one point of it can stand for.
+    """Triangles whose radiance varies too much within a pixel to be shaded at one point of it.
 
-    The mean over a pixel differs from the middle by 1/24 of the Laplacian, of which the mirror direction has its share;
-    and towards the rim of a surface radiance goes with the cosine of the view, which then must not vary much.
+    The mean over a pixel differs from the value at its center by 1/24 of the Laplacian; the first criterion limits this
+    for the change of the mirror direction. Near the silhouette of a glossy surface, radiance follows the cosine of the
+    view angle; the second criterion limits the change of that cosine.
 
     Args:
         mesh: The triangles.
         camera: The camera.
-        curvature: From `curvature`, of each vertex.
+        curvature: Result of `curvature` for the part of each vertex.
     """
     mesh, camera = jax.lax.stop_gradient((mesh, camera))
     x, y, q = raster.project(mesh.position, camera)
@@ -114,7 +116,7 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
     scale = 1 / jnp.where(jnp.abs(area) > _EDGE_ON, area, _EDGE_ON)
 
     def square(value: Array) -> Array:
-        """Squared change per pixel, to the right and down together."""
+        """Squared change of a value per pixel, summed over the horizontal and the vertical direction."""
         value = value.reshape(len(value), -1)
         one, other = (value[each] - value[a] for each in (b, c))
         right = (one * second[1][:, None] - other * first[1][:, None]) * scale[:, None]
@@ -123,6 +125,6 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
 
     wide = square(mirror) * curvature[a] > _WITHIN
     mean = jnp.maximum((cosine[a] + cosine[b] + cosine[c]) / 3, 0)
-    # What is ideally diffuse does not change with the view.
+    # Diffuse radiance does not depend on the view.
     rim = (square(cosine) > (_RIM * (mean + _RIM)) ** 2) & (curvature[a] > _MATTE)
     return wide | rim

@@ -1,4 +1,4 @@
-"""What is fitted once, and kept in a folder."""
+"""A cache on disk for results of fits."""
 
 import contextlib
 import pathlib
@@ -14,15 +14,15 @@ Made = TypeVar("Made")
 
 
 def kept(path: pathlib.Path | None, key: Any, make: Callable[[], Made]) -> Made:
-    """What a folder has for a key, or else what is made for it now, which the folder then keeps.
+    """Loads a result from a folder if it was stored there for the same key. Otherwise computes and stores it.
 
-    What was kept for another key, by an algorithm that is no longer the same, or is damaged, is made again.
+    A stored result is replaced if its key differs, if the algorithm has changed, or if the files are damaged.
 
     Args:
-        path: The folder; None keeps nothing.
-        key: All that the result depends on: objects of this package, arrays and plain values. Nothing is kept for one
-            that holds others, as functions that no file can name.
-        make: Makes the result, an object of this package.
+        path: The folder; None stores nothing.
+        key: Everything that the result depends on: objects of this package, arrays and plain values. If it holds
+            anything else, such as a function that cannot be found by name, nothing is stored.
+        make: Function () -> the result, an object of this package.
     """
     if path is None:
         return make()
@@ -31,10 +31,10 @@ def kept(path: pathlib.Path | None, key: Any, make: Callable[[], Made]) -> Made:
         if eqx.tree_equal(before, key):
             return found
     except (OSError, ValueError, TypeError):
-        pass  # Nothing, or nothing that can be used.
+        pass  # There is no stored result, or it cannot be read.
     made = make()
     shutil.rmtree(path, ignore_errors=True)
-    # Another process may be quicker, and a key may hold what cannot be kept.
+    # Another process may have stored it meanwhile, or the key may hold objects that cannot be stored.
     with contextlib.suppress(FileExistsError, TypeError):
         objects.save(path, (key, made))
     return made

@@ -1,4 +1,4 @@
-"""Lamps of a scene: parts that emit, and point lights."""
+"""Lamps of a scene: parts that emit light, and point lights."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,19 @@ from jaxprt.systems import bright_texels, lamps, lobe
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
-_LOBES = 12  # of BRDFs whose system has none
+_LOBES = 12  # number of lobes for a BRDF whose system has no table of lobes
 
 
 class SceneLamps(eqx.Module):
-    """What the lamps of a scene are to its parts. Emitting parts come first, then point lights.
+    """The lamps of a scene, and the transport of their light to all parts.
+
+    Lamps are numbered with emitting parts first, then point lights.
 
     Attributes:
-        part: What each part makes of their light.
-        emitting: Numbers of the parts that emit.
-        area: Surface that each vertex of these stands for.
-        point_lights: The point lights, with the intensities that they have if nothing else is said.
+        part: For each part, the transport of the light of all lamps.
+        emitting: Indices of the parts that emit.
+        area: For each part that emits, the surface area that each of its vertices represents.
+        point_lights: The point lights with their default intensities.
     """
 
     part: tuple[LitByLamps, ...]
@@ -40,11 +42,11 @@ class SceneLamps(eqx.Module):
     point_lights: tuple[PointLight, ...]
 
     def radiance(self, appearances: Sequence[Appearance], changed: Mapping[str, PointLight]) -> Float[Array, "n 3"]:
-        """Radiance of each lamp, the mean over its area; intensity of each point light.
+        """Radiance of each lamp: the mean over the area of an emitting part, or the intensity of a point light.
 
         Args:
-            appearances: The materials of all parts at their vertices.
-            changed: Point lights that are not as the scene has them, by their names.
+            appearances: Materials of all parts at their vertices.
+            changed: Point lights with other intensities, by name.
         """
         rows = [
             self._mean(number, own, appearances[number]) for number, own in zip(self.emitting, self.area, strict=True)
@@ -53,7 +55,7 @@ class SceneLamps(eqx.Module):
         return jnp.stack(rows)
 
     def number(self, part: int) -> int | None:
-        """Number of the lamp that a part is; None for none."""
+        """Index of the lamp that a part is; None if the part does not emit."""
         return self.emitting.index(part) if part in self.emitting else None
 
     def view(
@@ -63,16 +65,16 @@ class SceneLamps(eqx.Module):
         points: Sequence[Points] | None,
         traced: Sequence[Float[Array, " _"] | None],
     ) -> tuple[Float[Array, "n _ _"], ...]:
-        """`LitByLamps.view` of each part."""
+        """What depends on the view, for each part: `LitByLamps.view`."""
         rows = zip(self.part, blends, points or [None] * len(self.part), traced, strict=True)
         return tuple(part.view(eye, blend, place, narrow) for part, blend, place, narrow in rows)
 
     def combine(self, radiance: Float[Array, "n 3"], view: Sequence[Float[Array, "n _ _"]]) -> Float[Array, "v 3"]:
-        """Radiance of the vertices or points of all parts in the light of all lamps.
+        """Radiance of the vertices or points of all parts due to all lamps.
 
         Args:
-            radiance: Of each lamp.
-            view: Of each part, from `LitByLamps.view`.
+            radiance: Radiance of each lamp.
+            view: View of each part, from `LitByLamps.view`.
         """
         return jnp.concatenate([part.combine(radiance, own) for part, own in zip(self.part, view, strict=True)])
 
@@ -84,13 +86,13 @@ class SceneLamps(eqx.Module):
 def make(
     scene: Scene, shadings: Sequence[Shading], systems: Sequence[System], targets: Sequence[Target]
 ) -> SceneLamps | None:
-    """Traces what all parts see of the lamps of a scene; None where there are none.
+    """Precomputes the transport from the lamps of a scene to all its parts; None if there are no lamps.
 
     Args:
         scene: The scene.
-        shadings: What its parts are to systems.
-        systems: The systems of the parts, whose tables of lobes are used.
-        targets: What casts shadows, and where it is computed.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        systems: The systems of the parts. If one has a table of lobes, it is used.
+        targets: For each part, what casts shadows, and where and how to compute.
     """
     emitting = [number for number, each in enumerate(shadings) if each.emitted is not None]
     if not emitting and not scene.point_lights:
@@ -108,7 +110,7 @@ def make(
 
 
 def _table(shading: Shading, system: System, target: Target) -> lobe.LobeBrdf:
-    """The BRDF of a part in lobes."""
+    """The BRDF of a part as lobes."""
     own = system.system if isinstance(system, bright_texels.BrightTexels) else system
     if isinstance(own, lobe.LobeSystem):
         return own.brdf
@@ -120,10 +122,10 @@ def _table(shading: Shading, system: System, target: Target) -> lobe.LobeBrdf:
 
 
 def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, PointLight]]:
-    """Materials of parts, and point lights, of a dictionary of both; what is no dictionary is left as it is.
+    """Separates a dictionary of materials into materials of parts and point lights. Other values are kept as they are.
 
     Raises:
-        ValueError: There is no such point light, or it is at another place than that from which it was traced.
+        ValueError: There is no point light of the given name, or it has moved since precomputation.
     """
     if not isinstance(materials, Mapping):
         return materials, {}

@@ -1,4 +1,4 @@
-"""Scenes measured: errors of pictures and of vertices by the exact sum, times and bytes."""
+"""Measures precomputed scenes: errors of pictures and vertices against the sum over all texels, times and bytes."""
 
 import dataclasses
 import math
@@ -23,21 +23,21 @@ from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol, reference
 from jaxprt.systems.protocol import Joined, System
 
-JUDGED = 1350  # points of all parts together whose exact radiance is summed
-FEWEST = 100  # of one part
-_PICTURE = 192  # edge of the pictures that are judged
-_PIXELS = 120  # of each picture
+JUDGED = 1350  # number of points, of all parts together, whose exact radiance is computed
+FEWEST = 100  # smallest number of points of one part
+_PICTURE = 192  # edge of the measured pictures in pixels
+_PIXELS = 120  # number of pixels that are measured in each picture
 
 
 class PartReport(NamedTuple):
-    """How one part of a scene does in direct light.
+    """Errors and size of one part of a scene, in direct light.
 
     Attributes:
-        name: Of the part.
-        vertices: Their number.
-        errors: Relative L2 error of its pixels under each light.
+        name: Name of the part.
+        vertices: Number of its vertices.
+        errors: Relative L2 error of its pixels under each light; NaN if no picture shows it.
         vertex_errors: Relative L2 error of the radiance of its vertices under each light.
-        nbytes: Size of transport and BRDF in bytes.
+        nbytes: Size of its transport and BRDF in bytes.
     """
 
     name: str
@@ -48,12 +48,12 @@ class PartReport(NamedTuple):
 
 
 class Report(NamedTuple):
-    """How a scene that was made ready does; `print` shows it as a table.
+    """Errors, times and size of a precomputed scene; `print` shows it as a table.
 
     Attributes:
         part: One entry for each part of the scene.
         errors: Relative L2 error of the pictures under each light.
-        uncertainty: How much of that the exact pixels themselves may be off by.
+        uncertainty: Estimated relative L2 error of the reference pixels under each light.
         light_seconds: Time of a new light for all vertices on this machine.
         view_seconds: Time of a new view for all vertices on this machine.
         nbytes: Size of all transport and BRDFs in bytes.
@@ -67,7 +67,7 @@ class Report(NamedTuple):
     nbytes: int
 
     def __str__(self) -> str:
-        """One row for each part."""
+        """The table, with one row for each part."""
         rows = [
             f"{each.name}: {each.vertices} vertices, {each.nbytes / 1e6:.2f} MB, pixels off by "
             f"{_percent(each.errors)}, vertices by {_percent(each.vertex_errors)}"
@@ -94,13 +94,13 @@ def measure(
     """Measures a scene against the exact sum: pixels of pictures, and a sample of its vertices from eight views.
 
     Args:
-        picture: Draws the scene in direct light.
-        camera: From where it is looked at; two more stand on other sides of it.
-        direct: The systems of all parts, whose radiance is that of direct light.
-        system: The system whose bytes and times are reported, with bounces if there are any.
+        picture: Function (environment, camera) -> picture of the scene in direct light, [h, w, c].
+        camera: The first camera. Two more cameras are placed on other sides of the scene.
+        direct: The systems of all parts, for direct light.
+        system: The system whose bytes and times are reported; it includes bounces if there are any.
         scene: The scene.
-        shadings: What its parts are to systems.
-        environments: Lights of one size.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        environments: Environments of one size.
     """
     size, mesh = checked(environments, 1.0, 1.0), scene.mesh
     views, blends = views_around(mesh), [each.blend for each in shadings]
@@ -138,7 +138,7 @@ def measure(
 
 
 def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of pictures from three sides [light], of their parts [light, part], and of the yardstick [light]."""
+    """Errors of pictures [light], errors of their parts [light, part], and errors of the reference pixels [light]."""
     around = [orbit(scene.mesh, azimuth=turn, elevation=0.4) for turn in (2.2, 4.4)]
     wrong, right, unsure = (np.zeros((len(environments), len(scene.parts))) for _ in range(3))
     for each in (camera, *around):
@@ -158,12 +158,12 @@ def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarra
 
 
 def lights_of(scene: Scene) -> tuple[Environment, ...]:
-    """The scene's lights, or the two embedded ones."""
+    """The environments of the scene, or the two built-in ones if it has none."""
     return scene.environments or (builtin.daylight(), builtin.studio())
 
 
 def checked(environments: Sequence[Environment], error: float, rate: float) -> int:
-    """The size of the lights' faces, if a plan can be made for them."""
+    """Refuses invalid environments, errors and frame rates; returns the edge of the environments' faces in texels."""
     if not isinstance(environments, Sequence):
         raise TypeError(f"environments must be a list of lights, got one {type(environments).__name__}")
     if not environments:
@@ -182,7 +182,7 @@ def checked(environments: Sequence[Environment], error: float, rate: float) -> i
 
 
 def views_around(mesh: Mesh) -> Float[np.ndarray, "w 3"]:
-    """Eight viewers around the mesh, at two heights."""
+    """Eight positions of a viewer around the mesh, at two heights."""
     low, high = bounds(mesh)
     turn, rise = np.pi / 4 * np.arange(8), np.resize([0.2, 0.7], 8)
     around = np.stack([np.sin(turn) * np.cos(rise), np.sin(rise), np.cos(turn) * np.cos(rise)], -1)
@@ -190,25 +190,25 @@ def views_around(mesh: Mesh) -> Float[np.ndarray, "w 3"]:
 
 
 def _facing(visible, judged: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Which of some vertices face each view."""
+    """Which of some vertices face each view, [view, vertex]."""
     normal, position = np.asarray(visible.frame)[judged, 2], np.asarray(visible.position)[judged]
     return np.einsum("vi,wvi->wv", normal, views[:, None] - position) > 0
 
 
 def relative_error(now: np.ndarray, exact: np.ndarray) -> float:
-    """Relative L2 error; infinite for NaN."""
+    """Relative L2 error; infinite if the value contains NaN."""
     wrong, whole = (float(np.linalg.norm(each)) for each in (now - exact, exact))
     return float(np.nan_to_num(wrong, nan=np.inf)) / (whole if whole > 0 else 1.0)
 
 
 def _exact_brdf(shading: Shading, vertex: np.ndarray) -> Callable:
-    """The BRDF of some vertices."""
+    """The exact BRDF of some vertices."""
     exact = shading.exact
     return PerVertex(exact.of(jnp.asarray(vertex))) if isinstance(exact, PerVertex) else grid.as_argument(exact)
 
 
 def _exact(visible, judged: np.ndarray, brdf: Callable, environments, views: np.ndarray) -> np.ndarray:
-    """Radiance [light, view, vertex, color] of some vertices by all texels."""
+    """Radiance [light, view, vertex, color] of some vertices, summed over all texels."""
     batch = Environment(jnp.stack([light.radiance for light in environments]))
     seen, position, frame = jnp.asarray(visible.seen(judged)), visible.position[judged], visible.frame[judged]
     each = [reference.integrate(seen, position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
@@ -218,6 +218,6 @@ def _exact(visible, judged: np.ndarray, brdf: Callable, environments, views: np.
 
 
 def seconds(function: Callable) -> float:
-    """Median of five calls, compiled before."""
+    """Median time of five calls in seconds, without compilation."""
     jax.block_until_ready(function())
     return statistics.median(timeit.repeat(lambda: jax.block_until_ready(function()), number=1, repeat=5))

@@ -1,8 +1,8 @@
-"""BRDFs on the way of reflected light: with what functions the parts of a scene send light to each other.
+"""BRDFs along light paths: the functions with which the parts of a scene send light to each other.
 
-A part with one BRDF for good sends with that, factored. Other materials of a part have other colors, and another
-roughness where that may change: such a part sends with a few functions that are chosen for all of its range, and
-tables of their weights by roughness.
+A part whose BRDF cannot change sends light with that BRDF, factored. The material of other parts may get other colors,
+and possibly another roughness. Such a part uses a few functions that are fitted to its whole range of roughness, and a
+table of their weights over roughness.
 """
 
 from collections.abc import Callable
@@ -21,22 +21,22 @@ from jaxprt.relit.channels import Shading
 from jaxprt.systems import bounces, harmonic, separable
 from jaxprt.systems.bounces.varying import Sent
 
-_TERMS, _RESOLUTION = 24, 32  # of BRDFs on the way of reflected light
-_FUNCTIONS = 2  # of lobes of any roughness
-_STEP = 1.2  # from one roughness to the next, at most, between which weights of functions are linear
-_WIDTH = 0.09  # of lobes on the way of reflected light, at least: alpha of GGX, or m of Beckmann's distribution
-_SAME = 1e-5  # difference of equal parameters: means over other numbers of vertices are rounded otherwise
-_DARK = 1e-6  # albedo of what reflects nothing
-_VIEWS = 16  # over whose angles albedo is averaged
-_RINGS, _SECTORS = 48, 320  # of the quadrature of each: of roughness .1 and more within a few per cent
+_TERMS, _RESOLUTION = 24, 32  # number of terms, and edge of the maps, of BRDFs along light paths
+_FUNCTIONS = 2  # number of functions that represent lobes of any roughness
+_STEP = 1.2  # largest ratio of neighboring roughnesses between which weights are interpolated linearly
+_WIDTH = 0.09  # smallest width of lobes along light paths: alpha of GGX, or m of Beckmann's distribution
+_SAME = 1e-5  # relative tolerance for equal parameters, which may be means with different rounding
+_DARK = 1e-6  # smaller albedo counts as zero
+_VIEWS = 16  # number of view angles over which albedo is averaged
+_RINGS, _SECTORS = 48, 320  # quadrature of each view: accurate to a few percent for roughness of 0.1 and more
 
 
 class Path(NamedTuple):
-    """What a part sends light with.
+    """The factored BRDF with which a part sends light to others.
 
     Attributes:
-        brdf: Factored; its channels are those of the part's BRDF, or functions.
-        sent: Weights of the functions; None where the channels are those of the part's BRDF.
+        brdf: The factored BRDF. Its channels are those of the part's BRDF, or fitted functions.
+        sent: Weights of the fitted functions over roughness; None if the channels are those of the part's BRDF.
     """
 
     brdf: separable.SeparableBrdf
@@ -44,10 +44,11 @@ class Path(NamedTuple):
 
 
 def factored(shading: Shading) -> Path:
-    """What a part reflects light with on its way to others.
+    """The factored BRDF with which a part sends reflected light to other parts.
 
-    Lobes that are too narrow for the maps are widened: a mirror of roughness .05 would send 235 times the light that it
-    gets. Each channel then has the albedo that it has in truth. What arrives elsewhere is a few harmonics, and wider.
+    Lobes too narrow for the resolution of the maps are widened: otherwise a mirror of roughness 0.05 would send 235
+    times the light it receives. Each channel is scaled to its true albedo. Widening is acceptable because the light
+    that arrives elsewhere is represented by low-order harmonics, which are wider still.
     """
     knot = _finer(shading.knot)
     members = [shading.brdf(jnp.asarray(each)) for each in knot[0]] if knot else [shading.brdf]
@@ -55,7 +56,7 @@ def factored(shading: Shading) -> Path:
     if shading.blend is None or matte is None or matte.all():
         return Path(_alone(still(shading)), None)
     wide = [_lobes(each, ~matte) for each in members]
-    # Lobes that are all widened to the same width are one member of the set.
+    # Lobes that are widened to the same width become one member of the set.
     first = [0] + [n for n in range(1, len(wide)) if not _equal(wide[n - 1], wide[n])]
     lobes = [wide[n] for n in first]
     brdf, weight = bounces.functions.shared(lobes, functions=_FUNCTIONS, terms=_TERMS, resolution=_RESOLUTION)
@@ -71,7 +72,7 @@ def factored(shading: Shading) -> Path:
 
 
 def alike(one: Shading, other: Shading) -> bool:
-    """Whether two parts send light with the same: their BRDFs, and what these are made for, are equal."""
+    """Whether two parts can share one factored BRDF: their BRDFs and their ranges of roughness are equal."""
     pair = one.brdf, other.brdf
     knots = [each.knot for each in (one, other)]
     if (one.blend is None) != (other.blend is None) or len(knots[0]) != len(knots[1]):
@@ -84,7 +85,7 @@ def alike(one: Shading, other: Shading) -> bool:
 
 
 def typical(shading: Shading, path: Path) -> Float[Array, "p c"] | None:
-    """Weights of the channels of what a part sends light with, in the mean over its vertices; None without a blend."""
+    """Mean weights, over the part's vertices, of the channels with which it sends light; None without a blend."""
     if shading.blend is None:
         return None
     if path.sent is None:
@@ -101,14 +102,14 @@ def albedo(shading: Shading) -> Float[np.ndarray, "3"]:
 
 def channels(brdf: Callable) -> Float[np.ndarray, " k"]:
     """Mean albedo of each channel of a BRDF, over views from above."""
-    cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Evenly spread in projected solid angle.
+    cosine = np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS)  # Uniform in projected solid angle.
     wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
     sent = harmonic.table.project(brdf, jnp.asarray(wo), degree=0, rings=_RINGS, sectors=_SECTORS)
     return np.asarray(np.sqrt(4 * np.pi) * np.mean(sent[0], -1))
 
 
 def still(shading: Shading) -> Callable:
-    """The BRDF of a part, at the mean roughness if that varies."""
+    """The BRDF of a part; at the mean roughness if roughness varies."""
     if not shading.knot:
         return shading.brdf
     assert shading.blend is not None
@@ -116,12 +117,12 @@ def still(shading: Shading) -> Callable:
 
 
 def widened(brdf: Callable) -> Callable:
-    """A BRDF whose roughness is enough for maps of light paths; one without a roughness stays as it is."""
+    """The BRDF with enough roughness for the maps of light paths. A BRDF without a roughness is returned unchanged."""
 
     def wider(path: tuple, leaf: Any) -> Any:
         name = getattr(path[-1], "name", None) if path else None
         if name == "roughness":
-            # Cook-Torrance's is the width itself, that of metallic-roughness materials its root.
+            # Cook-Torrance's roughness is the width itself, that of metallic-roughness materials its square root.
             return jnp.maximum(leaf, _WIDTH if isinstance(_owner(brdf, path), CookTorrance) else _WIDTH**0.5)
         return jnp.minimum(leaf, 2 / _WIDTH**2 - 2) if name in ("nu", "nv", "exponent") else leaf
 
@@ -129,14 +130,14 @@ def widened(brdf: Callable) -> Callable:
 
 
 def _owner(tree: Any, path: tuple) -> Any:
-    """What holds a leaf."""
+    """The object that holds a leaf of a pytree."""
     for key in path[:-1]:
         tree = getattr(tree, key.name) if hasattr(key, "name") else tree[key.idx if hasattr(key, "idx") else key.key]
     return tree
 
 
 def _alone(brdf: Callable) -> separable.SeparableBrdf:
-    """One BRDF with its channels."""
+    """The factored BRDF of a part whose BRDF has its own channels."""
     made = separable.factor(widened(brdf), terms=1 if isinstance(brdf, Lambert) else _TERMS, resolution=_RESOLUTION)
     kept = np.atleast_1d(bounces.functions.albedo(made))
     scale = np.where(kept > _DARK, channels(brdf) / np.maximum(kept, _DARK), 1)
@@ -144,7 +145,7 @@ def _alone(brdf: Callable) -> separable.SeparableBrdf:
 
 
 def _finer(knot: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Knots over the same range, as many as weights of functions need."""
+    """Knots over the same range, close enough for linear interpolation of the functions' weights."""
     if not knot:
         return ()
     low, high = knot[0][0], knot[0][-1]
@@ -152,20 +153,20 @@ def _finer(knot: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
 
 
 def _matte(brdf: Callable) -> np.ndarray | None:
-    """Which channels of a BRDF are diffuse; None for one that is not of channels."""
+    """Which channels of a BRDF are diffuse; None if the BRDF has no channels."""
     if not isinstance(brdf, Channels):
         return None
     return np.array([isinstance(each, Lambert | SchlickDiffuse) for each in brdf.model])
 
 
 def _lobes(brdf: Callable, which: np.ndarray) -> Callable:
-    """Some of the channels, wide enough and without their scales."""
+    """The selected channels, widened and without their scales."""
     assert isinstance(brdf, Channels)
     kept = tuple(each for each, own in zip(brdf.model, which, strict=True) if own)
     return widened(Channels(kept, jnp.ones(len(kept), brdf.scale.dtype)))
 
 
 def _equal(one: Callable, other: Callable) -> bool:
-    """Whether two BRDFs of one kind have the same parameters."""
+    """Whether two BRDFs of the same class have equal parameters."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)

@@ -1,4 +1,4 @@
-"""Pictures of scenes: radiance at pixels where it pays, at vertices where it does not, and textures at pixels."""
+"""Pictures of scenes. Radiance is computed at pixels where interpolation between vertices would be too inaccurate."""
 
 from collections.abc import Sequence
 
@@ -22,17 +22,17 @@ from jaxprt.scene import Camera, Environment, Mesh
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.protocol import System
 
-_ERROR = 0.01  # of radiance interpolated between vertices, from where it is made at the pixels
+_ERROR = 0.01  # RMS error of interpolated radiance above which radiance is computed at the pixels
 
 
 class PartPixels(eqx.Module):
-    """The points of one part.
+    """The points of a picture that lie on one part.
 
     Attributes:
-        number: Of the part.
-        at_pixels: Whether radiance is made at the points; else it is made at the vertices and interpolated.
-        index: Numbers of the points among all of the picture, in rows that are shaded at once; -1 in padding.
-        kept: Of each row what `look` makes; None where that is made anew for each light.
+        number: Index of the part.
+        at_pixels: Whether radiance is computed at the points. If not, it is computed at the vertices and interpolated.
+        index: Indices of the points among all points of the picture, in rows that are shaded together; -1 is padding.
+        kept: What `look` returns for each row; None if it is recomputed for each light.
     """
 
     number: int = eqx.field(static=True)
@@ -42,17 +42,17 @@ class PartPixels(eqx.Module):
 
 
 class PictureView(eqx.Module):
-    """All of a picture but its light: what `RelitScene.picture_view` makes of a scene, a camera and materials.
+    """All of a picture that does not depend on the light; `RelitScene.picture_view` makes it.
 
     Attributes:
         mesh: The mesh of all parts.
         system: The system of all parts.
-        camera: From where.
-        surface: The parts.
-        canvas: What is shaded, and where it goes.
-        part: What is shaded, by parts.
-        lamp: Radiance of each lamp; None without.
-        reflected: What sharp parts show of others, by rays, row after row; None without.
+        camera: The camera.
+        surface: One `Surface` for each part.
+        canvas: The points that are shaded, and their pixels.
+        part: The points of each part that the picture shows.
+        lamp: Radiance of each lamp; None without lamps.
+        reflected: Traced reflections of the sharp parts, one entry for each row of points; None without.
     """
 
     mesh: Mesh
@@ -65,11 +65,13 @@ class PictureView(eqx.Module):
     reflected: tracing.Reflections | None = None
 
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
-        """The picture in a light, in linear radiance. `between` is that of `RelitScene.picture`.
+        """Renders the picture under an environment, in linear radiance.
+
+        `between` is a function that is called between steps of the work, as in `RelitScene.picture`.
 
         Raises:
-            TypeError: The light is no Environment.
-            ValueError: The light is a batch, or of another size.
+            TypeError: `environment` is not an `Environment`.
+            ValueError: The environment is a batch, or has another size than the systems require.
         """
         require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
         if environment.radiance.ndim != 4:
@@ -126,17 +128,17 @@ def make(
     keep: bool,
     between: Between,
 ) -> PictureView:
-    """The view of a scene at the pixels of a camera.
+    """Finds the shaded points of a picture, and computes what depends on the camera and the materials.
 
     Args:
-        mesh: The mesh of all parts; its regions are their numbers.
+        mesh: The mesh of all parts; its regions are the indices of the parts.
         system: The system of all parts.
-        surfaces: The parts.
-        camera: From where.
-        lamp: Radiance of each lamp; None without.
-        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
-        keep: Whether what systems make of the view is kept for other lights: about a kilobyte for each point.
-        between: As in `RelitScene.picture`.
+        surfaces: One `Surface` for each part.
+        camera: The camera.
+        lamp: Radiance of each lamp; None without lamps.
+        samples: Number of coverage samples of each pixel: 4 or 1.
+        keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
+        between: Function that is called between steps of the work, as in `RelitScene.picture`.
     """
     if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):
         pixels, rows = _placed(mesh, surfaces, camera, samples, between)
@@ -162,7 +164,7 @@ def make(
 def _placed(
     mesh: Mesh, surfaces: Sequence[Surface], camera: Camera, samples: int, between: Between
 ) -> tuple[Pixels, list[tuple[int, bool, Array]]]:
-    """The points of a picture; and of each part that it shows whether radiance is made at them, and their numbers."""
+    """The points of a picture. For each visible part: its index, whether to shade at its points, and their indices."""
     bend = _bends([each.curvature for each in surfaces], mesh.region)
     fragments = finished(rasterize(mesh, camera, samples=samples), between)
     pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
@@ -178,7 +180,7 @@ def _placed(
 
 @jit
 def _bends(curvature: Sequence[Array], region: Int[Array, " v"]) -> Float[Array, " v"]:
-    """Curvature of the BRDF of each vertex."""
+    """Curvature of the radiance of each vertex's part."""
     return jnp.stack(curvature)[region]
 
 
@@ -186,16 +188,17 @@ def _bends(curvature: Sequence[Array], region: Int[Array, " v"]) -> Float[Array,
 def _judged(
     mesh: Mesh, bend: Float[Array, " v"], pixels: Pixels, camera: Camera
 ) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
-    """The part of each point, -1 in padding, and the error that interpolating radiance makes there."""
+    """The part of each point (-1 in padding), and the relative error of radiance that is interpolated there."""
     wrong = interpolation.error(mesh.position, mesh.normal, mesh.face, camera.eye, bend)
     own = jnp.maximum(pixels.triangle, 0)
     return jnp.where(pixels.triangle >= 0, mesh.region[mesh.face[:, 0]][own], -1), wrong[own]
 
 
 def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
-    """Whether the radiance of a part is made at its points: it is too far off interpolated, or vertices are more.
+    """Whether to compute radiance at the points of a part.
 
-    The radiance of what is ideally diffuse is linear in the transfer of the vertices.
+    It is done if interpolation between vertices is too inaccurate, or if the part has more vertices than points. Not
+    for Lambertian parts, because their radiance is linear in the interpolated transfer.
     """
     if isinstance(surface.shading.brdf, Lambert):
         return False

@@ -1,7 +1,7 @@
-"""An error in, a plan out: for each part of a scene the system and the sizes that meet an error with the fewest bytes.
+"""Chooses the system and its parameters for each part of a scene, with the fewest bytes that meet a given error.
 
-Recipes of all systems are carried out for a sample of each part's vertices and judged by the exact sum, from eight
-views, under every light. Bytes and times are those of the sample, scaled to the part.
+Candidate recipes are run on a sample of each part's vertices. Their error is measured against the exact sum over all
+texels, from eight views, under every light. Bytes and times of the sample are scaled to the whole part.
 """
 
 import math
@@ -27,11 +27,11 @@ from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
 from jaxprt.scene import Environment, Scene
 from jaxprt.visibility import blocks
 
-MARGIN = 1.25  # plans are made for an error smaller by this factor: lights and views that they did not see differ
-_SAVING = 0.1  # of the bytes: what is worth measuring another candidate for
-_SLOW = 2.0  # times the bytes of what is too slow may be measured for what is faster
+MARGIN = 1.25  # safety factor on the error, for lights and views that were not measured
+_SAVING = 0.1  # smallest saving, as a fraction of the bytes, for which another system is measured
+_SLOW = 2.0  # a faster candidate may have this many times the bytes of one that is too slow
 
-# Steps up in size, the cheapest first. Terms, resolution, components, modes, coefficients and texels are in balance.
+# Ladders of increasing size. The parameters of each step of _SIZES contribute errors of similar size.
 _DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
 _HARMONIC = tuple(Harmonics(degree=degree) for degree in (2, 3, 4))
 _LOBES = tuple(Lobes(*each) for each in ((2, 4), (4, 8), (8, 16), (12, 16), (16, 32), (24, 64)))
@@ -55,11 +55,11 @@ class PartPlan(eqx.Module):
 
     Attributes:
         name: Name of the part.
-        vertices: Number of its vertices.
-        chosen: What was chosen.
-        considered: All that was measured, in this order.
-        mesh_error: Relative L2 error that the mesh adds under the worst of the lights, whatever the system: shadows
-            finer than its triangles.
+        vertices: Number of vertices of the part.
+        mesh_error: Relative L2 error that the mesh adds in any system, under the worst of the lights. It comes from
+            shadows that are finer than the triangles.
+        chosen: The chosen candidate.
+        considered: All candidates, in the order in which they were measured.
     """
 
     name: str
@@ -70,17 +70,17 @@ class PartPlan(eqx.Module):
 
 
 class Plan(eqx.Module):
-    """The plan of a scene; `print` shows its decisions as a table.
+    """The plan of a scene; `print` shows it as a table.
 
     Attributes:
         part: One plan for each part of the scene.
-        reflected: Fraction of each part's radiance that other surfaces reflected at least once (row 0), twice (row 1)
-            and three times (row 2): relative L2, estimated for matte surfaces.
-        bounces: As many as leave no more than the error of any part's light out: 0, 1, 2 or "all".
-        asked: The error that was asked for.
-        rate: Frames per second that were asked for.
+        reflected: Fraction of each part's radiance (column) that was reflected by other surfaces at least once (row 0),
+            twice (row 1) and three times (row 2). Relative L2, estimated for diffuse surfaces.
+        bounces: Smallest number of bounces that omits at most `asked` of the radiance of every part: 0, 1, 2 or "all".
+        asked: The requested error.
+        rate: The requested number of frames per second.
         size: Edge of the lights' cubemap faces in texels.
-        key: Fingerprint of the scene and the lights, by which the plan of others is refused.
+        key: Fingerprint of the scene and the lights. A stored plan with another fingerprint is refused.
     """
 
     part: tuple[PartPlan, ...]
@@ -93,17 +93,17 @@ class Plan(eqx.Module):
 
     @property
     def error(self) -> float:
-        """Predicted relative L2 error of the part that is farthest off."""
+        """Predicted relative L2 error of the part with the largest error."""
         return max(each.chosen.error for each in self.part)
 
     @property
     def seconds(self) -> float:
-        """Time of a frame with new light and new view on this machine, without drawing."""
+        """Time of a frame with a new light and a new view on this machine, without rasterization."""
         return sum(each.chosen.seconds for each in self.part)
 
     @property
     def nbytes(self) -> int:
-        """Size of transport and BRDFs in bytes, without those of bounces."""
+        """Size of transport and BRDFs in bytes, without the data of bounces."""
         return sum(each.chosen.nbytes for each in self.part)
 
     @property
@@ -112,11 +112,11 @@ class Plan(eqx.Module):
         return {each.name: each.chosen.recipe for each in self.part}
 
     def __str__(self) -> str:
-        """The table of what was considered; a star marks what was chosen."""
+        """The table of all candidates; a star marks the chosen one."""
         rows = [f"error asked {100 * self.asked:g} %, {self.rate:g} frames per second"]
         for part in self.part:
             rows.append(f"{part.name}: {part.vertices} vertices")
-            chosen = repr(part.chosen.recipe)  # A plan that was saved has a copy of it among those considered.
+            chosen = repr(part.chosen.recipe)  # In a plan loaded from a file, `chosen` is a copy: compare by value.
             rows += [f"  {'*' if repr(each.recipe) == chosen else ' '} {each}" for each in part.considered]
             advice = "; `jaxprt.refine` divides its triangles" if part.mesh_error > self.asked else ""
             rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
@@ -140,32 +140,33 @@ def plan(
     path: str | os.PathLike | None = None,
     progress: bool = True,
 ) -> Plan:
-    """Chooses for each part of a scene the system that meets an error at a rate with the fewest bytes.
+    """Chooses a system for each part of a scene: the one with the fewest bytes that meets an error and a frame rate.
 
-    The plan takes the cheapest sizes of each system whose error is below `error` / 1.25. Under lights and from views
-    that it did not see, the error is then below `error` if they are of the same kind: a plan made under an overcast sky
-    promises nothing for a sun. If no system reaches the rate, the fastest one is taken, and the table says so.
+    A candidate must have an error below `error` / 1.25 under the given lights. The margin is for lights and views that
+    were not measured. It holds for lights of the same kind: a plan made for an overcast sky says nothing about a sun.
+    If no system reaches the frame rate, the fastest is chosen, and the table says so.
 
-    Errors, times and bytes are those of direct light. Light that the parts reflect onto each other is left out if it is
-    less than `error` of every part's; else the plan asks for as many bounces as leave no more out, and for all if two
-    leave out more.
+    Errors, times and bytes are those of direct light. The plan also chooses the number of bounces: the smallest number
+    that omits at most `error` of the radiance of every part, or "all" if two bounces omit more.
 
     Args:
         scene: The scene.
-        environments: Lights that the error must hold for, of one size; the scene's own, or else the two embedded ones.
-        error: Relative L2 error of the radiance of each part, between its vertices too, as pictures show it, but for
-            shadows that are finer than the triangles: `PartPlan.mesh_error`.
-        rate: Frames per second with new light and new view, for the scene as a whole, without drawing.
-        path: Folder that keeps what was measured; a call that was stopped, or killed, goes on from there.
+        environments: Environments under which the error must hold, all of one size. If None, those of the scene, or the
+            two built-in ones if it has none.
+        error: Largest relative L2 error of the radiance of each part, at the vertices and between them. It does not
+            include shadows that are finer than the triangles; see `PartPlan.mesh_error`.
+        rate: Frames per second for the whole scene, each with a new light and a new view, without rasterization.
+        path: Folder in which measurements are stored. A call that was interrupted resumes from there.
         progress: Whether to show a progress bar.
 
     Returns:
         The plan, for `jaxprt.precompute(scene, system=plan.recipes, bounces=plan.bounces)`.
 
     Raises:
-        TypeError: No scene.
-        ValueError: No lights, lights of different sizes, NaN or infinity in them or from a BRDF, an error or a rate
-            that is not positive and finite, or an error that no system reaches for some part; the message has the best.
+        TypeError: `scene` is not a `Scene`, or `environments` is not a list of `Environment`.
+        ValueError: There are no lights, or lights of different sizes; a light or the result of a BRDF is not finite;
+            `error` or `rate` is not positive and finite; or no system meets the error for some part. The message then
+            gives the smallest error that can be met.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     environments = lights_of(scene) if environments is None else environments
@@ -197,39 +198,40 @@ def plan(
 
 
 def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
-    """Fingerprint of a scene and its lights: meshes, classes and parameters of materials, textures, radiance.
+    """Fingerprint of a scene and its lights: meshes, classes and parameters of materials, textures, and radiance.
 
-    A function counts by its qualified name alone, which another process finds again.
+    A function is identified by its qualified name only, which is the same in another process.
     """
     leaves, structure = jax.tree.flatten((scene, tuple(environments)))
     arrays = [each for each in leaves if not callable(each)]
     functions = [getattr(each, "__qualname__", type(each).__qualname__) for each in leaves if callable(each)]
-    kinds = re.sub(r" at 0x[0-9a-f]+", "", f"{structure} {functions}")  # without addresses of static functions
+    kinds = re.sub(r" at 0x[0-9a-f]+", "", f"{structure} {functions}")  # without the addresses of static functions
     return blocks.fingerprint(np.frombuffer(kinds.encode(), np.uint8), *arrays)
 
 
 def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):
-    """Candidates of each system: by bisection, those around the first step of its ladder that meets the error.
+    """Measures candidates of each system: a bisection along its ladder, to the first step that meets the error.
 
-    Left out are steps that must have more bytes than what meets the error already, twice as many if that is too slow;
-    those that are too near to one that misses the error by far; and smaller ones that could not save a tenth.
+    Some steps are skipped: those with more bytes than a candidate that already meets the error (twice as many if that
+    candidate is too slow); those close to a step that misses the error by far; and those of a system whose smallest
+    step would save less than a tenth of the bytes.
     """
     if isinstance(sample.shading.brdf, Lambert):
         ladders: list[tuple] = [_DIFFUSE]
     else:
         ladders = [_HARMONIC, _LOBES] + ([] if sample.shading.knot else [_TERMS])
-    most = math.inf  # bytes of what is worth measuring
+    most = math.inf  # largest number of bytes that is worth measuring
     for ladder in ladders:
         least = [sample.least_bytes(recipe) for recipe in ladder]
         low, high = 0, sum(each <= most for each in least)
-        while low < high:  # Errors fall along a ladder, at most by half from step to step.
+        while low < high:  # Assumption: from one step to the next, the error decreases by at most half.
             middle = (low + high) // 2
             each = _measured(sample, ladder[middle], folder)
             yield each
             if each.error * MARGIN > error:
                 halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
                 low = middle + max(1, int(halvings))
-                if most == math.inf:  # Nothing meets the error yet: the best must be known.
+                if most == math.inf:  # No candidate meets the error yet: measure the last step too, for the message.
                     low = min(low, max(middle + 1, len(ladder) - 1))
                 continue
             high, fast = middle, each.seconds <= seconds
@@ -239,7 +241,7 @@ def _considered(sample: Sample, folder: pathlib.Path | None, error: float, secon
 
 
 def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Candidate:
-    """What a recipe brings and costs, kept in a folder."""
+    """Measures a candidate, or loads its measurement from a folder."""
     if folder is None:
         return sample.measure(recipe)
     path = folder / re.sub(r"\W+", "_", str(recipe))

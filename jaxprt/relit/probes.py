@@ -1,4 +1,4 @@
-"""Light that arrives at points in a scene, sampled into environments: an object moves through a room lit by these."""
+"""Light probes: samples the light that arrives at points of a scene into environments, for objects that move in it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,21 +21,22 @@ def sample(
     materials: Mapping[str, Any] | None = None,
     size: int = 32,
 ) -> list[Environment]:
-    """What is seen from points in a scene, in all directions: six pictures for each point.
+    """Renders what is seen from points of a scene in all directions, as one environment for each point.
 
-    Each is an environment for objects around its point. `jaxprt.harmonic.project` makes coefficients of it, and
-    `jaxprt.harmonic.probe_light` interpolates these between the points.
+    Each environment consists of six pictures and lights objects near its point. `jaxprt.harmonic.project` makes SH
+    coefficients of it, and `jaxprt.harmonic.probe_light` interpolates these between the points.
 
     Args:
-        scene: The scene, without the object that is to be lit.
+        scene: The precomputed scene, without the object that is to be lit.
         environment: The light around the scene.
-        positions: The points, [p, 3], in world units.
-        materials: Other materials of some parts, as in `RelitScene.picture`.
-        size: Edge of the environments' faces in texels.
+        positions: Positions of the points in world units, [p, 3].
+        materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
+        size: Edge of the environments' cubemap faces in texels.
 
     Raises:
-        TypeError: No relit scene.
-        ValueError: Points that are not [p, 3] or not finite, a size below 1, or as in `RelitScene.picture`.
+        TypeError: `scene` is not a `RelitScene`.
+        ValueError: `positions` is not [p, 3] or not finite, `size` is below 1, or for the reasons that
+            `RelitScene.picture` gives.
 
     Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting).
     """
@@ -50,11 +51,11 @@ def sample(
 
 
 def _faces(scene: RelitScene, environment: Environment, place: np.ndarray, materials: Any, size: int) -> Sequence:
-    """The faces of a cubemap around a point."""
+    """Renders the six cubemap faces around a point."""
     faces = []
     for right, down, forward in cubemap.axes():
         camera = Camera(place, place + forward, -down, np.pi / 2, size, size)
         face = scene.picture(environment, camera, materials=materials)
-        # Seen from inside, the columns of a face run as the camera's do, or against them.
+        # Seen from inside, the columns of some faces run in the opposite direction to the camera's.
         faces.append(face if np.dot(np.cross(forward, -down), right) > 0 else face[:, ::-1])
     return faces

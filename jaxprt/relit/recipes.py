@@ -1,4 +1,4 @@
-"""How to make a part of a scene ready for a system: the sizes, and the calls that they take."""
+"""Recipes: a system and its parameters, and the calls that precompute the system for one part of a scene."""
 
 import dataclasses
 import functools
@@ -23,31 +23,31 @@ from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import StoredVisibility
 
-_HARMONIC_SIZE = 32  # texels along an edge of the visibility: as many as low degrees need
-_STEPS = 4  # of harmonics for one of lobes, from knot to knot
-_VARYING = 0.02  # error of tables of harmonics of which roughness varies
-_DIFFUSE = 32  # times as many single texels for what is ideally diffuse
+_HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low degrees
+_STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
+_VARYING = 0.02  # error of harmonic tables over roughness
+_DIFFUSE = 32  # factor on the number of single texels of Lambertian parts
 
 
 class Known:
-    """What several recipes for one part share, made when one of them needs it first.
+    """Intermediate results that several recipes for one part share. Each is computed when it is first needed.
 
     Attributes:
-        visible: What the vertices see.
+        visible: Visibility of the vertices.
     """
 
     def __init__(self, visible: StoredVisibility):
-        """Keeps the visibility."""
+        """Stores the visibility."""
         self.visible = visible
         self._factored: dict[int, SeparableBrdf] = {}
 
     @functools.cached_property
     def pyramid(self) -> LobeTransport:
-        """The pyramids of the visibility."""
+        """The visibility pyramids of the vertices."""
         return lobe.compress(self.visible)
 
     def factored(self, brdf: Callable, terms: int, resolution: int) -> SeparableBrdf:
-        """The part's BRDF in terms: the first of those that were made already, if these are enough."""
+        """The BRDF of the part, factored into terms. An earlier factorization is truncated if it has enough terms."""
         made = self._factored.get(resolution)
         if made is None or made.terms < terms:
             made = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
@@ -56,15 +56,16 @@ class Known:
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """What a part is made ready for, and where that is done.
+    """What a recipe needs besides the part itself: occluders, vertices, and where and how to compute.
 
     Attributes:
-        occluder: What casts shadows: all parts.
+        occluder: Mesh that casts shadows: all parts of the scene.
         size: Edge of the light's cubemap faces in texels.
-        vertex: Numbers of the vertices to light; all if None.
-        known: What is known already. `Lobes` and `Clusters` then trace no rays; others do.
-        path: What the names of folders begin with; None keeps nothing.
-        executor: Where blocks are computed; this machine's cores if None.
+        vertex: Indices of the vertices to precompute; all if None.
+        known: Intermediate results that exist already. `Lobes` and `Clusters` then trace no rays; other recipes ignore
+            it.
+        path: Prefix of the names of the folders that store results; None stores nothing.
+        executor: Executor that computes the blocks of work; all cores of this machine if None.
         progress: Whether to show progress bars.
     """
 
@@ -77,38 +78,38 @@ class Target:
     progress: bool = True
 
     def options(self, name: str) -> dict:
-        """Options of every `precompute`, for a folder of a name."""
+        """Keyword arguments that every `precompute` takes, with a folder of the given name."""
         path = None if self.path is None else pathlib.Path(f"{self.path}_{name}.prt")
         return {"path": path, "executor": self.executor, "progress": self.progress}
 
     def traced(self) -> dict:
-        """Options of those that trace rays."""
+        """Additional keyword arguments of the `precompute` functions that trace rays."""
         return {"occluder": self.occluder, "vertex": self.vertex}
 
 
 @runtime_checkable
 class Recipe(Protocol):
-    """Sizes for one system, and how a part is made ready with them."""
+    """The parameters of a system, and the method that precomputes it for a part."""
 
     def make(self, shading: Shading, target: Target) -> System:
-        """The system of a part."""
+        """Precomputes the system of a part."""
         ...
 
 
 class Lobes(eqx.Module):
-    """The lobe system, with the brightest texels summed exactly.
+    """Recipe of the lobe system. The brightest texels of the light are summed exactly.
 
     Attributes:
-        lobes: Lobes of the BRDF.
-        texels: Brightest texels that are summed one by one; 0 for none. What is ideally diffuse, for which a texel
-            costs a thirtieth, has 32 times as many: shadows of all lamps.
+        lobes: Number of lobes of the BRDF.
+        texels: Number of brightest texels that are summed one by one; 0 for none. A Lambertian part uses 32 times as
+            many, because a texel costs it only about 1/30 as much; every bright light source then has a sharp shadow.
     """
 
     lobes: int = 12
     texels: int = 16
 
     def make(self, shading: Shading, target: Target) -> System:
-        """The system of a part."""
+        """Precomputes the system of a part."""
         if target.known is None:
             transport = lobe.precompute(shading.mesh, size=target.size, **target.traced(), **target.options("lobe"))
         else:
@@ -122,27 +123,28 @@ class Lobes(eqx.Module):
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Bytes of the pyramids, or of bits and vectors."""
+        """Smallest number of bytes: the visibility pyramids, or bits and transfer vectors for a Lambertian part."""
         if isinstance(shading.brdf, Lambert):
             return vertices * (6 * size**2 // 8 + 4 * (lobe.pyramid.DEGREE + 1) ** 2)
         return vertices * lobe.pyramid.scales(size).total
 
 
 class Harmonics(eqx.Module):
-    """The harmonic system: transfer vectors for what is ideally diffuse, matrices for all else.
+    """Recipe of the harmonic system: transfer vectors for Lambertian parts, transfer matrices for all others.
 
-    The name "harmonic" stands for `laplacian=0.4`. Visibility is traced at 6 x 32 x 32 texels at most.
+    The system named "harmonic" is `Harmonics(laplacian=0.4)`. Visibility is traced at no more than 6 x 32 x 32 texels.
 
     Attributes:
-        degree: Highest degree of the harmonics.
-        laplacian: Share of the light's squared Laplacian that is kept for what is not diffuse; 1 for no window.
+        degree: Highest degree of the spherical harmonics.
+        laplacian: Fraction of the light's squared Laplacian that windowing keeps, to reduce ringing. 1 means no window.
+            Not used for Lambertian parts.
     """
 
     degree: int = 4
     laplacian: float = 1.0
 
     def make(self, shading: Shading, target: Target) -> System:
-        """The system of a part."""
+        """Precomputes the system of a part."""
         options = {"degree": self.degree, "size": min(target.size, _HARMONIC_SIZE), **target.traced()}
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.precompute_diffuse(shading.mesh, **options, **target.options(f"vectors_{self.degree}"))
@@ -152,18 +154,18 @@ class Harmonics(eqx.Module):
         return harmonic.HarmonicSystem(matrices, table, self.laplacian)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Bytes of the vectors or matrices."""
+        """Number of bytes of the transfer vectors or matrices."""
         terms = (self.degree + 1) ** 2
         return 4 * vertices * (terms if isinstance(shading.brdf, Lambert) else terms**2)
 
 
 class Terms(eqx.Module):
-    """The separable system with sparse transport.
+    """Recipe of the separable system with sparse wavelet transport.
 
     Attributes:
-        terms: BRDF terms; what is ideally diffuse has one.
-        keep: Wavelet coefficients of each vertex and term.
-        resolution: Edge of the terms' maps in texels.
+        terms: Number of BRDF terms; a Lambertian part has one.
+        keep: Number of wavelet coefficients of each vertex and term.
+        resolution: Edge of the maps of the terms in texels.
     """
 
     terms: int = 4
@@ -171,7 +173,7 @@ class Terms(eqx.Module):
     resolution: int = 48
 
     def make(self, shading: Shading, target: Target) -> System:
-        """The system of a part."""
+        """Precomputes the system of a part."""
         check(self, shading)
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
@@ -181,16 +183,16 @@ class Terms(eqx.Module):
 
 
 class Clusters(eqx.Module):
-    """The separable system compressed over clusters of vertices, with the brightest texels summed exactly.
+    """Recipe of the separable system, compressed over clusters of vertices. The brightest texels are summed exactly.
 
     Attributes:
-        terms: BRDF terms.
-        resolution: Edge of their maps in texels.
-        components: Principal components along the vertices of a cluster.
-        modes: Principal components along the light.
-        keep: Wavelet coefficients of each cluster.
-        texels: Brightest texels that are summed one by one.
-        members: Vertices of a cluster, about.
+        terms: Number of BRDF terms.
+        resolution: Edge of the maps of the terms in texels.
+        components: Number of principal components over the vertices of a cluster.
+        modes: Number of principal components over the light.
+        keep: Number of wavelet coefficients of each cluster.
+        texels: Number of brightest texels that are summed one by one.
+        members: Approximate number of vertices of a cluster.
     """
 
     terms: int = 32
@@ -202,7 +204,7 @@ class Clusters(eqx.Module):
     members: int = 225
 
     def make(self, shading: Shading, target: Target) -> System:
-        """The system of a part."""
+        """Precomputes the system of a part."""
         check(self, shading)
         known = target.known
         if known is None:
@@ -217,7 +219,7 @@ class Clusters(eqx.Module):
         return _bright(system, lobe.bits(known.pyramid), shading, self.texels, visible.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Bytes of the visibility of single texels, weights, cores, modes, and gray maps."""
+        """Number of bytes of the texels' visibility, the weights, cores and modes, and the maps of a gray BRDF."""
         clusters, terms, sizes = self._sizes(shading, vertices, size)
         components, modes, keep = sizes.values()
         bits = 6 * size**2 // 8 if self.texels else 0
@@ -225,7 +227,7 @@ class Clusters(eqx.Module):
         return vertices * (bits + 4 * components) + 2 * clusters * modes * (keep + components * terms) + maps
 
     def _sizes(self, shading: Shading, vertices: int, size: int) -> tuple[int, int, dict[str, int]]:
-        """Clusters, terms, and options of the compression, as far as vertices and texels allow them."""
+        """Number of clusters, number of terms, and options of the compression, limited by the vertices and texels."""
         clusters = max(1, round(vertices / self.members))
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         components, keep = min(self.components, vertices // clusters), min(self.keep, 6 * size**2)
@@ -241,7 +243,7 @@ SYSTEMS: dict[str, Recipe] = {
 
 
 def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:
-    """A system with single texels, if any are asked for."""
+    """The system with an exact sum over the brightest texels, if there are any."""
     texels = min(texels, 6 * size * size - 1)
     if not texels:
         return system
@@ -251,29 +253,29 @@ def _bright(system: System, visible, shading: Shading, texels: int, size: int) -
 
 
 def lobe_table(shading: Shading, lobes: int, path: pathlib.Path | None) -> lobe.LobeBrdf:
-    """The BRDF of a part in lobes, over its roughness if that varies; kept in a folder if one is given."""
+    """The BRDF of a part as a table of lobes, over roughness if that varies; stored in a folder if one is given."""
     key = shading.brdf, shading.knot, lobes
     return kept(path, key, lambda: lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot))
 
 
 def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:
-    """The BRDF of a part in harmonics, over its roughness if that varies."""
+    """The BRDF of a part as a table of harmonics, over roughness if that varies."""
     if not shading.knot:
         return harmonic.tabulate(shading.brdf, degree=degree)
-    # Lobes between knots move and widen; harmonics are interpolated linearly, and need more knots.
+    # Lobes are moved and widened between knots. Harmonics are interpolated linearly, so they need more knots.
     return harmonic.tabulate(shading.brdf, degree=degree, knot=tuple(map(_finer, shading.knot)), error=_VARYING)
 
 
 def _finer(knot: np.ndarray) -> np.ndarray:
-    """Evenly spaced knots, with as many steps in place of one as harmonics need."""
+    """Evenly spaced knots over the same range, with `_STEPS` intervals in place of one."""
     return np.linspace(knot[0], knot[-1], _STEPS * (len(knot) - 1) + 1)
 
 
 def check(recipe: Recipe, shading: Shading) -> None:
-    """Refuses a part that a recipe cannot make.
+    """Refuses a part that a recipe does not support.
 
     Raises:
-        ValueError: The roughness of the part varies, and the recipe factors one BRDF.
+        ValueError: The roughness of the part varies, but the recipe factors a single BRDF.
     """
     if shading.knot and isinstance(recipe, Terms | Clusters):
         low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])

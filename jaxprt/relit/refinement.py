@@ -1,4 +1,4 @@
-"""Scenes whose meshes are as fine as their shadows."""
+"""Refines the meshes of a scene where shadows are finer than the vertices."""
 
 from collections.abc import Sequence
 
@@ -15,29 +15,31 @@ def refine(
     environments: Sequence[Environment] | None = None,
     progress: bool = True,
 ) -> Scene:
-    """Divides the triangles of a scene where its shadows are finer than its vertices, before `jaxprt.precompute`.
+    """Subdivides triangles where shadows vary between vertices. Call it before `jaxprt.precompute`.
 
-    All parts cast shadows on each other, and are divided alike where they share a border. See `visibility.refine` for
-    what the error means.
+    All parts cast shadows on each other. Parts that share a border are subdivided alike along it. `visibility.refine`
+    defines the error.
 
     Args:
-        scene: The scene, from `jaxprt.load_scene` or made of `jaxprt.Part`.
-        error: Relative L2 error that interpolation between vertices may leave in the radiance of the surface of the
-            whole scene, were it white and diffuse. 0 divides until there are as many vertices as allowed.
-        vertices: How many the scene may have afterwards. Where that is too few for the error, the largest errors are
-            taken away first, with a warning. A scene that has more stays as it is.
-        environments: Lights for which the error must hold. If None, light of natural spectrum from any direction; the
-            shadows of a sun need the light that it is in.
+        scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
+        error: Largest relative L2 error that linear interpolation between vertices may cause in the radiance of the
+            whole scene's surface, as if it were white and diffuse. 0 subdivides until the number of vertices is
+            reached.
+        vertices: Largest number of vertices after refinement. If this is too few for the error, the triangles with the
+            largest errors are subdivided first, and a warning is given. A scene that already has more is returned
+            unchanged.
+        environments: Environments under which the error must hold. If None, light with the power spectrum of natural
+            scenes, from any direction. Sharp shadows of a sun require the environment that contains it.
         progress: Whether to show a progress bar.
 
     Returns:
         The scene with the same surfaces, images and materials, and more vertices.
 
     Raises:
-        TypeError: There is no scene, the environments are no list of lights, or the material of a part has one BRDF for
-            each vertex.
-        ValueError: The error is negative or not finite, vertices are fewer than 1, there are no environments or one is
-            a batch, or rays cannot be traced as for `visibility.Occluder`.
+        TypeError: `scene` is not a `Scene`, `environments` is not a list of `Environment`, or a part has a material
+            with one BRDF for each vertex.
+        ValueError: `error` is negative or not finite; `vertices` is below 1; `environments` is empty or contains a
+            batch; or rays cannot be traced, for the reasons that `visibility.Occluder` gives.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     mesh = scene.mesh

@@ -1,4 +1,4 @@
-"""Light that the parts of a scene reflect onto each other: what it is worth, and how it is precomputed."""
+"""Light that the parts of a scene reflect onto each other: estimates of its size, and its precomputation."""
 
 import pathlib
 from collections.abc import Callable, Sequence
@@ -28,19 +28,19 @@ from jaxprt.systems.protocol import System
 T = TypeVar("T")
 
 ALL = bounces.build.ALL
-_EACH = 3  # bounces that are estimated one by one; those that follow fall as these do
-_EDGE = 8  # of the faces of light that is reflected, at most
-_DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # where bounces are judged: harmonics, and edges of the faces of rays
-_SLOWEST = 0.95  # share of a bounce that the next one has, at most
-_LOBES = 8  # of parts whose systems have none, for the rays of sharp ones
+_EACH = 3  # number of bounces that are estimated one by one; further ones are extrapolated as a geometric series
+_EDGE = 8  # largest edge of the faces of light that is reflected
+_DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # of the estimate: degree of harmonics, and edges of the faces of rays
+_SLOWEST = 0.95  # largest ratio of a bounce to the previous one
+_LOBES = 8  # number of lobes for sharp parts whose system has no table of lobes
 
 
 def check(count: int | str | None) -> None:
-    """Refuses numbers of bounces that are none.
+    """Refuses invalid numbers of bounces.
 
     Raises:
-        TypeError: It is no whole number, nor "all" nor None.
-        ValueError: It is less than 0, or another word.
+        TypeError: `count` is not a whole number, "all" or None.
+        ValueError: `count` is negative, or a word other than "all".
     """
     if count is None or (isinstance(count, str) and count == ALL):
         return
@@ -53,12 +53,12 @@ def check(count: int | str | None) -> None:
 
 
 def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartBounces:
-    """Precomputes reflected light between all parts.
+    """Precomputes the light that all parts reflect onto each other and themselves.
 
     Args:
-        shadings: What the parts are to systems.
-        count: How many times light is reflected, at least once; or "all".
-        target: The light's size, and where that is done; the parts occlude each other, and all vertices are lit.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        count: Number of bounces, at least 1; or "all".
+        target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
 
     Returns:
         The system of reflected light alone.
@@ -68,7 +68,7 @@ def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartB
     tables = _alike(shadings, partial(harmonic_table, degree=DEGREE))
     weights = [paths.typical(*each) for each in zip(shadings, sent, strict=True)]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
-    # Nothing is left out: how many bounces there are is decided, and materials may change to what brings more.
+    # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(mesh, [each.brdf for each in sent], weights=weights, bounces=count, **options)
     frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
     parts = [
@@ -79,12 +79,12 @@ def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartB
 
 
 def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathlib.Path | None) -> list[LobeBrdf | None]:
-    """Lobes of the parts whose reflections are traced; None for those that harmonics are enough for.
+    """For each part, its lobes if its reflections are traced; None if harmonics represent its reflections well enough.
 
     Args:
-        shadings: What the parts are to systems.
-        systems: The systems of the parts, whose tables of lobes are taken where they have some.
-        folder: What keeps tables that are made here; None keeps nothing.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        systems: The systems of the parts. If one has a table of lobes, it is used.
+        folder: Folder that stores tables that are made here; None stores nothing.
     """
     result: list[LobeBrdf | None] = []
     for number, (shading, system) in enumerate(zip(shadings, systems, strict=True)):
@@ -101,16 +101,16 @@ def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathli
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
-    """Fraction of each part's radiance that other surfaces reflected at least once, twice, and three times.
+    """Estimates the fraction of each part's radiance that surfaces reflected at least once, twice and three times.
 
-    An estimate: surfaces count as matte, with the mean albedo of their parts.
+    The estimate treats all surfaces as diffuse, with the mean albedo of their parts.
 
     Args:
-        shadings: What the parts are to systems.
-        environments: Lights; the largest fraction under any of them counts.
+        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        environments: Environments. The result is the largest fraction under any of them.
 
     Returns:
-        Relative L2, by bounces and parts.
+        Relative L2 fraction for each number of bounces (rows) and part (columns).
     """
     mesh, albedo = _joined(shadings), np.stack([paths.albedo(each) for each in shadings])
     options = {"size": _REFLECTED, "progress": False}
@@ -126,7 +126,7 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
         lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
         for part in range(len(shadings)):
             own = lit[:, region == part]
-            # Over two bounces: between two surfaces, odd ones and even ones are not alike.
+            # The ratio is taken over two bounces, because odd and even bounces between two surfaces differ.
             before, _, last = (float(np.linalg.norm(bounce)) for bounce in own[-3:])
             ratio = min((last / before) ** 0.5, _SLOWEST) if before > 0 else 0.0
             own = np.concatenate([own[:-1], own[-1:] / (1 - ratio)])
@@ -137,19 +137,19 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
 
 
 def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int | str:
-    """How many bounces leave no more than an error of any part's light out; all if two leave out more."""
+    """Smallest number of bounces that omits at most `error` of each part's radiance; "all" if two omit more."""
     enough = np.flatnonzero(np.all(reflected <= error, 1))
     return int(enough[0]) if enough.size else ALL
 
 
 def _joined(shadings: Sequence[Shading]) -> Mesh:
-    """The meshes of all parts as one, whose regions are the parts."""
+    """The meshes of all parts as one mesh, whose regions are the parts."""
     one = [eqx.tree_at(lambda mesh: mesh.region, each.mesh, jnp.zeros_like(each.mesh.region)) for each in shadings]
     return join(one)
 
 
 def _alike(shadings: Sequence[Shading], make: Callable[[Shading], T]) -> list[T]:
-    """What is made of each part's BRDF; parts of the same BRDF, colors apart, share it."""
+    """The result of `make` for each part. Parts with equal BRDFs, apart from colors, share one result."""
     known: list[tuple[Shading, T]] = []
     for each in shadings:
         same = [made for other, made in known if paths.alike(each, other)]

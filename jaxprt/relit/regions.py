@@ -1,4 +1,4 @@
-"""Pictures of systems whose parts are the regions of a mesh: the dynamic system, alone or with bounces."""
+"""Pictures of systems whose parts are the regions of one mesh: the dynamic system, alone or with bounces."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,15 +13,15 @@ from jaxprt.systems.protocol import System
 
 
 class RegionsView(eqx.Module):
-    """All of a picture but its light, of a system whose parts are the regions of a mesh: `of_regions` makes it.
+    """All of a picture that does not depend on the light, for a system of regions; `of_regions` makes it.
 
     Attributes:
         system: The system.
-        materials: The materials of the regions, as `System.view` takes them.
-        camera: From where.
-        canvas: What is shaded, and where it goes.
-        points: The points of each row that is shaded at once, of each region.
-        kept: What the system makes of the view of each row; None where that is made anew for each light.
+        materials: Materials of the regions, in the form that `System.view` takes.
+        camera: The camera.
+        canvas: The points that are shaded, and their pixels.
+        points: For each row that is shaded at once, the points on each region.
+        kept: View of each row, in the form of the system; None if it is recomputed for each light.
     """
 
     system: System
@@ -32,11 +32,11 @@ class RegionsView(eqx.Module):
     kept: tuple[PyTree, ...] | None
 
     def picture(self, environment: Environment) -> Float[Array, "h w c"]:
-        """The picture in a light, in linear radiance.
+        """Renders the picture under an environment, in linear radiance.
 
         Raises:
-            TypeError: The light is no Environment.
-            ValueError: The light is a batch, or of another size.
+            TypeError: `environment` is not an `Environment`.
+            ValueError: The environment is a batch, or has another size than the system requires.
         """
         arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
         for number, points in enumerate(self.points):
@@ -49,17 +49,17 @@ class RegionsView(eqx.Module):
 def of_regions(
     system: System, mesh: Mesh, camera: Camera, *, materials: PyTree = None, samples: int = 4, keep: bool = False
 ) -> RegionsView:
-    """The view of a mesh by a system that takes points of its regions: the dynamic system, alone or with bounces.
+    """Prepares a picture of a mesh by a system of its regions: the dynamic system, alone or with bounces.
 
-    Radiance is made at all pixels. Not for `jax.jit`.
+    Radiance is computed at every pixel. Not for use inside `jax.jit`.
 
     Args:
         system: The system of the mesh.
         mesh: The mesh.
-        camera: From where.
-        materials: As the system takes them.
-        samples: How many places in each pixel tell which surfaces it shows: 4 or 1.
-        keep: Whether what the system makes of the view is kept for other lights: about a kilobyte for each point.
+        camera: The camera.
+        materials: Materials of the regions, in the form that the system takes.
+        samples: Number of coverage samples of each pixel: 4 or 1.
+        keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
     """
     pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
     region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
@@ -68,7 +68,7 @@ def of_regions(
     rows, width = rows_of(owner == np.argmax([len(each) for each in every])).shape
     index = np.stack([np.pad(each, (0, rows * width - len(each)), constant_values=-1) for each in every])
     index = jnp.asarray(index.reshape(len(every), rows, width).swapaxes(0, 1))
-    # Numbers of the vertices in their regions.
+    # Index of each vertex among those of its region.
     place = np.zeros(len(region), np.int32)
     for number in range(len(every)):
         own = np.flatnonzero(region == number)

@@ -1,4 +1,4 @@
-"""Recipes measured: carried out for some vertices of a part, judged at points of the triangles between them."""
+"""Measures recipes: runs them for some vertices of a part, and compares radiance at points on the triangles between."""
 
 import dataclasses
 import time
@@ -24,19 +24,20 @@ from jaxprt.systems import protocol, reference, separable
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.protocol import Blend, System
 
-MEMBERS = 225  # vertices in a cluster
-_CLUSTERS = 24  # of all parts together that are measured: of the bunny, half of the squared error is in an eighth
+MEMBERS = 225  # number of vertices in a cluster
+_CLUSTERS = 24  # number of measured clusters, of all parts together: errors differ much between clusters
 
 
 class Candidate(eqx.Module):
-    """What one recipe brings and costs for one part, measured on a sample.
+    """Error and cost of one recipe for one part, measured on a sample.
 
     Attributes:
         recipe: The recipe.
-        error: Relative L2 error of radiance, under the worst of the lights.
-        seconds: Time of a frame with new light and new view on this machine, without drawing.
+        error: Relative L2 error of radiance under the worst of the lights.
+        seconds: Time of a frame with a new light and a new view on this machine, without rasterization.
         nbytes: Size of transport and BRDF in bytes.
-        precompute_seconds: Time of precomputation on this machine, without what candidates share.
+        precompute_seconds: Time of precomputation on this machine. What candidates share, other than tracing rays, is
+            counted only for the first.
     """
 
     recipe: Any
@@ -46,7 +47,7 @@ class Candidate(eqx.Module):
     precompute_seconds: float
 
     def __str__(self) -> str:
-        """One row of the table."""
+        """One row of the plan's table."""
         sizes = ", ".join(f"{name} {value:g}" for name, value in vars(self.recipe).items())
         cost = f"{1e3 * self.seconds:7.1f} ms {self.nbytes / 1e6:8.2f} MB {self.precompute_seconds:7.0f} s"
         return f"{100 * self.error:6.1f} % {cost}   {type(self.recipe).__name__}({sizes})"
@@ -54,20 +55,21 @@ class Candidate(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """Some vertices of a part, points on the triangles between them, and what is known of both.
+    """Some vertices of a part, points on the triangles between them, and the reference radiance of the points.
 
     Attributes:
-        shading: The part, as systems take it.
-        target: Which vertices, and what they see.
-        vertex_ratio: How many times as many the part has.
-        points: Where recipes are judged, numbered as the vertices of the sample are.
-        blend: What the points are made of.
-        facing: Which of the points face each view.
-        exact: Their exact radiance, as far as the mesh tells what they see: the mean of what the corners see.
-        mesh_error: What that leaves out, relative L2 under the worst light: shadows finer than the triangles.
-        environments: Under these lights.
-        views: From these places.
-        rays_seconds: What tracing the vertices took.
+        shading: Mesh, BRDF and channel weights of the part.
+        target: The vertices of the sample, and their visibility.
+        vertex_ratio: Number of vertices of the part, divided by that of the sample.
+        points: Points at which recipes are compared. Their corners are indices into the vertices of the sample.
+        blend: Material weights at the points; None for a part with a BRDF that cannot change.
+        facing: Which points face each view.
+        exact: Reference radiance of the points, with the visibility interpolated from the corners of their triangles.
+        mesh_error: Relative L2 error of the reference due to interpolated visibility, under the worst light. It comes
+            from shadows that are finer than the triangles.
+        environments: The environments of the comparison.
+        views: Positions of the viewers.
+        rays_seconds: Time to trace the visibility of the vertices.
     """
 
     shading: Shading
@@ -86,7 +88,7 @@ class Sample:
     def make(
         cls, part: Part, shading: Shading, scene: Mesh, total: int, size: int, environments, views: np.ndarray
     ) -> "Sample":
-        """Traces and sums for whole clusters of vertices, a share of all that are measured."""
+        """Chooses whole clusters of vertices, traces their visibility, and computes the reference radiance."""
         mesh = shading.mesh
         count = len(mesh.position)
         clusters = max(1, round(count / MEMBERS))
@@ -108,12 +110,12 @@ class Sample:
         return cls(shading, target, ratio, points, blend, facing, exact, mesh_error, lights, views, seconds)
 
     def least_bytes(self, recipe: Any) -> int:
-        """Bytes that a recipe has at least for the whole part."""
+        """Smallest number of bytes that a recipe needs for the whole part."""
         count = len(self.shading.mesh.position)
         return recipe.least_bytes(self.shading, vertices=count, size=self.target.size)
 
     def measure(self, recipe: Recipe) -> Candidate:
-        """What a recipe brings and costs."""
+        """Runs a recipe on the sample and measures its error and cost."""
         start = time.perf_counter()
         system = recipe.make(self.shading, self.target)
         seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
@@ -121,14 +123,14 @@ class Sample:
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
 
     def _error(self, system: System, light: Environment, exact: np.ndarray) -> float:
-        """Relative L2 error over all views, as far as points face the viewer."""
+        """Relative L2 error over all views, at points that face the viewer."""
         lit, placed = system.light(light), system.at(self.points)
         views = (placed.view(jnp.asarray(eye), self.blend) for eye in self.views)
         now = np.stack([np.asarray(placed.combine(lit, view)) for view in views])
         return relative_error(np.broadcast_to(now, exact.shape)[self.facing], exact[self.facing])
 
     def _frame(self, system: System) -> float:
-        """Seconds of a frame of the whole part. A light that all vertices share does not grow with them."""
+        """Seconds of a frame of the whole part. The time of a light that all vertices share is not scaled."""
         light, eye = self.environments[0], jnp.asarray(self.views[0])
         whole, vertex = self.shading.blend, self.target.vertex
         blend = None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
@@ -139,7 +141,7 @@ class Sample:
 
 
 def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
-    """Points by chance on the triangles between some vertices, by area; numbered as these vertices are."""
+    """Random points, uniform by area, on the triangles between some vertices. Corners are indices into these."""
     number = np.full(len(mesh.position), -1)
     number[vertex] = np.arange(len(vertex))
     corner = number[np.asarray(mesh.face)]
@@ -148,7 +150,7 @@ def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     random = np.random.default_rng(1)
     if not len(corner) or not area.sum() > 0:
-        # Vertices without triangles among them stand for points.
+        # No triangle has all its corners among the vertices: use the vertices as points.
         alone = random.integers(len(vertex), size=count)
         corner, chosen = np.repeat(alone[:, None], 3, 1), np.arange(count)
     else:
@@ -166,7 +168,11 @@ def _judged(
     environments: Sequence[Environment],
     views: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Which points face each view, their radiance [light, view, point, color], and what visibility `told` errs by."""
+    """Which points face each view, their radiance [light, view, point, color], and the error of the visibility `told`.
+
+    The error is the relative L2 difference between radiance with the visibility `told` and radiance with rays traced
+    from the points, under the worst light.
+    """
     mesh = shading.mesh
     position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
     toward = views[:, None] - np.asarray(position)
@@ -188,7 +194,7 @@ def _judged(
 
 
 def _bytes(system: System, vertex_ratio: float) -> int:
-    """Bytes of a system of so many times as many vertices."""
+    """Bytes of a system with `vertex_ratio` times as many vertices."""
     if isinstance(system, BrightTexels):
         transports: list[Array] = jax.tree.leaves((system.system.transport, system.visibility))  # pyright: ignore
     else:

@@ -1,4 +1,4 @@
-"""Scenes made ready: every part by a system, and the four verbs, radiance and pictures of the whole."""
+"""Precomputed scenes: one system for each part, and methods for radiance and pictures of the whole scene."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -27,17 +27,17 @@ from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, Joined, System, Total
 
-RAYS = 8  # of each vertex or point of a sharp part
+RAYS = 8  # reflection rays of each vertex or point of a sharp part
 
 
 class SceneView(eqx.Module):
-    """A view of a scene.
+    """What depends on the view and the materials of a scene.
 
     Attributes:
-        part: The views of its parts, as their systems have them.
-        emitted: Radiance that each vertex emits; None where none does.
-        lit: Radiance of the vertices of each part in the light of each lamp of radiance 1; None without lamps.
-        reflected: What sharp parts show of others, by rays; None without.
+        part: View of each part, in the form of its system.
+        emitted: Radiance that each vertex emits; None if no part emits.
+        lit: For each part, radiance of its vertices due to each lamp of unit radiance; None without lamps.
+        reflected: Reflections that sharp parts show by ray tracing; None without.
     """
 
     part: tuple[PyTree, ...]
@@ -47,11 +47,11 @@ class SceneView(eqx.Module):
 
 
 class SceneLight(eqx.Module):
-    """What arrives at a scene with lamps.
+    """The light that arrives at a scene with lamps.
 
     Attributes:
-        arriving: Of the environment, as the systems of the parts have it.
-        lamp: Radiance of each lamp.
+        arriving: Light of the environment, in the form of the parts' systems.
+        lamp: Radiance of each lamp; for a point light, its intensity.
     """
 
     arriving: PyTree
@@ -59,26 +59,28 @@ class SceneLight(eqx.Module):
 
 
 class RelitScene(System):
-    """A scene that is ready to be relit. It is a system itself: its vertices are those of `scene.mesh`, in that order.
+    """A precomputed scene. It is itself a system: its vertices are those of `scene.mesh`, in that order.
 
-    Materials are a dictionary from names of parts to other materials: `TexturedMaterial`, `Appearance` for one that is
-    evaluated at the vertices already, or `Blend` for its weights alone. Parts that are not named keep the material that
-    they were precomputed with. A part whose material is a BRDF keeps that. Point lights may be among them, by their
-    names, with other intensities.
+    Materials are given as a dictionary from names of parts to new materials. A material is a `TexturedMaterial` or a
+    `BlinnPhong`, an `Appearance` for one that is already evaluated at the vertices, or a `Blend` to change only the
+    weights of the BRDF's channels. Parts that are not named keep the material that they were precomputed with. A part
+    that was precomputed with another BRDF, or with a `BlinnPhong` and no range of roughness, cannot change its
+    material. The dictionary may also map names of point lights to a `PointLight` with another intensity.
 
     Attributes:
         scene: The scene.
-        direct: The systems of its parts.
-        shading: What its parts are to the systems.
-        bounces: Light that the parts reflect onto each other; None without.
-        lamps: Parts that emit, and point lights; None without. What bounces do not reflect again.
-        mesh: The mesh of all parts, with the scene's own normals.
-        camera: The scene's first camera; one around it, a little from above, where it has none.
-        curvature: How sharp the radiance of each part is, from `jaxprt.relit.interpolation.curvature`.
-        points: Where on each part radiance is asked for; None for the vertices.
-        mipmapped: Materials of the parts with mip maps of their textures; None for BRDFs.
-        lobes: The BRDFs, as lobes, of parts that are too sharp for the harmonics of reflected light; None for others.
-        rays: How many rays each vertex or point of these sends for what they reflect.
+        direct: The systems of the parts, for direct light.
+        shading: Mesh, BRDF and channel weights of each part.
+        bounces: The system of light that the parts reflect onto each other; None without bounces.
+        lamps: Emitting parts and point lights; None if there are none. `bounces` does not include their light.
+        mesh: The mesh of all parts, with the original normals (without normal maps).
+        camera: The first camera of the scene. If it has none, a camera that shows the whole scene from slightly above.
+        curvature: How fast the radiance of each part varies with direction, from
+            `jaxprt.relit.interpolation.curvature`.
+        points: Points on each part at which radiance is computed; None for the vertices.
+        mipmapped: Material of each part with mipmaps of its textures; None for a part with a BRDF.
+        lobes: BRDF, as lobes, of each part whose reflections are too sharp for harmonics; None for other parts.
+        rays: Number of reflection rays that each vertex or point of a sharp part sends.
     """
 
     scene: Scene
@@ -105,19 +107,20 @@ class RelitScene(System):
         lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
     ):
-        """Joins the parts' meshes.
+        """Joins the meshes of the parts.
 
         Args:
             scene: The scene.
-            direct: The systems of its parts, in order.
-            shading: What its parts are to the systems, from `jaxprt.relit.channels.of_part`.
-            bounces: Light that the parts reflect onto each other; None without.
-            lamps: What the scene's lamps are to its parts; None without.
-            lobes: As `RelitScene.lobes` has them; None where no part is sharp.
-            rays: As `RelitScene.rays` has it; 0 for reflections by harmonics alone.
+            direct: The systems of the parts for direct light, in order.
+            shading: Mesh, BRDF and weights of each part, from `jaxprt.relit.channels.of_part`.
+            bounces: The system of light that the parts reflect onto each other; None without bounces.
+            lamps: Emitting parts and point lights, precomputed; None without.
+            lobes: BRDF, as lobes, of each sharp part, and None for other parts. None if no part is sharp.
+            rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
+                alone.
         """
         _check_rays(rays)
-        # What is no array cannot be an argument of a jitted function.
+        # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
             if isinstance(part.material, TexturedMaterial)
@@ -137,27 +140,27 @@ class RelitScene(System):
 
     @property
     def system(self) -> Joined | Total:
-        """The system of all vertices, without what they emit: direct light, and bounces where there are any."""
+        """The system of all vertices without emission: direct light of the environment, and bounces if requested."""
         return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """What a light is to all parts."""
+        """Projects an environment for the systems of all parts."""
         return self.system.light(environment)
 
     def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
-        """What arrives at all parts."""
+        """The light that arrives at all parts, given the materials. Redone when the light or the materials change."""
         given, changed = scene_lamps.split(self.lamps, materials)
         every = self._all(given)
         arriving = self.system.shade(light, [each.blend for each in every])
         return arriving if self.lamps is None else SceneLight(arriving, self.lamps.radiance(every, changed))
 
     def view(self, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
-        """What a view and the materials are to all parts.
+        """What depends on the eye and the materials, for all parts.
 
         Raises:
-            TypeError: The materials are no dictionary, one of them is of another kind, or one is of a part whose
-                material is a BRDF.
-            ValueError: There is no such part, or a material has what was not precomputed; see
+            TypeError: `materials` is not a dictionary; a material is of a kind that its part does not take; or the
+                material of its part is a BRDF that cannot change.
+            ValueError: There is no part of the given name, or a material needs something that was not precomputed; see
                 `jaxprt.relit.channels.appearance`.
         """
         materials = scene_lamps.split(self.lamps, materials)[0]
@@ -181,7 +184,7 @@ class RelitScene(System):
         return SceneView(view, jnp.concatenate(emitted), lit, reflected)
 
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
-        """Radiance of all vertices, with what they emit."""
+        """Radiance of all vertices, including emission."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
         lamp = None
         if self.lamps is not None and view.lit is not None:
@@ -197,7 +200,7 @@ class RelitScene(System):
     def radiance(
         self, environment: Environment, *, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None
     ) -> Float[Array, "*l v c"]:
-        """Radiance that each vertex sends to the eye: `jaxprt.radiance` of this scene."""
+        """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
         given, changed = scene_lamps.split(self.lamps, materials)
         return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(given), **changed})
 
@@ -210,25 +213,28 @@ class RelitScene(System):
         samples: int = 4,
         between: Between = None,
     ) -> Float[Array, "h w c"]:
-        """The picture of the scene in a light, in linear radiance.
+        """Renders the scene under an environment, in linear radiance.
 
-        Radiance is made at the pixels where interpolating it between the vertices would be off by more than 1 %, by the
-        sharpness of the material and the size of the triangles in the picture; textures are read at the pixels.
+        Textures are evaluated at each pixel. Radiance of a part is computed at each pixel if interpolating it between
+        vertices would cause an error of more than 1 %, or if the part has more vertices than pixels; otherwise it is
+        interpolated. The error is estimated from the sharpness of the material and the size of the triangles.
+        Lambertian parts are always interpolated.
 
         Args:
-            environment: One light, which is seen behind the scene too.
-            camera: From where; `self.camera` if None.
-            materials: Other materials of some parts.
-            samples: Of the coverage of each pixel: 4, or 1 for no anti-aliasing.
-            between: Called after each stage and after each row of 8,192 points; an exception that it raises gives the
-                picture up. Not inside `jax.jit`.
+            environment: One environment. It is also the background.
+            camera: The camera; `self.camera` if None.
+            materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
+            samples: Number of coverage samples of each pixel: 4, or 1 for no anti-aliasing.
+            between: Function that is called after each stage and after each block of 8,192 points. If it raises an
+                exception, rendering stops. Not inside `jax.jit`.
 
         Returns:
-            The picture. `jaxprt.image.display` makes it fit for the screen.
+            The picture. `jaxprt.image.display` converts it for a screen.
 
         Raises:
-            TypeError: The light is no Environment, or the camera no Camera.
-            ValueError: The light is a batch, or as in `view`.
+            TypeError: `environment` is not an `Environment`, `camera` is not a `Camera`, or for the reasons that `view`
+                gives.
+            ValueError: The environment is a batch, or for the reasons that `view` gives.
         """
         view = self._picture_view(camera, materials, samples=samples, keep=False, between=between)
         return view.picture(environment, between=between)
@@ -236,9 +242,15 @@ class RelitScene(System):
     def picture_view(
         self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
     ) -> PictureView:
-        """All of a picture but the light, for many lights: `picture_view(camera).picture(environment)`.
+        """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
-        It holds about a kilobyte for each pixel that is shaded. Arguments and errors are those of `picture`.
+        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point. `picture`
+        gives the errors.
+
+        Args:
+            camera: The camera; `self.camera` if None.
+            materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
+            samples: Number of coverage samples of each pixel: 4, or 1 for no anti-aliasing.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 
@@ -251,7 +263,7 @@ class RelitScene(System):
         return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
 
     def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
-        """The parts as pictures shade them."""
+        """One `Surface` for each part."""
         given = self.appearances(materials)
         with tracing.now(self.curvature):
             curvature = list(self.curvature)
@@ -276,44 +288,47 @@ class RelitScene(System):
         return surfaces
 
     def with_rays(self, rays: int) -> "RelitScene":
-        """The scene with another number of rays for the reflections of its sharp parts; 0 for harmonics alone."""
+        """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
         _check_rays(rays)
-        made = object.__new__(RelitScene)  # Inside of jax.jit too, where nothing can be measured again.
+        made = object.__new__(RelitScene)  # Works inside jax.jit too, where __init__ could not measure the curvature.
         for field in dataclasses.fields(self):
             object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
         return made
 
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
-        """Errors of pictures and parts against the exact sum, times and bytes, measured on this machine.
+        """Measures errors against the exact sum over all texels, times and bytes, on this machine.
 
-        Errors are those of direct light alone: of some pixels of pictures from three sides, and of some vertices of
-        each part from eight; times and bytes are those of all light.
+        Errors cover direct light only. They are measured at some pixels of pictures from three sides, and at some
+        vertices of each part from eight directions. Times and bytes include bounces.
 
         Args:
-            environments: Lights of one size; the scene's own, or else the two embedded ones.
+            environments: Environments of one size. If None, those of the scene, or the two built-in ones if it has
+                none.
 
         Returns:
             The report; `print` shows it as a table.
 
         Raises:
-            ValueError: No lights, lights of different sizes, or NaN or infinity in them.
+            TypeError: `environments` is not a list of `Environment`.
+            ValueError: There are no lights, lights of different sizes, or a light that is not finite.
         """
         lights = measuring.lights_of(self.scene) if environments is None else environments
         alone = RelitScene(self.scene, self.direct, self.shading)
         return measuring.measure(alone.picture, self.camera, self.direct, self.system, self.scene, self.shading, lights)
 
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
-        """Materials evaluated at the vertices: once for all views.
+        """Evaluates materials at the vertices, so that this is done once for many views.
 
         Args:
-            materials: A dictionary from names of parts to materials; None for none.
+            materials: Dictionary from names of parts to materials; None for an empty one.
 
         Returns:
-            The same dictionary with an `Appearance` for each material, which all verbs take.
+            Dictionary from names of parts to `Appearance`. All methods take it in place of `materials`.
 
         Raises:
-            TypeError: As in `view`.
-            ValueError: As in `view`.
+            TypeError: For the reasons that `view` gives.
+            ValueError: For the reasons that `view` gives, or a material emits light on a part that was precomputed
+                without.
         """
         if materials is None:
             return {}
@@ -346,18 +361,20 @@ class RelitScene(System):
         return result
 
     def at(self, points: Sequence[Points]) -> "RelitScene":
-        """The scene at points on its parts, one list for each part: `System.at`. Materials stay those of the vertices.
+        """The same scene at points on its parts instead of the vertices: one list of points for each part.
+
+        Materials are still evaluated at the vertices, and interpolated to the points.
 
         Raises:
-            TypeError: They are no list of points for each part.
-            ValueError: Points are not on triangles of their part.
+            TypeError: `points` is not one list of points for each part.
+            ValueError: A point is not on a triangle of its part.
         """
         given = protocol.check_points(points, [len(part.mesh.position) for part in self.scene.parts])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points if the scene was moved to points by `at`."""
         return self._placed.vertices
 
     @property
@@ -366,11 +383,11 @@ class RelitScene(System):
 
     @property
     def shared_light(self) -> tuple | None:
-        """What the light of all parts depends on besides the environment."""
+        """What `light` depends on besides the environment; see `System.shared_light`."""
         return self.system.shared_light
 
     def _all(self, materials: Mapping[str, Any] | None) -> list[Appearance]:
-        """The appearance of each part: the given one, or that which it was precomputed with."""
+        """The appearance of each part: the given one, or that of the material it was precomputed with."""
         given = self.appearances(materials)
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]

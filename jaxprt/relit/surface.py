@@ -1,4 +1,4 @@
-"""Parts of scenes as pictures shade them: views and radiance at points and vertices, of all light that a part gets."""
+"""Shading of parts of scenes: radiance at points and vertices from direct light, bounces and lamps together."""
 
 from functools import partial, reduce
 from typing import Any
@@ -19,21 +19,21 @@ from jaxprt.systems.protocol import Blend, System
 
 
 class Surface(eqx.Module):
-    """A part of a scene as pictures shade it.
+    """A part of a scene with everything that its shading requires.
 
     Attributes:
         part: The part.
-        first: Number of its first vertex in the mesh of all parts.
-        shading: What it is to systems.
-        system: The system of its direct light.
-        reflecting: What it makes of light that arrives from other surfaces; None without.
-        lit: What it makes of the light of lamps; None without.
+        first: Index of its first vertex in the mesh of all parts.
+        shading: Mesh, BRDF and channel weights of the part.
+        system: The system of direct light from the environment.
+        reflecting: How it reflects light from other surfaces; None without bounces.
+        lit: How it reflects light from lamps; None without lamps.
         appearance: Its material at the vertices.
-        material: What has its material at points: a `TexturedMaterial`, an `Appearance` at the vertices, or None for
-            the part's own.
-        curvature: How sharp its radiance is, from `interpolation.curvature`.
-        lamp: Number of the lamp that the part is; None for none.
-        glows: Whether what it emits is seen. Rays of reflections count it by lamps.
+        material: Source of its material at points: a `TexturedMaterial` or `BlinnPhong`, an `Appearance` at the
+            vertices, or None for the part's own material.
+        curvature: How fast its radiance varies with direction, from `interpolation.curvature`.
+        lamp: Index of the lamp that the part is; None if it does not emit.
+        glows: Whether its emission is visible. It is not for reflection rays, which add lamps separately.
     """
 
     part: Part
@@ -51,7 +51,7 @@ class Surface(eqx.Module):
 
 @partial(jit, static_argnames="at_pixels")
 def look(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
-    """Some points of a part, the material there, and what systems make of the view of them."""
+    """Some points of a part, the material there, and the view of each system of the part (None unless `at_pixels`)."""
     appearance = at_points(surface.part, surface.shading, surface.material, points)
     return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
 
@@ -63,7 +63,14 @@ def lit(
     vertices: Float[Array, "k v c"] | None,
     viewed: tuple[Points, Appearance, PyTree],
 ) -> Float[Array, "p c"]:
-    """Colors of some points of a part: of the light that arrives, or of radiance at the vertices."""
+    """Colors of some points of a part, from the arriving light or, if given, from the radiance of the vertices.
+
+    Args:
+        surface: The part.
+        arriving: Direct light, reflected light, and radiance of each lamp.
+        vertices: Radiance of each channel at the vertices, from `at_vertices`; None to shade at the points.
+        viewed: Result of `look`.
+    """
     points, appearance, view = viewed
     if vertices is None:
         color = _combine(surface, arriving, view, points)
@@ -77,7 +84,7 @@ def lit(
 
 @partial(jit, static_argnames="at_pixels")
 def shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
-    """Colors of some points of a part. For derivatives what is between is made again, not kept."""
+    """Colors of some points of a part. Intermediate results are recomputed for derivatives instead of stored."""
 
     def both(surface, arriving, vertices, eye):
         viewed = look(surface, points, eye, at_pixels=at_pixels)
@@ -88,7 +95,7 @@ def shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool)
 
 @jit
 def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
-    """Radiance of the vertices of a part, of each channel of its BRDF by itself."""
+    """Radiance of the vertices of a part, separately for each channel of its BRDF."""
     blend = surface.appearance.blend
     if blend is None:
         return _combine(surface, arriving, _view(surface, eye, None, None), None)[None]
@@ -100,7 +107,7 @@ def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: 
 
 
 def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
-    """What the systems of a part make of a view, at points or at the vertices."""
+    """The view of each system of a part: direct light, reflected light and lamps; at points or at the vertices."""
     system = surface.system if points is None else surface.system.at(points)
     reflecting, lit = surface.reflecting, surface.lit
     traced = jnp.ones(len(points)) if isinstance(reflecting, SharpPart) and points is not None else None
@@ -114,7 +121,7 @@ def _combine(
     view: tuple[PyTree, PyTree, PyTree],
     points: Points | None,
 ) -> Array:
-    """Radiance of the systems of a part."""
+    """Radiance of a part from all its systems."""
     system = surface.system if points is None else surface.system.at(points)
     color = system.combine(arriving[0], view[0])
     if surface.reflecting is not None:

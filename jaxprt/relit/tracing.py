@@ -1,12 +1,13 @@
-"""Reflections by rays: what the sharp parts of a scene show of their neighbors, in any light and in any colors.
+"""Traced reflections: what sharp parts of a scene reflect of their neighbors, under any light and with any colors.
 
-Rays go from vertices or points along the narrow lobes of `jaxprt.systems.bounces.traced`, and read the radiance of the
-fronts that they meet: direct light, and what is reflected as far as 16 harmonics tell it. Rays that meet nothing, or a
-back, bring nothing, since the light of the sky is direct light. Those that meet a lamp tell how much of it is seen.
+Rays start from vertices or points and follow the narrow lobes of `jaxprt.systems.bounces.traced`. Each ray reads the
+radiance of the front face that it hits: direct light, and light that was reflected before, represented by 16 harmonics.
+Rays that hit nothing or a back face contribute nothing, because light of the environment is already part of direct
+light. Rays that hit a lamp determine how much of it is visible in the reflection.
 
-Embree casts the rays on the host, once for each eye and roughness. Where they hit is a constant: radiance is
-differentiable in the light and in the colors of all materials, and its derivative by the eye or by roughness is
-refused.
+Embree casts the rays on the host, once for each eye position and roughness. The hit points are constants. Radiance is
+therefore differentiable in the light and in the colors of all materials. Derivatives with respect to the eye or to
+roughness raise an error.
 """
 
 import contextlib
@@ -32,18 +33,18 @@ from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
 
-CHUNK = 1 << 13  # hits that are shaded at once
+CHUNK = 1 << 13  # number of hits that are shaded together
 _FEWEST = 1 << 10
 
 
 class Asked(eqx.Module):
-    """Vertices or points of a part that rays start from.
+    """Vertices or points of a part from which rays start.
 
     Attributes:
-        number: Of the part.
-        blend: What they are made of.
+        number: Index of the part.
+        blend: Material weights of the vertices or points.
         points: The points; None for all vertices.
-        seen: Whether the eye may see each; None for all.
+        seen: 1 where the eye may see the vertex or point, 0 elsewhere; None for 1 everywhere.
     """
 
     number: int = eqx.field(static=True)
@@ -53,12 +54,12 @@ class Asked(eqx.Module):
 
 
 class Carried(eqx.Module):
-    """The rays of what was asked for.
+    """The rays of one `Asked`.
 
     Attributes:
-        slot: Number of the hit of each ray among all; one more than there are for none.
-        weight: What its radiance is multiplied by.
-        lamp: What the radiance of each lamp is multiplied by; None without lamps.
+        slot: Index of each ray's hit among all hits; the number of hits if there is none.
+        weight: Factor of the radiance that each ray reads.
+        lamp: Factor of the radiance of each lamp; None without lamps.
     """
 
     slot: Int[Array, "j v"]
@@ -67,13 +68,13 @@ class Carried(eqx.Module):
 
 
 class HitRow(eqx.Module):
-    """Hits on a part that are shaded at once.
+    """Hits on one part that are shaded together.
 
     Attributes:
-        number: Of the part.
-        points: Where on it.
-        eye: Where the ray of each came from.
-        kept: What systems make of that view; None where it is made anew for each light.
+        number: Index of the part.
+        points: The hits as points on the part.
+        eye: Origin of the ray of each hit.
+        kept: What `look` returns for the hits; None if it is recomputed for each light.
     """
 
     number: int = eqx.field(static=True)
@@ -83,11 +84,11 @@ class HitRow(eqx.Module):
 
 
 class Reflections(eqx.Module):
-    """A view by rays.
+    """The traced reflections of a view.
 
     Attributes:
-        own: The rays, in the order in which they were asked for.
-        hit: What they meet.
+        own: The rays of each `Asked`, in the given order.
+        hit: The surfaces that they hit.
     """
 
     own: tuple[Carried, ...]
@@ -99,12 +100,12 @@ class Reflections(eqx.Module):
         arriving: tuple[Sequence[PyTree], Sequence[PyTree]],
         lamp: Float[Array, "n 3"] | None,
     ) -> list[Float[Array, "_ c"]]:
-        """What rays add to the radiance of what was asked for.
+        """The reflected radiance that rays add at each vertex or point, one array for each `Asked`.
 
         Args:
             surfaces: All parts, from `flattened`.
-            arriving: Direct light and reflected light of each.
-            lamp: Radiance of each lamp; None without.
+            arriving: Direct light and reflected light of each part.
+            lamp: Radiance of each lamp; None without lamps.
         """
         rows, vertices = [], {}
         for each in self.hit:
@@ -122,29 +123,29 @@ class Reflections(eqx.Module):
 
 
 def known(*value: Any) -> bool:
-    """Whether JAX traces none of the arrays."""
+    """Whether no array is traced by JAX."""
     return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
 
 
 def now(*value: Any) -> contextlib.AbstractContextManager:
-    """A context in which what depends on known arrays alone is computed at once, inside `jax.jit` too."""
+    """A context in which operations on known arrays are executed at once, even inside `jax.jit`."""
     return jax.ensure_compile_time_eval() if known(*value) else contextlib.nullcontext()
 
 
 def trace(
     mesh: Mesh, surfaces: Sequence[Surface], asked: Sequence[Asked], eye: Float[Array, "3"], *, keep: bool
 ) -> Reflections:
-    """Casts the rays of some vertices or points.
+    """Casts the reflection rays of some vertices or points.
 
     Args:
         mesh: The mesh of all parts.
-        surfaces: All parts. Those that rays start from have a `SharpPart`.
-        asked: What rays start from.
+        surfaces: All parts. The parts from which rays start have a `SharpPart`.
+        asked: Vertices or points from which rays start.
         eye: Position of the viewer.
-        keep: Whether what systems make of the hits is kept for other lights.
+        keep: Whether to store what depends on the view of the hits, for many lights.
 
     Raises:
-        ValueError: JAX traces the eye, the roughness, or the scene.
+        ValueError: The eye, the roughness, the points or the scene is traced by JAX.
     """
     plain = [flattened(each) for each in surfaces]
     found, rays = [], []
@@ -172,7 +173,7 @@ def trace(
 def _lamps(
     surfaces: Sequence[Surface], asked: Asked, met: Int[np.ndarray, "j v"], weight: Array, concentration: Array
 ) -> Float[Array, "n v c"] | None:
-    """What rays read of each lamp of radiance 1, given the part that each meets, -1 for none."""
+    """Factor of the radiance of each lamp at each vertex or point, given the part that each ray hits (-1 for none)."""
     lit = surfaces[asked.number].lit
     if lit is None:
         return None
@@ -195,15 +196,18 @@ def split(
     blends: Sequence[Blend | None],
     points: Sequence[Points] | None,
 ) -> tuple[PyTree, Reflections | None]:
-    """A view by systems without what rays carry, and the rays; None where no part is sharp.
+    """Separates traced reflections from the view of the systems. The rays are None if no part is sharp.
 
     Args:
         mesh: The mesh of all parts.
         surfaces: All parts.
-        view: Of direct light and of bounces, part by part.
+        view: Views of direct light and of bounces, part by part.
         eye: Position of the viewer.
-        blends: What the vertices, or points, of each part are made of.
-        points: On each part; None for the vertices.
+        blends: Material weights of the vertices or points of each part.
+        points: Points on each part; None for the vertices.
+
+    Returns:
+        The view without what rays represent, and the rays.
     """
     sharp = _sharp(surfaces)
     if not sharp:
@@ -222,9 +226,13 @@ def split(
 def traced(
     mesh: Mesh, surfaces: Sequence[Surface], eye: Float[Array, "3"], points: Sequence[Points] | None
 ) -> list[Float[Array, " _"] | None]:
-    """How much of narrow lobes rays carry at the vertices or points of each part; None for nothing.
+    """Fraction of narrow lobes that rays represent at the vertices or points of each part; None without rays.
 
-    Arguments are those of `split`.
+    Args:
+        mesh: The mesh of all parts.
+        surfaces: All parts.
+        eye: Position of the viewer.
+        points: Points on each part; None for the vertices.
     """
     sharp = _sharp(surfaces)
     if not sharp:
@@ -234,7 +242,7 @@ def traced(
 
 
 def _faces(mesh: Mesh, surfaces: Sequence[Surface], eye: Array, points: Sequence[Points] | None) -> list[Any]:
-    """Whether the eye may see each vertex of each part; None where points tell."""
+    """1 for each vertex of each part that the eye may see, 0 for others; None for each part if there are points."""
     if points is not None:
         return [None] * len(surfaces)
     with now(mesh, eye):
@@ -248,7 +256,15 @@ def read(
     lamp: Float[Array, "n 3"] | None,
     points: Sequence[Points] | None,
 ) -> Float[Array, "v c"]:
-    """What rays add to the radiance of all vertices or points; arguments are those of `split` and `radiance`."""
+    """The reflected radiance that rays add at all vertices or points.
+
+    Args:
+        reflected: The traced reflections.
+        surfaces: All parts.
+        arriving: Direct light and reflected light of each part.
+        lamp: Radiance of each lamp; None without lamps.
+        points: Points on each part; None for the vertices.
+    """
     rows = reflected.radiance([flattened(each) for each in surfaces], arriving, lamp)
     counts = [len(each.part.mesh.position) for each in surfaces] if points is None else list(map(len, points))
     own = dict(zip(_sharp(surfaces), rows, strict=True))
@@ -258,19 +274,19 @@ def read(
 
 
 def _sharp(surfaces: Sequence[Surface]) -> list[int]:
-    """Numbers of the parts that rays start from."""
+    """Indices of the parts from which rays start."""
     return [number for number, each in enumerate(surfaces) if isinstance(each.reflecting, SharpPart)]
 
 
 def flattened(surface: Surface) -> Surface:
-    """A part as rays read it: it reflects by harmonics alone, and what it emits is not seen."""
+    """The part as rays see it: it reflects by harmonics alone, and its emission is hidden."""
     part = surface.reflecting
     return dataclasses.replace(surface, reflecting=part.plain if isinstance(part, SharpPart) else part, glows=False)
 
 
 @jit
 def facing(mesh: Mesh, eye: Float[Array, "3"]) -> Float[Array, " v"]:
-    """1 for vertices that are corners of a triangle whose front the eye may see, 0 for others."""
+    """1 for vertices of a triangle whose front faces the eye, 0 for others."""
     a, b, c = (mesh.position[mesh.face[:, k]] for k in range(3))
     across = jnp.cross(b - a, c - a)
     side = jnp.sum(across * jnp.sum(mesh.normal[mesh.face], 1), -1)
@@ -290,7 +306,7 @@ def _check(mesh: Mesh, part: SharpPart, points: Points | None, eye: Any, paramet
 
 
 def _rows(mesh: Mesh, surfaces: Sequence[Surface], found: Sequence[tuple], *, keep: bool):
-    """Slots of all rays, and hits part by part in rows of few lengths, so that programs serve many views."""
+    """Slots of all rays; and the hits of each part in rows of few lengths, so that views share compiled programs."""
     cast = caster(mesh)
     shape = [each[0].shape for each in found]
     triangle = np.concatenate([np.zeros(0, int), *(each[0].ravel() for each in found)])
@@ -306,7 +322,7 @@ def _rows(mesh: Mesh, surfaces: Sequence[Surface], found: Sequence[tuple], *, ke
         length = CHUNK if len(index) > CHUNK else max(_FEWEST, 1 << (len(index) - 1).bit_length())
         count = -(-len(index) // length)
         total += count * length
-        # Padding repeats the last.
+        # Padding repeats the last hit.
         index = np.pad(index, (0, count * length - len(index)), mode="edge").reshape(count, length)
         for each in index:
             points = Points(jnp.asarray(cast.face[triangle[each]].T - surface.first), jnp.asarray(weight[each].T))
@@ -325,7 +341,7 @@ def _is_matte(surface: Surface) -> bool:
 
 @jit
 def _read(own: Sequence[Carried], rows: Sequence[Array], lamp: Array | None) -> list[Array]:
-    """The sums over rays of the radiance that they read."""
+    """The weighted sum over rays of the radiance that they read."""
     colors = max([1, *(each.shape[1] for each in rows)])
     dtype = jnp.result_type(float) if not rows else rows[0].dtype
     flat = [jnp.broadcast_to(each, (len(each), colors)) for each in rows]

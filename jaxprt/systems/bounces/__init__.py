@@ -1,4 +1,4 @@
-"""Bounces: reflected light by precomputed transfer tensors, materials free (Sun et al. 2007)."""
+"""Bounces: reflected light by precomputed transfer tensors, with materials that can change (Sun et al. 2007)."""
 
 from jaxprt.systems.bounces import (
     between,

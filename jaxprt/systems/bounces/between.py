@@ -1,13 +1,13 @@
-"""Path functions of BRDFs between those of a set: the BRDF that is really there, projected on the functions.
+"""Path functions for BRDFs between those of a set: the true BRDF there, projected on the functions.
 
-Weights w of a set's BRDFs make weights H of functions by a quadratic form, which is exact at each BRDF and in the
-middle of each pair of them:
+Weights w of the set's BRDFs determine weights H of the functions by a quadratic form. It is exact at each BRDF, and
+halfway between each pair of BRDFs:
 
     H(w) = sum_m w_m H_m + sum_m<n w_m w_n 4 (H_mn - (H_m + H_n) / 2)
 
-H_mn is the projection of the BRDF in the middle of m and n. That is the model with the mean of their parameters, as
-`jaxprt.dynamic.DynamicBrdf.at` has it; where BRDFs are of no one model, their lobes are moved half way and what the
-lobes leave is mixed. So light that is sent to other surfaces is of the material that is seen.
+H_mn is the projection of the BRDF halfway between m and n. If the BRDFs are of one model, this is the model with the
+mean parameters, as in `jaxprt.dynamic.DynamicBrdf.at`. Otherwise their lobes are moved halfway, and the residuals of
+the lobes are averaged. Light that is sent to other surfaces thus has the material that is seen.
 """
 
 import itertools
@@ -26,15 +26,15 @@ from jaxprt.systems.dynamic import brdf_set, reflected
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import mean
 
-_ALL = 64  # BRDFs of a set all of whose pairs count where nothing says which do
-_GRAZING = 1e-3  # least cosine that a product with it is divided by
+_ALL = 64  # largest set in which, without a navigation, all pairs count
+_GRAZING = 1e-3  # smallest cosine in a division
 
 
 class Moved(eqx.Module):
-    """The BRDF in 1/sr that lobes are of.
+    """The BRDF that lobes represent, in 1/sr.
 
     Attributes:
-        lobe: A table without parameters.
+        lobe: A table of lobes without parameters.
     """
 
     lobe: LobeBrdf
@@ -45,14 +45,14 @@ class Moved(eqx.Module):
 
 
 def pairs(count: int, navigation: Line | Plane | Columns | None) -> Int[np.ndarray, "p 2"]:
-    """Pairs of a set's BRDFs in whose middle there is one: those that a navigation joins.
+    """Pairs of a set's BRDFs that have a BRDF halfway between them: those that a navigation connects.
 
     Args:
         count: Number of BRDFs in the set.
-        navigation: The way through the set. None for all pairs, or none where the set has more than 64 BRDFs.
+        navigation: The navigation through the set. If None, all pairs; or no pairs if the set has more than 64 BRDFs.
 
     Raises:
-        ValueError: The navigation is of another number of BRDFs.
+        ValueError: The navigation is for another number of BRDFs.
     """
     if navigation is None:
         every = itertools.combinations(range(count), 2) if count <= _ALL else ()
@@ -66,16 +66,17 @@ def pairs(count: int, navigation: Line | Plane | Columns | None) -> Int[np.ndarr
 def middles(
     brdfs: Sequence[Callable], lobe: LobeBrdf | None, pair: Int[np.ndarray, "p 2"]
 ) -> tuple[list[Callable], list[Callable]]:
-    """The BRDF in the middle of each pair; and of lobes also what each BRDF of the set has of them.
+    """The BRDF halfway between each pair of BRDFs.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr.
-        lobe: Their lobes, along the one parameter of the table.
-        pair: Numbers of the BRDFs.
+        lobe: Lobes of the BRDFs, along the single parameter of the table.
+        pair: Indices of the two BRDFs of each pair.
 
     Returns:
-        As many as pairs, or none where BRDFs are of no one model and there are no lobes; and as many as BRDFs, where
-        they are of no one model and there are lobes.
+        Two lists. The first has the BRDF of each pair; if the BRDFs are not of one model, it represents their lobes
+        only, and without lobes it is empty. The second has the part of each given BRDF that its lobes represent; it is
+        empty if the BRDFs are of one model, or have no lobes.
     """
     together, count = reflected.stacked(brdfs), len(brdfs)
     half = np.zeros((len(pair), count), np.float32)
@@ -96,11 +97,11 @@ def _models(together: Callable, weight: Float[Array, "p m"]) -> Callable:
 
 @partial(jit, static_argnames=("count",))
 def quadratic(factor: Float[Array, "n c h"], pair: Int[Array, "p 2"], *, count: int) -> Float[Array, "m m c h"]:
-    """Factors of each pair of BRDFs, such that half and half make what is in the middle: `brdf_set.combined`.
+    """Factors of pairs of BRDFs, such that equal weights of a pair give the BRDF halfway; for `brdf_set.combined`.
 
     Args:
-        factor: Of each BRDF, and of the middle of each pair.
-        pair: Numbers of the BRDFs; pairs that are missing are mixed linearly.
+        factor: Factors of each BRDF, followed by those of the BRDF halfway between each pair.
+        pair: Indices of the two BRDFs of each pair. Other pairs are interpolated linearly.
         count: Number of BRDFs.
     """
     own, middle = factor[:count], factor[count:]

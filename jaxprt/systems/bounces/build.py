@@ -1,4 +1,4 @@
-"""Precomputes transfer tensors: responses to direct light, one bounce, two, and patches for all that follow."""
+"""Precomputes transfer tensors for one bounce and two, and patches for diffuse light of all further bounces."""
 
 import math
 import os
@@ -21,10 +21,10 @@ from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, 
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.separable import SeparableBrdf
 
-ALL = "all"  # bounces that bring light
-_MEMBERS = 230  # vertices of a cluster
-_SEEN = 4  # visibility has faces so many times as large as the light's
-_SAMPLE = 8  # clusters that tell what a bounce is worth
+ALL = "all"  # as many bounces as contribute
+_MEMBERS = 230  # number of vertices of a cluster
+_SEEN = 4  # edge of the visibility's faces relative to that of the light's
+_SAMPLE = 8  # number of clusters from which the worth of a bounce is estimated
 
 
 def precompute(
@@ -43,37 +43,40 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> TransferTensor:
-    """Traces bounces from every vertex, and decomposes what arrives.
+    """Traces reflected light to every vertex, and compresses it into a transfer tensor.
+
+    Memory during precomputation: 24 edge^2 bytes for each vertex and light factor of its region; afterwards, for two
+    bounces, 96 bytes for each vertex, light factor and function.
 
     Args:
-        mesh: The whole scene, which lights itself.
-        brdfs: What light meets on its way, for each region in the order of their numbers: a set from
-            `jaxprt.bounces.factor`, or the one BRDF that it has for good, factored.
-        weights: Typical weights of the channels k of each region's BRDF in each color, by which `worth` is judged. None
-            for a set, and for a BRDF whose channels are colors.
-        bounces: How many times light is reflected, or "all" for as many times as it brings any. Those after the second
+        mesh: The whole scene, which reflects light onto itself.
+        brdfs: BRDFs along light paths, for each region in the order of their numbers: a set from
+            `jaxprt.bounces.factor`, or one factored BRDF that cannot change.
+        weights: For each region, typical weights of the BRDF's channels k in each color, [k, c]. They are used to
+            estimate `worth`. None for a set, and for a BRDF whose channels are colors.
+        bounces: Number of times that light is reflected, or "all" for as many as contribute. Bounces after the second
             are diffuse, between patches.
-        least: The second bounce is left out if it is worth less, see `TransferTensor.worth`; and functions that bring
-            less than this share of what arrives.
-        components: Along the vertices of a cluster, or as many as it has; half of them for two bounces.
-        modes: Along the light, or as many as it has texels.
-        edge: Edge of the light's faces in texels, a power of two.
-        size: Edge of the faces through whose texels rays are sent.
-        patches: Parts of the surfaces that exchange diffuse light, about: by them textures have the colors that they
-            have at each place, and light is reflected more than twice.
-        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed; this machine's cores if None.
-        progress: Whether to show progress bars, and to say what is left out.
+        least: Smallest worth of the second bounce; see `TransferTensor.worth`. If it is worth less, it is omitted.
+            Functions that contribute less than this fraction of the arriving light are omitted too.
+        components: Number of principal components over the vertices of a cluster, limited by the number of vertices.
+            Two bounces have half as many.
+        modes: Number of principal components over the light, limited by its number of texels.
+        edge: Edge of the light's cubemap faces in texels, a power of two.
+        size: Edge of the cubemap faces through whose texels rays are traced.
+        patches: Approximate number of patches that exchange diffuse light. They account for the spatial variation of
+            textures, and for bounces after the second.
+        path: Folder in which finished work is stored. A call that was interrupted resumes from there.
+        executor: Executor that computes the blocks of work; all cores of this machine if None.
+        progress: Whether to show progress bars, and to report what is omitted.
 
     Returns:
-        The tensor of all vertices. Meanwhile the responses of all of them are held: 24 edge^2 bytes for each vertex and
-        light factor of its region, and after that for two bounces 96 bytes for each vertex, light factor and function.
+        The tensor for all vertices.
 
     Raises:
-        TypeError: A mesh or BRDFs of another kind.
-        ValueError: Not one BRDF for each region, weights of other channels or not finite, a set without terms or with
-            lobes, bounces that are neither "all" nor a whole number of at least 1, numbers below 1, or an edge that is
-            no power of two.
+        TypeError: `mesh` is not a `Mesh`, `brdfs` is not a list, or a BRDF is neither a set nor factored.
+        ValueError: There is not one BRDF for each region; weights have another number of channels or are not finite; a
+            set has no terms, or has lobes; `bounces` is neither "all" nor a whole number of at least 1; `least` is not
+            in [0, 1); another number is below 1; or `edge` is not a power of two.
 
     Reference: Sun et al. 2007, sections 3.1 and 4.3.
     """
@@ -123,28 +126,28 @@ def precompute(
 
 
 class _Run(NamedTuple):
-    """Where blocks are computed and kept."""
+    """Where blocks of work are computed and stored."""
 
     path: str | os.PathLike | None
     executor: Executor | None
     progress: bool
 
     def compute(self, job: visibility.blocks.Job, name: str, label: str) -> dict[str, np.ndarray]:
-        """The results of a job, kept in a folder of a name."""
+        """The results of a job, stored in a folder of the given name."""
         store = None if self.path is None else os.path.join(self.path, name)
         options = {"executor": self.executor, "progress": self.progress}
         return visibility.blocks.compute(job, path=store, label=label, **options)
 
 
 class _Exchange(NamedTuple):
-    """What makes patches.
+    """Makes the patches of a scene.
 
     Attributes:
         mesh: The whole scene.
         job: The job of one bounce.
-        wanted: Number of patches, about.
-        bounces: How many in all; None for all.
-        run: Where that is done.
+        wanted: Approximate number of patches.
+        bounces: Total number of bounces; None for all.
+        run: Where the work is computed and stored.
     """
 
     mesh: Mesh
@@ -191,7 +194,7 @@ class _Exchange(NamedTuple):
         return Patches(factor, spread, *of_patch, between=between, light=light, first=once, **more)
 
     def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
-        """What bounces after the second bring, each of them or all together."""
+        """Worth of the bounces after the second: one value for each bounce, or one for all of them together."""
         place = separable.members.places(self.job.member)
         mean = patches.Means(np.asarray(made.patch), areas(self.mesh), len(made.region))
         rho = np.asarray(made.albedo(jnp.asarray(function), jnp.asarray(white[:, None], made.light.dtype)))
@@ -207,7 +210,7 @@ class _Exchange(NamedTuple):
 
 
 def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
-    """Numbers of the regions, if there is a BRDF for each."""
+    """Numbers of the regions. Refuses a list that does not have one BRDF for each region."""
     if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
         raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
     for number, each in enumerate(brdfs):
@@ -255,7 +258,7 @@ def _check_sizes(
 
 
 def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run: _Run) -> tuple[np.ndarray, ...]:
-    """What the light factors of each region make of direct light."""
+    """Response of the light factors of each region to direct light."""
     result = []
     for number, basis in zip(numbers.tolist(), bases, strict=True):
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)
@@ -268,7 +271,7 @@ def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run:
 def _second(
     job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: _Run
 ) -> tuple[SecondBounce | None, np.ndarray]:
-    """The second bounce, or None if some clusters show that it brings too little; and what it brings to vertices."""
+    """The second bounce, or None if a sample of clusters shows too little worth; and its irradiance at vertices."""
     sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
     brought = np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample])
     if _rms(brought) < least:
@@ -279,7 +282,7 @@ def _second(
 
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:
-    """Weights of the functions of a region that is white if it can be, else as it is, brightest color."""
+    """Weights of the functions of a region: white for a set, otherwise those of its BRDF in the brightest color."""
     if factor.ndim > 2:
         return np.append(np.zeros(factor.shape[-1], np.float32), np.float32(1))
     weight = np.asarray(factor) if channel is None else np.asarray(factor) @ np.asarray(channel)
@@ -287,7 +290,7 @@ def _white(factor: Array, channel: Array | None) -> np.ndarray:
 
 
 def _contributions(energy: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """What each function brings at its largest weight, as a share of what all bring."""
+    """Contribution of each function at its largest weight, relative to the contribution of all functions."""
     size = np.sqrt(energy.sum(0)) * scale
     return size / max(np.linalg.norm(size), np.finfo(np.float32).tiny)
 

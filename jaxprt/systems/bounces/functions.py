@@ -1,12 +1,12 @@
-"""BRDFs along light paths: a few functions of which all BRDFs that a region can have are sums.
+"""BRDFs along light paths: a few functions whose weighted sums represent all BRDFs that a region can have.
 
     f_h(wi, wo) ~ sum_p H(h, p) f_p(wi, wo),    f_p(wi, wo) = sum_k g_kp(wo) u_k(wi)
 
-Light that has been reflected is linear in the weights H of every surface that it met, so that transport along paths of
-functions p serves all BRDFs. Each function is factored over the two directions: a bounce is then gathers and products.
-A point receives what surfaces send it from many directions, as a few harmonics. So what they send is judged smoothed
-over directions too: 24 factors then lose .107 of what arrives, where 24 that are chosen for pictures lose .147; 32
-lose .096.
+Reflected light is linear in the weights H of every surface that it met. Transport along paths of functions p therefore
+serves all BRDFs. Each function is factored over the two directions, so that a bounce consists of gathers and products.
+A point receives reflected light from many directions and represents it by a few harmonics. The functions therefore
+minimize the error of the reflected light after smoothing over directions: 24 factors then lose 0.107 of the arriving
+light. If they are chosen for pictures, 24 lose 0.147 and 32 lose 0.096.
 """
 
 import math
@@ -28,12 +28,12 @@ from jaxprt.systems.dynamic.reflected import Reflected
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
 
-_RINGS, _SECTORS = 32, 64  # of a quadrature of what is bilinear on a map times a few harmonics
-_SMOOTH = 5  # degree of harmonics of what is sent; with 4 more is lost of light from the horizon, with 6 of all
-_FUNCTIONS = 4  # that stand for a set if it has as many BRDFs
-_TOGETHER = 64  # BRDFs and middles of pairs for which functions are chosen, and that are integrated at once
-_RANK = 1e-3  # of the largest singular value, below which float32 has no more
-_NOTHING = 1e-3  # of the largest singular value: a color that is a multiple of another
+_RINGS, _SECTORS = 32, 64  # quadrature of a bilinear map times low-order harmonics
+_SMOOTH = 5  # degree of smoothing: 4 loses more of the light from the horizon, 6 more of all light
+_FUNCTIONS = 4  # default number of functions of a set
+_TOGETHER = 64  # largest number of BRDFs, with those halfway, for which functions are chosen; and batch of integration
+_RANK = 1e-3  # smaller singular values, relative to the largest, are rounding in float32
+_NOTHING = 1e-3  # smaller singular values, relative to the largest: a color is a multiple of another
 
 
 def factor(
@@ -45,38 +45,39 @@ def factor(
     terms: int = 32,
     resolution: int = 32,
 ) -> DynamicBrdf:
-    """A set of BRDFs for light paths, decomposed whole: principal components of the set, and factors of the light.
+    """A set of BRDFs for light paths: functions that represent the set, factored over the light, without lobes.
 
-    Least squares of what the BRDFs reflect of light of natural spectrum into directions, smoothed over these to degree
-    5. Views are not compressed, since transport holds none of them. Between BRDFs of the set, the functions have the
-    weights that are the best for the BRDF that is really there, see `jaxprt.bounces.between`: a model whose parameters
-    are between, or moved lobes.
+    The decomposition minimizes the squared error of the light that the BRDFs reflect under light with a natural
+    spectrum, smoothed over outgoing directions to degree 5. Views are not compressed, because transport does not depend
+    on their number. Between BRDFs of the set, the functions' weights approximate the true BRDF, which is the model with
+    interpolated parameters, or moved lobes; see `jaxprt.bounces.between`.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
-        lobe: Their lobes, from `jaxprt.dynamic.separate`, by which BRDFs that are of no one model move. Without these,
-            such BRDFs are mixed linearly.
-        navigation: The way through the set, which tells what can be mixed with what. If None, all pairs count, or for
-            more than 64 BRDFs none: these are then mixed linearly.
-        functions: How many stand for the set. If None, four, or as many as there are BRDFs and middles of pairs, times
-            colors.
-        terms: Light factors that they share. Precomputed bounces cost in proportion.
+        lobe: Lobes of the BRDFs, from `jaxprt.dynamic.separate`. If the BRDFs are not of one model, they are
+            interpolated by moving these lobes; without lobes they are interpolated linearly.
+        navigation: The navigation through the set, which determines the pairs of BRDFs that can be mixed. If None, all
+            pairs; a set of more than 64 BRDFs is then interpolated linearly.
+        functions: Number of functions that represent the set. If None, four, or fewer if there are fewer BRDFs (with
+            those halfway between pairs) times colors.
+        terms: Number of light factors that the functions share. The cost of precomputed bounces is proportional to it.
         resolution: Edge of the square maps in texels.
 
     Returns:
-        The set, without lobes. Its error is that of what its BRDFs reflect, smoothed.
+        The set. Its error is the relative error of the smoothed light that its BRDFs reflect.
 
     Raises:
-        ValueError: As of `jaxprt.dynamic.factor`, functions or terms out of range, or a navigation of another number of
-            BRDFs.
+        ValueError: There are no BRDFs, lobes of another number of BRDFs, or different numbers of colors; a BRDF is
+            negative or not finite; `functions` or `terms` is out of range; `resolution` is below 4; or the navigation
+            is for another number of BRDFs.
 
-    Reference: Sun et al. 2007, section 3.1, in the norm of natural light in place of Frobenius'.
+    Reference: Sun et al. 2007, section 3.1, with the natural power spectrum in place of the Frobenius norm.
     """
     colors = dynamic.brdf_set.check(brdfs, lobe, resolution=resolution)
     pair = between.pairs(len(brdfs), navigation)
     middle, moved = between.middles(brdfs, lobe, pair)
     pair = jnp.asarray(pair[: len(middle)], jnp.int32)
-    # Few BRDFs leave gaps, so that functions are chosen for the middles too; many are dense enough.
+    # In a small set, functions are chosen for the BRDFs halfway too; a large set is dense enough without them.
     dense = len(brdfs) + len(middle) > _TOGETHER
     found, rest = _members(brdfs, [] if dense else middle, moved, pair, resolution)
     members = len(found.tensor) * colors
@@ -103,17 +104,19 @@ def factor(
 def shared(
     brdfs: Sequence[Callable], *, functions: int, terms: int = 32, resolution: int = 32
 ) -> tuple[SeparableBrdf, Float[Array, "m c p"]]:
-    """Functions of which each of some BRDFs and its colors is a sum, chosen as in `factor` but with all BRDFs alike.
+    """Functions that represent several BRDFs and their colors, chosen as in `factor` but with equal weights of BRDFs.
 
     Args:
-        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all of as many colors, without diffuse parts.
-        functions: How many there are for all of them; as many as BRDFs times colors at most.
-        terms: Light factors that they share, or as many as the maps hold.
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all with the same number of colors, without
+            diffuse parts.
+        functions: Number of functions, limited by the number of BRDFs times colors.
+        terms: Number of light factors that they share, limited by what the maps can represent.
         resolution: Edge of the square maps in texels.
 
     Returns:
-        The functions as colors of one factored BRDF, a diffuse one of albedo 1 last. Their weights for each BRDF and
-        color, those of the diffuse one zero; the largest weight of each of the others is 1.
+        The functions as colors of one factored BRDF, followed by a diffuse function of albedo 1; and their weights for
+        each BRDF and color. The weights of the diffuse function are zero, and the largest weight of every other
+        function is 1.
 
     Raises:
         ValueError: A BRDF is negative or not finite.
@@ -137,7 +140,7 @@ def shared(
 
 @jit
 def _evened(found: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
-    """What BRDFs reflect, each divided by the size of what it sends, and that size."""
+    """The reflected light of each BRDF, divided by its norm, and the norms."""
     sent = _smoothed(found).reshape(len(found.tensor), -1)
     size = jnp.sqrt(jnp.sum(sent**2, 1))
     size = jnp.where(size > 0, size, 1)
@@ -145,7 +148,7 @@ def _evened(found: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
 
 
 def _check_count(name: str, value: int, most: int) -> None:
-    """Refuses what is no whole number from 1 to the tensor's size."""
+    """Refuses values that are not whole numbers from 1 to the tensor's size."""
     if not isinstance(value, int | np.integer) or not 1 <= value <= most:
         raise ValueError(f"{name} must be a whole number from 1 to {most} for these BRDFs, got {value}")
 
@@ -153,7 +156,7 @@ def _check_count(name: str, value: int, most: int) -> None:
 def _members(
     brdfs: Sequence[Callable], middle: Sequence[Callable], moved: Sequence[Callable], pair: Array, resolution: int
 ) -> tuple[Reflected, Array | None]:
-    """What BRDFs and some in the middle of pairs reflect, and what lobes leave of the BRDFs where lobes move."""
+    """The reflected light of BRDFs and of those halfway between pairs; and the residual of lobes that are moved."""
     if not moved:
         return dynamic.reflected.reflect([*brdfs, *middle], None, resolution=resolution), None
     found = dynamic.reflected.reflect(brdfs, None, resolution=resolution)
@@ -166,7 +169,7 @@ def _members(
 
 
 def _middles(found: Reflected, rest: Array | None, pair: Array) -> Reflected:
-    """What BRDFs in the middle of pairs reflect: moved lobes, and the mean of what these leave."""
+    """The reflected light of BRDFs halfway between pairs: that of the moved lobes and the mean residual of the pair."""
     if rest is None:
         return found
     return found._replace(tensor=found.tensor + jnp.mean(rest[pair], 1))
@@ -174,7 +177,7 @@ def _middles(found: Reflected, rest: Array | None, pair: Array) -> Reflected:
 
 @jit
 def _smoothed(found: Reflected) -> Float[Array, "m s b"]:
-    """What each BRDF and color sends, as harmonics of the view."""
+    """The light that each BRDF and color reflects, as harmonics of the view."""
     seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
     return tucker.multiply(found.tensor.reshape(-1, *found.tensor.shape[2:]), seen, mode=1)
 
@@ -185,7 +188,7 @@ def _maps(found: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
     along, _, across = least.factor
     flat = found.tensor.reshape(-1, *found.tensor.shape[2:])
     view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, k]
-    # Light maps carry the size, so that view factors have a mean square of about one.
+    # Light maps carry the size of each term, so that view factors have a mean square of about one.
     square = jnp.einsum("hdk,d->k", view**2, found.area) / (jnp.sum(found.area) * len(flat))
     size = jnp.where(square > 0, jnp.sqrt(square), 1)
     edge = math.isqrt(len(found.area))
@@ -197,7 +200,7 @@ def _maps(found: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
 
 @jit
 def _projected(smooth: Float[Array, "n s b"], least: tucker.Tucker) -> Float[Array, "n h"]:
-    """The weights of functions that make the least error of what BRDFs send."""
+    """Least-squares weights of the functions for the light that BRDFs reflect."""
     core = least.core.reshape(len(least.core), -1)
     met = tucker.multiply(tucker.multiply(smooth, least.factor[2], mode=2), least.factor[1], mode=1)
     square = jnp.linalg.pinv(core @ core.T, rtol=_RANK**2, hermitian=True)
@@ -206,24 +209,25 @@ def _projected(smooth: Float[Array, "n s b"], least: tucker.Tucker) -> Float[Arr
 
 @jit
 def _missed(smooth: Float[Array, "n s b"], along: Float[Array, "n h"], least: tucker.Tucker) -> Float[Array, ""]:
-    """Relative error of what functions with some weights send."""
+    """Relative error of the light that functions with given weights reflect."""
     sent = tucker.Tucker(least.core, (along, *least.factor[1:])).full()
     whole = jnp.vdot(smooth, smooth)
     return jnp.sqrt(jnp.vdot(sent - smooth, sent - smooth) / jnp.where(whole > 0, whole, 1))
 
 
 def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
-    """The functions f_p, in place of the colors of a factored BRDF.
+    """The path functions f_p, as the colors of a factored BRDF.
 
     Args:
-        brdf: A set with terms, of which each rank of the set makes a function, and a constant one for the diffuse part
-            follows; or one BRDF, of which one function is made if all its colors are multiples of one.
+        brdf: A set with terms: each of its ranks makes a function, and a constant function for the diffuse part
+            follows. Or one factored BRDF: it makes as many functions as its colors need, one if all are multiples of
+            one color.
 
     Returns:
         View factors of all functions on light factors that they share.
 
     Raises:
-        ValueError: The set has no terms, or lobes, or the BRDF's light maps are per color.
+        ValueError: The set has no terms, or has lobes; or the light maps of the BRDF differ by color.
 
     Reference: Sun et al. 2007, section 3.1.
     """
@@ -239,7 +243,7 @@ def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
 
 @jit
 def _functions(core: Array, view_map: Array, light_map: Array) -> tuple[Array, Array]:
-    """Light and view maps of the functions of a set, and of a constant one."""
+    """Light and view maps of the functions of a set, followed by those of a constant function."""
     view = jnp.einsum("hoi,oyx->iyxh", core, view_map)
     light = jnp.concatenate([light_map, jnp.ones_like(light_map[:1])])[..., None]
     return light, jnp.pad(view, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
@@ -247,7 +251,7 @@ def _functions(core: Array, view_map: Array, light_map: Array) -> tuple[Array, A
 
 @partial(jit, static_argnames=("degree",))
 def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
-    """What light factors make of harmonics in the local frame: integrals over the hemisphere with the cosine.
+    """Projection of light factors on harmonics in the local frame: integrals over the hemisphere with the cosine.
 
     Reference: Sun et al. 2007, section 3.3, the matrix C of one-bounce interreflection.
     """
@@ -259,7 +263,7 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
 
 @jit
 def albedo(basis: SeparableBrdf) -> Float[Array, " p"]:
-    """Share of constant light that each function reflects, into all directions: its hemispherical albedo."""
+    """Hemispherical albedo of each function: the fraction of uniform light that it reflects into all directions."""
     up = jnp.zeros(3, basis.light_map.dtype).at[2].set(1)
     direction, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
     flux = direction[:, 2] * area
@@ -274,21 +278,21 @@ def weights(
     diffuse: Float[Array, " c"],
     specular: Float[Array, " d"],
 ) -> Float[Array, "p e"]:
-    """Weights H of a set's functions for one of its BRDFs; per color if any of the arguments is.
+    """Weights H of a set's functions for one of its BRDFs, in color if any of the arguments is.
 
-    Between BRDFs of the set the weights are those of the BRDF that is really there, see `jaxprt.bounces.between`.
+    Between BRDFs of the set, the weights approximate the true BRDF; see `jaxprt.bounces.between`.
 
     Args:
-        factor: The set's `jaxprt.dynamic.DynamicBrdf.factor`.
-        weight: The weight of each BRDF in the set, as `jaxprt.brdf.navigation` makes them.
+        factor: The attribute `factor` of the set, a `jaxprt.dynamic.DynamicBrdf`.
+        weight: Weight of each BRDF in the set. `jaxprt.brdf.navigation` makes them.
         diffuse: Albedo of the diffuse part.
-        specular: What the BRDF of the set is multiplied by.
+        specular: Factor of the set's BRDF.
 
     Returns:
-        The weights, the diffuse part's last. Differentiable in all but the set.
+        The weights, with that of the diffuse part last. Differentiable in all arguments but `factor`.
 
     Raises:
-        ValueError: The weights are not one for each BRDF of the set.
+        ValueError: There is not one weight for each BRDF of the set.
     """
     if weight.shape != factor.shape[:1]:
         raise ValueError(f"weights must be one for each of {len(factor)} BRDFs, got {list(weight.shape)}")
@@ -299,15 +303,16 @@ def weights(
 
 
 def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
-    """Weights of the functions of one BRDF, which does not change: as few as its colors need, and orthonormal.
+    """Weights of the functions of one BRDF that cannot change. They are orthonormal, and as few as its colors need.
 
     Raises:
-        ValueError: Light maps per color.
+        ValueError: The light maps of the BRDF differ by color.
     """
     if brdf.light_map.shape[-1] != 1:
         raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
     light, view = (np.asarray(each, np.float64) for each in (brdf.light_map, brdf.view_map))
     rows = view * np.sqrt(np.mean(light**2, (1, 2, 3), keepdims=True))
     _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
-    axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)  # Signs are otherwise as rounding has them.
+    # Fix the signs, which rounding would decide otherwise.
+    axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)
     return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)

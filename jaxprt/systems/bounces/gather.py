@@ -1,12 +1,12 @@
-"""Reflected light along paths of functions: what arrives at vertices after light met surfaces of given functions.
+"""Reflected light along paths of functions: the light that arrives at vertices from surfaces with given functions.
 
     R_y(l, k) = int_l u_k(w) V_y(w) (w . n) dw
     T_x(s, p, l) = sum_rays m_s sum_y b_y sum_k g_kp(wo) R_y(l, k)
 
-One bounce T is a tensor over measures s of what arrives, such as harmonics, the function p of the surface, and the
-light's texels l. It is made of the responses R of light factors u at the corners y of the triangles that rays meet,
-with their barycentric weights b, by gathers and products. The response to light that has been reflected itself makes
-the next bounce of the same steps. Functions are those of `jaxprt.bounces.functions`.
+One bounce T is a tensor over measures s of the arriving light, such as harmonics, the function p of the reflecting
+surface, and the light's texels l. It is computed from the responses R of light factors u at the corners y of the
+triangles that rays hit, with barycentric weights b, by gathers and products. The response to reflected light gives the
+next bounce by the same steps. The functions are those of `jaxprt.bounces.functions`.
 """
 
 import functools
@@ -23,22 +23,22 @@ from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.systems.bounces import functions
 from jaxprt.systems.separable import SeparableBrdf
 
-DEGREE = 3  # of the harmonics that arrive
-_HITS = 64  # in a group: their responses should stay in the cache
-_GRAZING = 1e-3  # least height of a view: interpolated normals may look away where the surface does not
+DEGREE = 3  # degree of the harmonics that arrive
+_HITS = 64  # number of hits in a group: their responses should fit in the cache
+_GRAZING = 1e-3  # smallest cosine of a view: interpolated normals may face away where the surface does not
 
 
 @functools.partial(jit, static_argnames=("edge",))
 def respond(
     seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf, *, edge: int
 ) -> Float[Array, "b l k"]:
-    """What light factors make of light from each texel of coarse faces: direct light.
+    """Response of light factors to direct light from each texel of coarse cubemap faces.
 
     Args:
         seen: Visibility of each cubemap texel in sixteenths.
-        frame: Rows are tangent, bitangent, normal.
+        frame: Frame of each vertex; rows are tangent, bitangent, normal.
         basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
-        edge: Edge of the light's faces, a divisor of the visibility's.
+        edge: Edge of the coarse faces, a divisor of that of the visibility's faces.
 
     Returns:
         Integrals over each coarse texel of light factor x visibility x cosine.
@@ -58,28 +58,28 @@ def respond(
 def respond_again(
     arriving: Float[Array, "s q b"], frame: Float[Array, "b 3 3"], basis: SeparableBrdf
 ) -> Float[Array, "b q k"]:
-    """What light factors make of light that arrives as harmonics, one response for each kind q of it.
+    """Response of light factors to light that arrives as harmonics, for each kind q of light.
 
     Args:
         arriving: SH coefficients of radiance in world directions.
-        frame: Rows are tangent, bitangent, normal.
-        basis: Functions of the surfaces.
+        frame: Frame of each vertex; rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
 
     Returns:
-        Integrals over the horizon of light factor x radiance x cosine.
+        Integrals over the hemisphere of light factor x radiance x cosine.
     """
     local = rotation.rotate_each(arriving, frame)
     return jnp.einsum("sqb,sk->bqk", local, functions.project(basis, degree=harmonics.degree_of(len(arriving))))
 
 
 class Rays(NamedTuple):
-    """Rays that meet surfaces, in groups of those of one point; where a group has fewer, weights are zero.
+    """Rays that hit surfaces, in groups that each belong to one point. Padding of a group has zero weights.
 
     Attributes:
-        owner: The point of each group.
-        corner: Vertices of the triangle that each ray meets.
-        weight: Barycentric weights in it.
-        texel: Through which each ray is sent.
+        owner: Index of the point of each group.
+        corner: Vertices of the triangle that each ray hits.
+        weight: Barycentric weights of the hit.
+        texel: Texel through which each ray is traced.
     """
 
     owner: Int[np.ndarray, " g"]
@@ -101,22 +101,22 @@ def arrive(
     *,
     points: int,
 ) -> Float[Array, "b s p l"]:
-    """What surfaces send to some points, summed over the rays of each by some measures.
+    """The light that surfaces send to some points, summed over the rays of each point with given measures.
 
     Args:
-        response: Of the light factors at all vertices of the surfaces, from `respond` or `respond_again`, with the
-            light last: along it rows are read whole, which takes a third of the time.
-        frame: Of these vertices.
-        basis: Functions of the surfaces.
-        owner: Of each group of rays the point that they arrive at; this and more as `Rays` has it.
-        corner: Vertices of the triangle that each ray meets.
-        weight: Barycentric weights in it.
+        response: Responses of the light factors at all vertices of the surfaces, from `respond` or `respond_again`. The
+            light is the last axis, so that memory is read contiguously, which is three times as fast.
+        frame: Frames of these vertices.
+        basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
+        owner: Index of the point of each group of rays; see `Rays`.
+        corner: Vertices of the triangle that each ray hits.
+        weight: Barycentric weights of the hit.
         direction: Directions of the rays.
-        measure: What each ray counts: harmonics times solid angle, or cosine times solid angle over pi.
+        measure: Weights of each ray: harmonics times solid angle, or cosine times solid angle over pi.
         points: Number of points.
 
     Returns:
-        For each point, measure, function and light.
+        The sum for each point, measure, function and light.
     """
 
     def add(total, group):
@@ -141,18 +141,19 @@ def rays(
     *,
     size: int = 16,
 ) -> dict[int, Rays]:
-    """Where rays through the texels above some points' horizons meet the fronts of surfaces.
+    """Traces rays through the texels above the horizon of some points, and finds the front faces that they hit.
 
     Args:
         occluder: The scene.
-        start: Points where rays start.
-        normal: Normals there.
+        start: Origins of the rays.
+        normal: Normals at the origins.
         frame: Frames of the scene's vertices.
-        region: Of each of the scene's vertices.
-        size: Edge of the faces through whose texels rays are sent.
+        region: Region of each vertex of the scene.
+        size: Edge of the cubemap faces through whose texels rays are traced.
 
     Returns:
-        The rays that meet each region that is met; where a triangle has corners of several, each region has its own.
+        For each region that is hit, its rays. If the corners of a triangle belong to several regions, each of them has
+        the ray, with the weights of its own corners.
     """
     point, texel, corner, barycentric, _ = visibility.hits.hits(occluder, start, normal, size=size)
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
@@ -173,13 +174,13 @@ def rays(
 
 
 def shares(normal: Float[np.ndarray, "b 3"], *, size: int) -> Float[np.ndarray, "b d"]:
-    """Share of each texel in the irradiance of points under constant light: the shares of a point sum to one."""
+    """Fraction that each texel contributes to the irradiance of points under uniform light. Rows sum to one."""
     flux = np.maximum(normal @ np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3).T, 0)
     return flux / flux.sum(1, keepdims=True)
 
 
 def cosines(normal: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "b s"]:
-    """What makes irradiance over pi of the harmonics that arrive at points."""
+    """Weights that give irradiance over pi from the harmonics that arrive at points."""
     kernel = harmonics.evaluate(jnp.asarray(normal), degree=DEGREE).T
     return np.asarray(harmonics.convolve(kernel, harmonics.cosine(degree=DEGREE) / np.pi).T, np.float32)
 
@@ -191,16 +192,16 @@ def measures(
     *,
     size: int,
 ) -> Float[np.ndarray, "*b s"]:
-    """What rays count in the harmonics that arrive: such that the irradiance of these is right.
+    """Weights of rays in the harmonics that arrive, corrected such that these give the right irradiance.
 
-    The harmonics of a ray have an irradiance that is off where the cosine has bands that are left out: near the horizon
-    they have some where there is none. The least change that mends it is along the harmonics of the cosine.
+    The truncated harmonics of a ray have a wrong irradiance, because the cosine has higher bands: for instance, it is
+    not zero just below the horizon. The smallest correction of the coefficients is along the harmonics of the cosine.
 
     Args:
-        cosine: From `cosines`, of the point at which each ray arrives.
-        texel: The texel of each ray.
-        share: Its share in the irradiance of the point.
-        size: Edge of the faces.
+        cosine: Result of `cosines` for the point at which each ray arrives.
+        texel: Texel of each ray.
+        share: Fraction that the ray contributes to the irradiance of the point under uniform light.
+        size: Edge of the cubemap faces.
     """
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
     area = np.asarray(cubemap.solid_angle(size=size), np.float32).reshape(-1, 1)

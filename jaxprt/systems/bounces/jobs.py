@@ -1,4 +1,4 @@
-"""Blocks of transfer tensors: what light factors make of direct light; one bounce and two, for clusters of vertices."""
+"""Blocks of work for transfer tensors: responses to direct light, and one bounce and two for clusters of vertices."""
 
 import functools
 import math
@@ -20,15 +20,15 @@ from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
 from jaxprt.systems.separable import SeparableBrdf
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms that make the results. A release that changes results increments one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
-DEGREE = gather.DEGREE  # of the harmonics that arrive
+DEGREE = gather.DEGREE  # degree of the harmonics that arrive
 _AGAIN = 2  # edge of the light's faces for two bounces
 
 
 @dataclass(frozen=True)
 class ResponseJob(visibility.rays.VisibilityJob):
-    """Blocks of what light factors make of direct light; see `blocks.Job`."""
+    """Responses of light factors to direct light, in blocks of vertices; see `blocks.Job`."""
 
     basis: SeparableBrdf
     edge: int
@@ -59,14 +59,16 @@ class ResponseJob(visibility.rays.VisibilityJob):
 
 @dataclass(frozen=True)
 class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
-    """What surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
+    """Light that surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
 
     Attributes:
         bases: Functions of each region.
-        response: Of their light factors, at the vertices of each region; the light is the last axis.
-        white: Weights of all functions by which a bounce is judged.
-        scale: Of all functions, by which errors of decompositions count them.
-        region: Number of each vertex's region.
+        response: Responses of their light factors, at the vertices of each region; the light is the last axis.
+        white: Weights of all functions with which the worth of a bounce is estimated.
+        scale: Weights of all functions in the errors of decompositions.
+        region: Index of each vertex's region.
+        member: Vertices of each cluster.
+        components: Number of principal components over the vertices of a cluster.
     """
 
     bases: tuple[SeparableBrdf, ...]
@@ -89,15 +91,15 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        """Sketches of the BRDFs' functions, and of what their light factors make of direct light."""
+        """Sketches of the BRDFs' functions, and of the responses of their light factors."""
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            parts |= {f"response {number}": response.swapaxes(1, 2)}  # As stores of earlier releases have it.
+            parts |= {f"response {number}": response.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
         return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
-        """Harmonics of what arrives at some vertices, before it is decomposed."""
+        """Harmonics of the light that arrives at some vertices, before compression."""
         found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
@@ -110,7 +112,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
             rays, own = found[number], np.flatnonzero(self.region == number)
             local = np.zeros(len(self.region), np.int32)
             local[own] = np.arange(len(own))
-            # Padded to a power of two groups, so that few shapes are compiled; what is added weighs nothing.
+            # Pad to a power of two groups, so that few shapes are compiled. Padding has zero weight.
             spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
             owner, corner, weight, texel = (np.concatenate([x, np.zeros((spare, *x.shape[1:]), x.dtype)]) for x in rays)
             point = np.repeat(owner[:, None], texel.shape[1], 1)
@@ -121,7 +123,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         return np.concatenate(result, 2)
 
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
-        """Irradiance over pi at each vertex of a part, by weights of functions, under constant light."""
+        """Irradiance over pi at each vertex of a part, for given weights of functions, under uniform light."""
         met = np.sum(tensor, 1)
         for _ in range(met.ndim - 2):
             met = met @ white
@@ -130,7 +132,11 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
 
 @dataclass(frozen=True)
 class TransferJob(_PathJob):
-    """Tensors of one bounce."""
+    """Tensors of one bounce.
+
+    Attributes:
+        modes: Number of principal components over the light.
+    """
 
     modes: int
 
@@ -165,18 +171,18 @@ class TransferJob(_PathJob):
         return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
-        """What arrives at some vertices, before it is decomposed."""
+        """The light that arrives at some vertices, before compression."""
         return np.moveaxis(self.arrived(part), 3, 1)
 
     def without_response(self) -> "TransferJob":
-        """The job without what it needs no longer when its blocks are done, some 40 kB for each vertex."""
+        """The job without responses: about 40 kB for each vertex that are not needed when its blocks are done."""
         none = tuple(np.zeros((0, *each.shape[1:]), each.dtype) for each in self.response)
         return replace(self, response=none)
 
     def again(
         self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int
     ) -> "AgainJob":
-        """The job of a second bounce, off surfaces that the first one lights."""
+        """The job of the second bounce, off surfaces that the first one lights."""
         fine = math.isqrt(self.response[0].shape[2] // 6)
         edge = min(_AGAIN, fine)
         shape = (len(mode), 6, edge, fine // edge, edge, fine // edge, -1)
@@ -200,7 +206,11 @@ class TransferJob(_PathJob):
 
 @dataclass(frozen=True)
 class AgainJob(_PathJob):
-    """Tensors of two bounces."""
+    """Tensors of two bounces.
+
+    Attributes:
+        function: Indices of the functions that are kept.
+    """
 
     function: np.ndarray
     system: ClassVar[str] = "transfer 2"
@@ -234,7 +244,7 @@ class AgainJob(_PathJob):
         return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
-        """What arrives at some vertices, before it is decomposed."""
+        """The light that arrives at some vertices, before compression."""
         found = self.arrived(part)[:, :, self.function]
         found = found.reshape(*found.shape[:3], -1, len(self.function))
         return found.transpose(0, 3, 1, 4, 2)
@@ -244,17 +254,17 @@ class AgainJob(_PathJob):
 def compress(
     tensor: Float[Array, "m l f"], *, components: int, modes: int
 ) -> tuple[Float[Array, "m n"], Float16[Array, "e n f"], Float[Array, "l e"], Float[Array, ""]]:
-    """Decomposes the tensor of a cluster along vertices and then along the light.
+    """Decomposes the tensor of a cluster along the vertices, and then along the light.
 
-    What is least is the squared error under light whose spectrum falls like that of natural light.
+    It minimizes the squared error under light with the natural power spectrum.
 
     Args:
-        tensor: What arrives at each vertex from each texel, of any kinds f.
-        components: Along the vertices.
-        modes: Along the light.
+        tensor: Light that arrives at each vertex from each texel, for all harmonics and functions f.
+        components: Number of principal components over the vertices.
+        modes: Number of principal components over the light.
 
     Returns:
-        Weights of each vertex, cores scaled to largest entries of 1, modes, and the relative error.
+        Weights of each vertex, cores scaled to a largest entry of 1, modes, and the relative error.
     """
     count, texels, kinds = tensor.shape
     size = haar.face_edge(texels)
@@ -275,7 +285,7 @@ def compress(
 
 @functools.partial(jit, static_argnames=("components",))
 def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Array]:
-    """The same along the vertices alone, where the light has few texels and every one counts alike."""
+    """Decomposes a tensor along the vertices only, for light of few texels that all have the same weight."""
     whole = jnp.vdot(tensor, tensor)
     _, vertex, _ = eigen.symmetric(tucker.gram(tensor, mode=0), terms=components)
     core = tucker.multiply(tensor, vertex, mode=0)
@@ -285,7 +295,7 @@ def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Ar
 
 
 def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
-    """Weights with the sizes of the core, and the core in half precision with largest entries of 1."""
+    """Weights that carry the scale of the core, and the core in half precision with a largest entry of 1."""
     size = jnp.max(jnp.abs(core), tuple(range(1, core.ndim)), initial=0)  # There may be no functions.
     size = jnp.where(size > 0, size, 1)
     return vertex * size, (core / size.reshape(-1, *[1] * (core.ndim - 1))).astype(jnp.float16)
@@ -293,6 +303,6 @@ def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
 
 @jit
 def _expand(weight: Array, core: Array, coarse: Array) -> Array:
-    """What arrives at the vertices of a cluster from each coarse texel and function, [s l q, m] as harmonics first."""
+    """Light that arrives at the vertices of a cluster from each coarse texel and function, [harmonic, l q, vertex]."""
     met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
     return jnp.einsum("mn,nslq->slqm", weight, met).reshape(core.shape[2], -1, len(weight))

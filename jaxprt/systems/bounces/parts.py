@@ -1,4 +1,4 @@
-"""Bounces between the parts of a scene, each with one BRDF of channels that its vertices weight: textures."""
+"""Bounces between the parts of a scene. Each part has one BRDF with channels that textures weight at its vertices."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,14 +22,14 @@ from jaxprt.systems.protocol import Blend
 
 
 class ReflectingPart(eqx.Module):
-    """The vertices of a part, and the BRDF with which they reflect arriving light, given in harmonics.
+    """The vertices of a part, and the BRDF with which they reflect arriving light that is given in harmonics.
 
     Attributes:
         position: Positions of the vertices.
-        frame: Their frames; rows are tangent, bitangent, normal.
+        frame: Frames of the vertices; rows are tangent, bitangent, normal.
         brdf: Table of degree 3, from `jaxprt.harmonic.tabulate`.
-        sent: Weights of the channels of the part's BRDF in the tensor, by channels of `brdf` and roughness. None where
-            both are the same channels, and what the part sends to others has one roughness.
+        sent: Weights of the tensor's functions for each channel of `brdf` and each roughness. None if the channels of
+            both are the same, and light that the part sends to others has one roughness.
     """
 
     position: Float[Array, "v 3"]
@@ -38,7 +38,7 @@ class ReflectingPart(eqx.Module):
     sent: Sent | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        """Refuses tables of another degree than that of the light that arrives."""
+        """Refuses tables of another degree than that of the arriving light."""
         require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
         if self.brdf.degree != DEGREE:
             raise ValueError(f"the BRDF must have degree {DEGREE}, that of reflected light, got {self.brdf.degree}")
@@ -46,27 +46,28 @@ class ReflectingPart(eqx.Module):
     def view(
         self, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points | None = None
     ) -> Float[Array, "lm _ _"]:
-        """Harmonics of the BRDF of each vertex or point for its view; the blend is of these."""
+        """Harmonics of the BRDF at each vertex or point for its view direction. `blend` holds the weights there."""
         return harmonic.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
 
     def combine(
         self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points | None = None
     ) -> Float[Array, "_ e"]:
-        """Radiance of reflected light; light is what arrives at the vertices."""
+        """Radiance of reflected light. `light` is what arrives at the vertices."""
         return harmonic.combine(light if points is None else points.carry(light, axis=2), view)
 
 
 class PartBounces(protocol.System):
-    """Light that the parts of a scene reflect onto each other and themselves, without the direct light.
+    """Light that the parts of a scene reflect onto each other and themselves, without direct light.
 
-    Materials are a `Blend` for each part, or None for one whose BRDF is as it was tabulated. What a part sends to
-    others has its mean weights and roughness over its area, and patch by patch the difference in albedo, as diffuse
-    light; what its vertices make of light that arrives has their own.
+    Materials are a list with one `Blend` for each part, None for a part that keeps its tabulated BRDF. Light that a
+    part sends to other surfaces has the mean weights and roughness over its area. Differences in albedo are added patch
+    by patch, as diffuse light. Light that a part sends to the eye has the weights and roughness of each vertex.
 
     Attributes:
-        tensor: From `jaxprt.bounces.precompute` with one factored BRDF for each part, of the same channels.
-        part: The parts, whose vertices follow each other.
-        points: Where radiance is asked for on each part; None for the vertices.
+        tensor: Transfer tensor from `jaxprt.bounces.precompute`, made with one factored BRDF for each part, with the
+            same channels.
+        part: The parts, in the order of the tensor's vertices.
+        points: Points on each part at which radiance is computed; None for the vertices.
     """
 
     tensor: TransferTensor
@@ -74,7 +75,7 @@ class PartBounces(protocol.System):
     points: tuple[Points, ...] | None = None
 
     def __check_init__(self):
-        """Refuses tensors of sets, of other vertices and of parts in another order."""
+        """Refuses tensors of sets, of other vertices, or of parts in another order."""
         require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
         counts = [len(each.position) for each in self.part]
         found = [each.ndim for each in self.tensor.factor]
@@ -91,13 +92,13 @@ class PartBounces(protocol.System):
             raise ValueError("the tensor's regions must be the parts in their order, one after the other")
 
     def light(self, environment: Environment) -> LitTransfer:
-        """What bounces make of a light, for all materials: `jaxprt.bounces.light_side`."""
+        """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""
         return light_side(self.tensor, environment)
 
     def shade(
         self, light: LitTransfer, materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
-        """Harmonics of the light that arrives at the vertices of each part, in their frames, with all materials."""
+        """Harmonics of the light that arrives at the vertices of each part, in their frames, given all materials."""
         require.kind("the light", light, LitTransfer, source="PartBounces.light")
         blends = list(zip(self.part, self._given(materials), strict=True))
         means = [self._mean(number, *each) for number, each in enumerate(blends)]
@@ -112,7 +113,7 @@ class PartBounces(protocol.System):
     def view(
         self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
-        """Harmonics of the BRDF of each vertex or point for its view."""
+        """Harmonics of the BRDF at each vertex or point for its view direction."""
         require.position("the eye", eye)
         rows = zip(self.part, self._given(materials), self._points(), strict=True)
         return tuple(part.view(eye, own, points) for part, own, points in rows)
@@ -129,20 +130,20 @@ class PartBounces(protocol.System):
         return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
     def at(self, points: Sequence[Points]) -> "PartBounces":
-        """Points on each part, one list after the other: `System.at`. What arrives is shaded at the vertices."""
+        """The same system at points on each part, concatenated; see `System.at`. `shade` still uses the vertices."""
         given = protocol.check_points(points, [len(each.position) for each in self.part])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points if the system was moved to points by `at`."""
         return len(self.tensor.place) if self.points is None else sum(map(len, self.points))
 
     def _points(self) -> Sequence[Points | None]:
         return [None] * len(self.part) if self.points is None else self.points
 
     def _mean(self, number: int, part: ReflectingPart, blend: Blend | None) -> Float[Array, "k c"] | None:
-        """Mean weights of a part's channels over its area; None without any."""
+        """Mean weights of the tensor's functions over a part's area; None without a blend."""
         if blend is None:
             return None
         channels = self.tensor.factor[number].shape[1] if part.sent is None else part.sent.factor.shape[1]
@@ -152,7 +153,7 @@ class PartBounces(protocol.System):
         return area_mean(blend.weight, area) if part.sent is None else part.sent.mean(blend, area)
 
     def _changes(self, blends: Sequence, means: Sequence[Array | None]) -> Float[Array, "v c"] | None:
-        """What the albedo of each vertex is more than that of its part; None without blends or patches."""
+        """Albedo of each vertex minus the mean of its part; None without blends or patches."""
         if self.tensor.patches is None or not any(mean is not None for mean in means):
             return None
         rows = []

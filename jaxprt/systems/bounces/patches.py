@@ -1,15 +1,16 @@
-"""Patches that exchange diffuse light: all bounces after the second, and what textures change in the first two.
+"""Patches that exchange diffuse light, for all bounces after the second and for textures in the first two.
 
     b_3 = rho (e_2 + F d_2),    b = b_3 + rho F b_3 + (rho F)^2 b_3 + ... = (1 - rho F)^-1 b_3
 
-Patches are parts of the clusters of a `jaxprt.bounces.TransferTensor`, each of one region. F holds form factors between
-them, from the rays of the bounces; rho is their albedo at present, e_1 and e_2 the irradiance over pi that the tensor
-brings them after one bounce and two, e_0 that of the light itself. The tensor has light sent with the mean albedo of a
-region. Patches have their own, rho + delta, and send the difference:
+A patch is a part of a cluster of a `jaxprt.bounces.TransferTensor`, within one region. F holds the form factors between
+patches, from the rays of the bounces, and rho is the current albedo of each patch. e_0 is the irradiance over pi of the
+patches from the light itself; e_1 and e_2 are those that the tensor gives after one bounce and two. In the tensor, a
+surface reflects with the mean albedo of its region, rho - delta. Patches send the difference:
 
     d_1 = delta e_0,    d_2 = delta e_1 + rho F d_1
 
-A vertex receives from the patches what its own form factors say, spread over the directions in which it sees surfaces.
+A vertex receives light from the patches by its own form factors, distributed over the directions in which it sees
+surfaces.
 """
 
 from collections.abc import Callable
@@ -29,27 +30,26 @@ from jaxprt.sphere import cubemap
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
 
-MOST = 0.9999  # albedo that a sum of all bounces counts, so that it ends in a closed room
-LEAST = 2  # vertices of a patch, on the average
+MOST = 0.9999  # largest albedo in the sum of all bounces, which must converge in a closed room
+LEAST = 2  # smallest average number of vertices of a patch
 
 
 class Patches(eqx.Module):
     """Parts of surfaces that exchange diffuse light.
 
     Attributes:
-        factor: Form factors: the share of each vertex's irradiance that each patch sends.
-        spread: How light from patches arrives at each vertex: SH coefficients in world directions of radiance that has
-            an irradiance of pi, and is the same from all surfaces that the vertex sees.
-        patch: The patch of each vertex.
-        region: The region of each patch.
-        cluster: The cluster of the tensor that each patch is part of.
-        between: Form factors from the patches (columns) to the patches (rows).
-        light: Irradiance over pi of each patch under radiance of each texel of the light.
-        first: Irradiance over pi of each patch, of the components and harmonics that its cluster has of one bounce.
-        second: The same of two bounces; None without a second bounce.
-        strength: Albedo of the functions of each region, under constant light and over all views. Zero for functions
-            that the tensor leaves out.
-        bounces: How many there are in all; None for all that bring light.
+        factor: Form factors from patches to vertices: the fraction of each vertex's irradiance that each patch sends.
+        spread: Directional distribution of light from patches at each vertex: SH coefficients, in world directions, of
+            radiance with an irradiance of pi that is equal from all surfaces that the vertex sees.
+        patch: Index of the patch of each vertex.
+        region: Region of each patch.
+        cluster: Cluster of the tensor that contains each patch.
+        between: Form factors from patches (columns) to patches (rows).
+        light: Irradiance over pi of each patch under unit radiance of each texel of the light.
+        first: Irradiance over pi of each patch for each component and harmonic of its cluster, for one bounce.
+        second: The same for two bounces; None without a second bounce.
+        strength: Hemispherical albedo of the functions of each region; zero for functions that the tensor omits.
+        bounces: Total number of bounces; None for as many as contribute.
     """
 
     factor: Float16[Array, "v j"]
@@ -65,7 +65,7 @@ class Patches(eqx.Module):
     bounces: int | None = eqx.field(static=True)
 
     def truncate(self, components: int, again: int) -> "Patches":
-        """For the first components of the tensor alone, of one bounce and of two."""
+        """Keeps the first components of the tensor, for one bounce and for two."""
         second = None if self.second is None else self.second[:, :again]
         return eqx.tree_at(
             lambda each: (each.first, each.second), self, (self.first[:, :components], second), is_leaf=_is_none
@@ -79,7 +79,7 @@ class Patches(eqx.Module):
         return of_region.at[jnp.asarray(owner)[function]].add(strength)[self.region]
 
     def means(self, value: Float[Array, "v d"], area: Float[Array, " v"]) -> Float[Array, "j d"]:
-        """Means over the area of each patch."""
+        """Means of a value of the vertices over the area of each patch."""
         whole = jnp.zeros(len(self.region), value.dtype).at[self.patch].add(area)
         total = jnp.zeros((len(self.region), value.shape[1]), value.dtype).at[self.patch].add(area[:, None] * value)
         return total / jnp.where(whole > 0, whole, 1)[:, None]
@@ -92,14 +92,14 @@ class Patches(eqx.Module):
         once: Float[Array, "j e"],
         twice: Float[Array, "j e"] | None,
     ) -> Float[Array, "j e"]:
-        """Radiance of each patch that the tensor does not have.
+        """Radiance that each patch sends in addition to the light of the tensor.
 
         Args:
-            mean: Albedo that the tensor has light sent with.
-            change: What the patch's own albedo is more than that; None for none.
-            lit: Irradiance over pi by the light itself.
-            once: By what has been reflected once.
-            twice: By what has been reflected twice; None without a second bounce.
+            mean: Albedo of each patch in the tensor, the mean of its region.
+            change: The patch's own albedo minus this mean; None for zero.
+            lit: Irradiance over pi from the light itself.
+            once: Irradiance over pi of light after one bounce.
+            twice: Irradiance over pi of light after two bounces; None without a second bounce.
         """
         rho = mean if change is None else mean + change
         result = jnp.zeros_like(once) if change is None else change * lit
@@ -123,14 +123,14 @@ class Patches(eqx.Module):
         once: Float[Array, "g e n s"],
         twice: Float[Array, "g e o s"] | None,
     ) -> Float[Array, "s _ v"]:
-        """SH coefficients, in world directions, of what arrives at each vertex and the tensor does not have.
+        """SH coefficients, in world directions, of light that arrives at each vertex in addition to that of the tensor.
 
         Args:
-            mean: As in `sent`, and so are `change` and `lit`.
-            change: The change of albedo.
-            lit: Irradiance over pi by the light itself.
-            once: Components and harmonics that each cluster of the tensor has of one bounce.
-            twice: The same of two.
+            mean: Albedo of each patch in the tensor, the mean of its region.
+            change: The patch's own albedo minus this mean; None for zero.
+            lit: Irradiance over pi from the light itself.
+            once: Components and harmonics of each cluster after one bounce.
+            twice: Components and harmonics of each cluster after two bounces; None without a second bounce.
         """
         first = jnp.sum(self.first[:, None] * once[self.cluster], (-2, -1))
         second = None
@@ -149,7 +149,7 @@ class Patches(eqx.Module):
         return jax.lax.scan(step, (start, start), length=terms - 1)[0][0]
 
     def settled(self, rho: Float[Array, "j d"], start: Float[Array, "j e"]) -> Float[Array, "j e"]:
-        """All terms: the solution of b = start + rho F b."""
+        """The sum of all terms: the solution of b = start + rho F b."""
         matrix = jnp.eye(len(rho), dtype=rho.dtype) - rho.T[:, :, None] * self.between
         if len(matrix) == 1:
             return jnp.linalg.solve(matrix[0], start)
@@ -157,8 +157,8 @@ class Patches(eqx.Module):
         return jnp.linalg.solve(matrix, each)[..., 0].T
 
     def received(self, sent: Float[Array, "j e"]) -> Float[Array, "s e v"]:
-        """SH coefficients, in world directions, of what arrives at each vertex."""
-        # Converted by parts: all at once would be held in single precision.
+        """SH coefficients, in world directions, of the light that arrives at each vertex from all patches."""
+        # Convert in parts, so that the whole matrix is never in memory in single precision.
         step = max(1, len(self.factor) // 16)
         rows = [
             self.factor[first : first + step].astype(sent.dtype) @ sent for first in range(0, len(self.patch), step)
@@ -175,7 +175,7 @@ class PatchJob(visibility.rays.VisibilityJob):
     """Form factors of blocks of vertices; see `blocks.Job`.
 
     Attributes:
-        patch: The patch of each vertex.
+        patch: Index of the patch of each vertex.
         edge: Edge of the light's faces.
     """
 
@@ -227,12 +227,12 @@ class PatchJob(visibility.rays.VisibilityJob):
 
 
 class Means(NamedTuple):
-    """Means over the area of patches, on the host.
+    """Means over the area of patches, in NumPy.
 
     Attributes:
-        patch: The patch of each vertex.
+        patch: Index of the patch of each vertex.
         area: Area of each vertex.
-        patches: How many there are.
+        patches: Number of patches.
     """
 
     patch: np.ndarray
@@ -240,7 +240,7 @@ class Means(NamedTuple):
     patches: int
 
     def of(self, value: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "j k"]:
-        """Means of some values."""
+        """Means of values of the vertices."""
         return self._each(lambda own, share: share @ np.asarray(value[own], np.float32), (value.shape[1],))
 
     def product(self, one: Float[np.ndarray, "v n"], other: Float[np.ndarray, "v s"]) -> Float[np.ndarray, "j n s"]:
@@ -267,14 +267,14 @@ def divide(
     *,
     patches: int,
 ) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, " j"], Int[np.ndarray, " j"]]:
-    """Divides clusters of vertices into patches, each of one region, whose vertices lie and face alike.
+    """Divides clusters of vertices into patches of neighboring vertices with similar normals, each within one region.
 
     Args:
         position: Positions of the vertices.
-        normal: Their normals.
-        region: Their regions.
+        normal: Normals of the vertices.
+        region: Regions of the vertices.
         member: Vertices of each cluster.
-        patches: How many, about: each region has at least one in each cluster.
+        patches: Approximate number of patches. Each region has at least one in each cluster.
 
     Returns:
         The patch of each vertex, and the region and the cluster of each patch.

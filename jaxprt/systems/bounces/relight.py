@@ -1,10 +1,10 @@
-"""Relighting with light that has been reflected once and twice, while light, view and materials are free.
+"""Relighting with light that has been reflected; light, view and materials are free.
 
     B(x, wo) = sum_s E_x(s, wo) [sum_l L(l) sum_q H(q) T1_x(l, q, s) + sum_l L(l) sum_qp H(q) H(p) T2_x(l, q, p, s)]
 
-A change of light redoes `light_side`, one of materials `arriving` and what follows, one of the view only `view_side`;
-`combine` makes radiance. What lobes of a BRDF and its other terms make of harmonics is exact: von Mises-Fisher lobes
-are zonal, so that a lobe's width is a factor for each band.
+`light_side` is recomputed when the light changes, `arriving` when the light or the materials change, and `view_side`
+when the view or the materials change. `combine` computes radiance. Harmonics of the lobes and terms of a BRDF are
+exact: von Mises-Fisher lobes are zonal, so the width of a lobe is one factor for each band.
 """
 
 import math
@@ -32,12 +32,12 @@ from jaxprt.systems.separable import SeparableBrdf
 
 
 class LitTransfer(eqx.Module):
-    """What bounces make of a light, for all materials.
+    """The tensor applied to a light, before materials are known.
 
     Attributes:
-        first: Of each cluster and color: components, harmonics and functions.
-        second: Components, harmonics, and functions of both bounces; None without a second bounce.
-        matte: Irradiance over pi that each patch has of the light itself; None without patches.
+        first: One bounce. For each cluster and color: components, harmonics and functions.
+        second: Two bounces: components, harmonics, and functions of both bounces; None without a second bounce.
+        matte: Irradiance over pi of each patch from the light itself; None without patches.
     """
 
     first: Float[Array, "g c n s q"]
@@ -46,11 +46,11 @@ class LitTransfer(eqx.Module):
 
 
 class Arriving(eqx.Module):
-    """Reflected light that arrives at the rows of a region.
+    """Reflected light that arrives at the vertices of a region.
 
     Attributes:
-        local: SH coefficients of its radiance, in the frame of each row.
-        irradiance: Its irradiance over pi: what a white diffuse surface sends on.
+        local: SH coefficients of its radiance, in the frame of each vertex.
+        irradiance: Irradiance over pi: the radiance of a white diffuse surface.
     """
 
     local: Float[Array, "s c q"]
@@ -58,12 +58,12 @@ class Arriving(eqx.Module):
 
 
 class ReflectedView(eqx.Module):
-    """What a region sends to the eye of light that arrives.
+    """How a region reflects arriving light to the eye.
 
     Attributes:
-        coefficient: Of each harmonic in the frame of each row.
-        specular: What that is multiplied by.
-        diffuse: Of irradiance over pi.
+        coefficient: Coefficients of each harmonic of the arriving light, in the frame of each vertex or point.
+        specular: Factor of these.
+        diffuse: Factor of irradiance over pi.
     """
 
     coefficient: Float[Array, "s e q"]
@@ -82,25 +82,27 @@ def radiance(
     texels: int = 16,
     samples: int = 1,
 ) -> Float[Array, "v c"]:
-    """Radiance that each vertex sends to the eye, of direct light and of light that other surfaces reflect.
+    """Radiance that each vertex sends to the eye, from direct light and from light that other surfaces reflect.
 
     Args:
         transport: Precomputed transport of direct light.
-        tensor: Precomputed bounces, of the same mesh.
-        brdfs: This and more as `jaxprt.dynamic.radiance` has it.
-        materials: Light that a textured region sends to others has the texture's mean over the region's area.
-        light: Directly by its texels, reflected by coarser ones.
+        tensor: Precomputed bounces on the same mesh.
+        brdfs: For each region, the BRDF that the transport was made for.
+        materials: For each region, its current material; None for a region with one fixed BRDF. A textured region
+            reflects light to others with its mean material; patches add the differences in albedo.
+        light: The environment. Reflected light uses it at a lower resolution.
         eye: Position of the viewer in world units.
-        texels: How many light the vertices one by one.
-        samples: Points along the edge of each of them, see `jaxprt.dynamic.radiance`.
+        texels: Number of brightest texels that are summed one by one, in direct light.
+        samples: Number of points along the edge of each of them at which the BRDF is evaluated.
 
     Returns:
-        Linear radiance per vertex in the light's units. Differentiable in the light, the eye and the materials.
+        Linear radiance of each vertex in the units of the light. Differentiable in the light, the eye and the
+        materials.
 
     Raises:
-        TypeError: As of `jaxprt.dynamic.radiance`.
-        ValueError: As `jaxprt.dynamic.radiance` has it; or the tensor is of another mesh than the transport, or
-            of another number of BRDFs.
+        TypeError: For the reasons that `jaxprt.dynamic.radiance` gives.
+        ValueError: The tensor is for another mesh than the transport, or for another number of BRDFs; or for the
+            reasons that `jaxprt.dynamic.radiance` gives.
 
     Reference: Sun et al. 2007, equations 3 and 4.
     """
@@ -112,11 +114,12 @@ def radiance(
 
 
 def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
-    """What changes with the light.
+    """Applies the tensor to a light: everything that depends on the light only.
 
     Raises:
-        TypeError: The light is no Environment.
-        ValueError: It is a batch, not finite, or its faces are no multiple of those of the tensor's light.
+        TypeError: `light` is not an `Environment`.
+        ValueError: The light is a batch or not finite, or the edge of its faces is not a multiple of that of the
+            tensor's.
     """
     if not isinstance(light, Environment):
         raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
@@ -129,9 +132,9 @@ def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
 def arriving(
     transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, materials: Sequence[Material | None]
 ) -> tuple[Arriving, ...]:
-    """What arrives at the rows of each region under a light and with all materials; no view changes it.
+    """Reflected light that arrives at the vertices of each region, given the light and all materials, for any view.
 
-    Arguments and errors as of `radiance`.
+    `radiance` describes the materials, and gives the errors.
     """
     weight, change = weights(tensor, materials), changes(tensor, materials)
     if len(tensor.place) != len(transport.place):
@@ -154,10 +157,7 @@ def _arriving(
 
 
 def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Float[Array, "q c"]:
-    """Weights of all functions that the tensor keeps, region after region.
-
-    Errors as of `radiance`.
-    """
+    """Weights of all functions that the tensor keeps, region after region. `radiance` gives the errors."""
     if len(materials) != len(tensor.factor):
         raise ValueError(f"there must be a material for each of {len(tensor.factor)} regions, got {len(materials)}")
     rows = []
@@ -178,9 +178,9 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
 
 
 def changes(tensor: TransferTensor, materials: Sequence[Material | None]) -> Float[Array, "v d"] | None:
-    """What the albedo of each vertex is more than the mean of its region; None without textures or patches.
+    """Albedo of each vertex minus the mean of its region; None without textures or patches.
 
-    The arguments are those of `weights`, which refuses wrong ones.
+    The arguments are those of `weights`, which checks them.
     """
     if tensor.patches is None:
         return None
@@ -210,7 +210,7 @@ def _gathered(function: Array, rows: Sequence[Array]) -> Array:
 
 @jit
 def area_mean(value: Float[Array, "v *c"], area: Float[Array, " v"]) -> Float[Array, "*c"]:
-    """Mean of a value over a surface, given the area of each vertex; zero if there is no area."""
+    """Mean of a value over a surface, given the area of each vertex; zero if the area is zero."""
     whole = jnp.sum(area)
     return jnp.tensordot(area, value, 1) / jnp.where(whole > 0, whole, 1)
 
@@ -223,15 +223,15 @@ def collect(
     *,
     change: Float[Array, "v e"] | None = None,
 ) -> Float[Array, "s _ v"]:
-    """SH coefficients, in world directions, of the radiance that arrives at each vertex.
+    """SH coefficients, in world directions, of the reflected radiance that arrives at each vertex.
 
     Args:
-        tensor: The bounces.
-        light: From `light_side`.
-        weight: From `weights`.
-        change: What the albedo of each vertex is more than the mean of its region; None for nothing.
+        tensor: The transfer tensor.
+        light: Result of `light_side`.
+        weight: Result of `weights`.
+        change: Result of `changes`; None for zero.
     """
-    # Products summed along the last axes: as einsums, XLA's CPU code would transpose the large operands first.
+    # Multiply and sum along the last axes: for an einsum, XLA on CPUs would transpose the large operands first.
     met, row = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight
     once, twice = met, None
     if light.second is not None and tensor.second is not None:
@@ -257,13 +257,13 @@ def view_side(
     eye: Float[Array, "3"],
     points: Sequence[Points] | None = None,
 ) -> tuple[ReflectedView, ...]:
-    """What changes with the view and the materials.
+    """Everything that depends on the view and the materials.
 
     Args:
-        transport: As in `radiance`.
-        surfaces: What each region reflects with, from `jaxprt.dynamic.mix`.
+        transport: Precomputed transport of direct light.
+        surfaces: Current BRDF of each region, from `jaxprt.dynamic.mix`.
         eye: Position of the viewer in world units.
-        points: Of each region; None for the vertices.
+        points: Points of each region; None for the vertices.
     """
     require.position("the eye", eye)
     return _view_side(transport, surfaces, eye, points)
@@ -299,10 +299,10 @@ def combine(
     """Radiance of reflected light alone.
 
     Args:
-        transport: The transport of both.
-        arriving: From `arriving`.
-        view: From `view_side`.
-        points: As in `view_side`.
+        transport: The transport that both were made with.
+        arriving: Result of `arriving`.
+        view: Result of `view_side`.
+        points: Points of each region that `view_side` was given.
     """
     rows = []
     for light, seen, at in zip(arriving, view, points or [None] * len(view), strict=True):
@@ -316,13 +316,17 @@ def combine(
 
 @partial(jit, static_argnames=("edge",))
 def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
-    """Radiance of the texels of coarser faces: light is shared by the four texels around it, by its distances.
+    """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
 
-    So a small sun is where it is, to second order; kept in one texel alone it would be in its middle. Constant light
-    stays as it is; flux is kept within 2.5 % for faces of 8 x 8, 5 % for those of 4 x 4.
+    A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
+    Constant light is preserved. Flux is preserved within 2.5 % for faces of 8 x 8 texels, and 5 % for 4 x 4.
+
+    Args:
+        radiance: Radiance of the fine texels.
+        edge: Edge of the coarse faces in texels.
 
     Raises:
-        ValueError: The coarse faces' edge does not divide the light's.
+        ValueError: The edge of the coarse faces does not divide that of the light's.
     """
     size = radiance.shape[1]
     if edge < 1 or size % edge:
@@ -348,7 +352,7 @@ def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
 
 
 def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Array, "g c *f"]:
-    """Cluster by cluster: all at once half precision would be converted in memory, at five times the cost."""
+    """Applies cores to light, cluster by cluster. Converting all half-precision cores at once is five times as slow."""
     clusters, kinds, *shape = core.shape
 
     def one(argument):
@@ -362,20 +366,20 @@ def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Ar
 def _turned(whole: Float[Array, "s c v"], vertex: Array, frame: Array) -> Arriving:
     local = rotation.rotate_each(whole[..., vertex], frame)
     cosine = harmonics.cosine(degree=DEGREE) / np.pi
-    # Of a function that is the same around the normal only m = 0 counts: l (l + 1) is its row.
+    # A function that is symmetric about the normal has m = 0 only, in row l (l + 1).
     parts = (local[l * (l + 1)] * (cosine[l] * np.sqrt((2 * l + 1) / (4 * np.pi))) for l in range(DEGREE))
     return Arriving(local, reduce(jnp.add, parts))
 
 
 @isolated
 def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, Array]:
-    """Coefficients of the lobes of each row, and albedo of their diffuse part."""
+    """Coefficients of the lobes at each vertex or point, and the albedo of their diffuse part."""
     if lobe is None:
         return jnp.zeros(((DEGREE + 1) ** 2, 1, len(position)), position.dtype), jnp.zeros_like(position[:, :1].T)
     each = lobe.lookup(directions.view(frame, position, eye))
     band = mixture.bands(each.concentration, degree=DEGREE)
     basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(each.mean, 0, -1), degree=DEGREE), -1, 0)
-    # Written out lobe by lobe: a reduction over the middle axis costs XLA's CPU code ten times as much.
+    # One lobe at a time: a reduction over the middle axis is ten times as slow with XLA on CPUs.
     lobes = range(lobe.lobes)
     strong = [[each.weight[:, i] * band[l, i] for i in lobes] for l in range(DEGREE + 1)]
     rows = [reduce(jnp.add, (strong[math.isqrt(s)][i] * basis[s, i] for i in lobes)) for s in range(len(basis))]
@@ -384,6 +388,6 @@ def _by_lobes(lobe, position: Array, frame: Array, eye: Array) -> tuple[Array, A
 
 @isolated
 def _by_terms(brdf: SeparableBrdf, position: Array, frame: Array, eye: Array) -> Array:
-    """Coefficients of a factored BRDF at each row."""
+    """Coefficients of a factored BRDF at each vertex or point."""
     view = brdf.view(directions.view(frame, position, eye))
     return jnp.einsum("sk,qke->seq", functions.project(brdf, degree=DEGREE), view)

@@ -1,4 +1,4 @@
-"""Bounces: their four verbs."""
+"""Bounces as a system: light, shade, view, combine and points."""
 
 from collections.abc import Sequence
 
@@ -22,18 +22,18 @@ from jaxprt.systems.dynamic import Material
 
 
 class BouncesSystem(protocol.System):
-    """Light that surfaces have reflected once and twice, without the direct light: `jaxprt.total` adds that.
+    """Light that surfaces have reflected at least once, without direct light; `jaxprt.total` adds the two.
 
     Attributes:
-        tensor: From `jaxprt.bounces.precompute`.
-        direct: The system of direct light, whose regions, BRDFs and materials these are.
+        tensor: Transfer tensor from `jaxprt.bounces.precompute`.
+        direct: The system of direct light, which defines the regions, BRDFs and materials.
     """
 
     tensor: TransferTensor
     direct: dynamic.DynamicSystem
 
     def __check_init__(self):
-        """Refuses other tensors, systems of other kinds, and unlike numbers of vertices."""
+        """Refuses other kinds of tensors and systems, and different numbers of vertices."""
         require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
         require.kind("the direct system", self.direct, dynamic.DynamicSystem, source="jaxprt.dynamic.DynamicSystem")
         count = len(self.direct.transport.place)
@@ -41,18 +41,18 @@ class BouncesSystem(protocol.System):
             raise ValueError(f"the tensor must be of the transport's {count} vertices, got {len(self.tensor.place)}")
 
     def light(self, environment: Environment) -> LitTransfer:
-        """What bounces make of a light, for all materials: `jaxprt.bounces.light_side`."""
+        """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""
         return light_side(self.tensor, environment)
 
     def shade(self, light: LitTransfer, materials: Sequence[Material | None] | None = None) -> tuple[Arriving, ...]:
-        """What arrives at each region, with all materials: `jaxprt.bounces.arriving`."""
+        """Reflected light that arrives at each region, given all materials: `jaxprt.bounces.arriving`."""
         require.kind("the light", light, LitTransfer, source="BouncesSystem.light")
         return arriving(self.direct.transport, self.tensor, light, self.direct.given(materials))
 
     def view(
         self, eye: Float[Array, "3"], materials: Sequence[Material | None] | None = None
     ) -> tuple[ReflectedView, ...]:
-        """What each region sends to the eye of what arrives: `jaxprt.bounces.view_side`."""
+        """How each region reflects the arriving light to the eye: `jaxprt.bounces.view_side`."""
         points = self.direct.points
         surfaces = dynamic.mix(self.direct.transport, self.direct.brdf, self.direct.given(materials), points=points)
         return view_side(self.direct.transport, surfaces, eye=eye, points=points)
@@ -66,10 +66,10 @@ class BouncesSystem(protocol.System):
         return combine(self.direct.transport, light, view, points=self.direct.points)
 
     def at(self, points: Sequence[Points]) -> "BouncesSystem":
-        """Points of each region, as of the direct system: `System.at`."""
+        """The same system at points of each region; see `DynamicSystem.at`."""
         return BouncesSystem(self.tensor, self.direct.at(points))
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points if the system was moved to points by `at`."""
         return self.direct.vertices

@@ -1,16 +1,17 @@
-"""Precomputed transfer tensors: what arrives at every vertex after one bounce and two, for any light and any BRDFs.
+"""Precomputed transfer tensors: the light that arrives at every vertex after one bounce and two.
 
     I1_x(s) = sum_l L(l) sum_q H(q) T1_x(l, q, s)
     I2_x(s) = sum_l L(l) sum_qp H(q) H(p) T2_x(l, q, p, s)
 
-One bounce has light of 6 x 8 x 8 texels l, and arrives as 16 harmonics s in world directions. q counts the functions of
-all regions, which `jaxprt.bounces.functions` makes, and H are their weights at present. For two bounces, off functions
-q and then p, the light is reduced to 6 x 2 x 2 texels, which costs 7 % error. The paper treats the second bounce as
-uniform over direction, which would cost 50 %. Vertices are clustered, and the tensors of each cluster are decomposed,
-along vertices and light. `jaxprt.bounces.radiance` makes radiance of them.
+The tensors hold for any light and any BRDFs. For one bounce the light has 6 x 8 x 8 texels l. It arrives as 16
+harmonics s in world directions. q counts the functions of all regions, from `jaxprt.bounces.functions`, and H are their
+current weights. For two bounces, off functions q and then p, the light is reduced to 6 x 2 x 2 texels, which costs 7 %
+error. The paper treats the second bounce as uniform over direction, which would cost 50 %. Vertices are clustered, and
+the tensor of each cluster is decomposed along vertices and light. `jaxprt.bounces.radiance` computes radiance from it.
 
-A third bounce in the same way would cost as many times the second as there are functions. What follows the second is
-diffuse light between patches, `jaxprt.bounces.patches`, and so is what textures change in the first two.
+A third bounce of this kind would cost as many times the second as there are functions. Bounces after the second are
+therefore diffuse light between patches; see `jaxprt.bounces.patches`. The effect of textures on the first two is also
+computed by patches.
 """
 
 import math
@@ -25,17 +26,17 @@ from jaxtyping import Array, Float, Float16, Int
 from jaxprt.compile import jit
 from jaxprt.systems.bounces.patches import Patches
 
-_FEWER = 2  # as many times fewer components have two bounces
-_LEAST = 0.01  # of the largest weight
+_FEWER = 2  # ratio of the numbers of components of one bounce and of two
+_LEAST = 0.01  # smallest scale of a function, relative to the largest
 
 
 class SecondBounce(eqx.Module):
-    """Two bounces, by clusters of vertices; `weight` holds the sizes.
+    """Light that arrives after two bounces, by clusters of vertices. `weight` carries the scale.
 
     Attributes:
-        weight: Weights of the components of its cluster, for each row.
+        weight: Weights of the components of a vertex's cluster, for each row.
         core: For each cluster: texels of the light, components, harmonics, functions of the first and second bounce.
-        error: Relative L2 error of each cluster's tensor that the components make, as that of one bounce.
+        error: Relative L2 error of each cluster's tensor due to the truncation to components.
     """
 
     weight: Float[Array, "g m o"]
@@ -43,7 +44,7 @@ class SecondBounce(eqx.Module):
     error: Float[Array, " g"]
 
     def truncate(self, components: int, *, scale: Float[Array, " q"]) -> "SecondBounce":
-        """The first components; functions count by some scale."""
+        """Keeps the first components. `scale` weights the functions in the new error."""
         core = self.core * (scale[:, None] * scale)
         energy = jnp.sum(core**2, (1, 3, 4, 5)) * jnp.sum(self.weight**2, 1)
         whole = jnp.sum(energy, 1) / jnp.maximum(1 - self.error**2, jnp.finfo(energy.dtype).eps)
@@ -53,25 +54,28 @@ class SecondBounce(eqx.Module):
 
 
 class TransferTensor(eqx.Module):
-    """One bounce and two, by clusters of vertices; `weight` holds the sizes, so that half precision holds the rest.
+    """Light that arrives after one bounce and two, by clusters of vertices.
+
+    `weight` carries the scale, so that half precision is enough for `core`.
 
     Attributes:
-        weight: Weights of the components of its cluster, for each row.
+        weight: Weights of the components of a vertex's cluster, for each row.
         core: For each cluster: modes of the light, components, harmonics and functions.
-        mode: Modes of the light of each cluster, on its texels.
+        mode: Modes of the light of each cluster, over the light's texels.
         place: Row of each vertex.
         region: Number of the region of each vertex.
-        area: Surface that each vertex stands for, a third of the triangles around it.
-        function: Numbers of the functions that are kept among those of all regions.
-        factor: What makes the weights of each region's functions: those of the BRDFs of a set, or of one BRDF.
-        second: Two bounces, if asked for and not left out.
-        error: Relative L2 error of each cluster's tensor that the decomposition makes, of functions at the largest
-            weights they can have; a difference of squares: less than 5e-4 is rounding.
-        worth: What each bounce brings to white surfaces under constant light, root mean square of irradiance over that
-            of an open surface. Regions with one BRDF count as they are. If there are all bounces, the last is that of
-            all after the second.
-        mesh: Fingerprint of the mesh, by which transport of another one is refused; empty if made by hand.
-        patches: What exchanges diffuse light: bounces after the second, and what textures change; None without.
+        area: Surface area that each vertex represents, a third of that of the triangles around it.
+        function: Indices of the functions that are kept, among those of all regions.
+        factor: For each region, what determines the weights of its functions: the factors of its set, or the weights of
+            its one BRDF.
+        second: Two bounces; None if not requested, or omitted.
+        error: Relative L2 error of each cluster's tensor due to the decomposition, with each function at its largest
+            possible weight. It is computed as a difference of squares: values below 5e-4 are rounding.
+        worth: Contribution of each bounce for white surfaces under uniform light: RMS irradiance relative to the
+            irradiance of an unoccluded surface. Regions with one BRDF use that BRDF. With "all" bounces, the last value
+            is that of all bounces after the second together.
+        mesh: Fingerprint of the mesh. Transport of another mesh is refused. Empty if the tensor was made by hand.
+        patches: Patches that exchange diffuse light, for textures and for bounces after the second; None without.
     """
 
     weight: Float[Array, "g m n"]
@@ -95,12 +99,16 @@ class TransferTensor(eqx.Module):
         return sum(each.nbytes for each in jax.tree.leaves(held))
 
     def truncate(self, components: int, *, modes: int) -> "TransferTensor":
-        """The first components and modes of one bounce, and half as many components of two.
+        """Keeps the first components and modes of one bounce, and half as many components of two.
 
-        Their errors are then larger.
+        The errors grow accordingly.
+
+        Args:
+            components: Number of components to keep.
+            modes: Number of modes to keep.
 
         Raises:
-            ValueError: Numbers below 1, or above those of the tensor.
+            ValueError: A number is below 1, or above that of the tensor.
         """
         most = self.core.shape[2], self.core.shape[1]
         if not (1 <= components <= most[0] and 1 <= modes <= most[1]):
@@ -116,10 +124,14 @@ class TransferTensor(eqx.Module):
         return TransferTensor(weight, core, self.mode[..., :modes], *same, error, self.worth, self.mesh, patches)
 
     def shorten(self, *, error: float | None = None, nbytes: int | None = None) -> "TransferTensor":
-        """The smallest tensor whose root mean square error is no larger, or that of least error that is no larger.
+        """The smallest tensor within an RMS error, or the most accurate one within a number of bytes.
+
+        Args:
+            error: Largest RMS of the clusters' errors. Give this or `nbytes`.
+            nbytes: Largest number of bytes.
 
         Raises:
-            ValueError: Neither or both of error and bytes, or one that no components and modes reach.
+            ValueError: Neither or both are given, or no numbers of components and modes reach the given one.
         """
         if (error is None) == (nbytes is None):
             raise ValueError(f"give either error or nbytes, got error={error} and nbytes={nbytes}")
@@ -153,14 +165,14 @@ class TransferTensor(eqx.Module):
 
 @jit
 def _energy(tensor: TransferTensor) -> tuple[Float[Array, "g e n"], Float[Array, " g"]]:
-    """What each mode and component holds of a cluster's tensor under light of natural spectrum, and all of it."""
+    """Squared norm of each mode and component of a cluster's tensor under natural light, and of the whole tensor."""
     size = jnp.sum(tensor.weight**2, 1)
     energy = jnp.sum((tensor.core * scales(tensor.factor)[tensor.function]) ** 2, (3, 4)) * size[:, None]
     return energy, jnp.sum(energy, (1, 2)) / jnp.maximum(1 - tensor.error**2, jnp.finfo(size.dtype).eps)
 
 
 def _patch_bytes(patches: Patches, components: int, most: int) -> int:
-    """Bytes of patches with fewer components."""
+    """Bytes of the patches with fewer components."""
     if components == most:
         return sum(each.nbytes for each in jax.tree.leaves(patches))
     shape = jax.eval_shape(lambda each: each.truncate(components, twice(components)), patches)
@@ -168,12 +180,12 @@ def _patch_bytes(patches: Patches, components: int, most: int) -> int:
 
 
 def twice(components: int) -> int:
-    """Components of two bounces beside those of one."""
+    """Number of components of two bounces, given that of one bounce."""
     return max(1, components // _FEWER)
 
 
 def scales(factor: Sequence[Array]) -> Float[Array, " q"]:
-    """Largest weights of all functions, at least a hundredth of the largest of all: half precision must hold both."""
+    """Largest weight of each function, at least a hundredth of the largest of all: half precision holds both."""
     largest = []
     for each in factor:
         size = jnp.abs(each)

@@ -1,12 +1,12 @@
-"""Reflections that sixteen harmonics are too few for: which lobes rays carry in their place, and where the rays go.
+"""Reflections that are too sharp for sixteen harmonics: the lobes that rays represent instead, and their directions.
 
-A von Mises-Fisher lobe of concentration k leaves A_l(k) of band l of the light that it is averaged over. What the lobe
-would read above the bands of the arriving light is lost to the harmonics, so narrow lobes are traced: `share` tells how
-much of each, a smooth function of its concentration. The same share is taken out of the harmonics of the BRDF, where a
-lobe has the coefficients weight * A_l(k) * Y(center), so that nothing counts twice.
+The average of light over a von Mises-Fisher lobe of concentration k scales its band l by A_l(k). Arriving light has few
+bands, so narrow lobes lose what higher bands would contribute; these lobes are traced. `share` gives the traced
+fraction of each lobe, a smooth function of its concentration. The same fraction is subtracted from the harmonics of the
+BRDF, where a lobe has the coefficients weight * A_l(k) * Y(center). Nothing is counted twice.
 
-The rays of a point are quantiles of the mixture of its narrow lobes. Where they go depends on the view and on the
-widths of the lobes, not on colors; how much each of them counts depends on colors too, and is differentiable in them.
+The rays of a point are quantiles of the mixture of its narrow lobes. Their directions depend on the view and on the
+widths of the lobes, but not on colors. Their weights depend on colors too, and are differentiable in them.
 """
 
 import math
@@ -29,9 +29,9 @@ from jaxprt.systems.lobe.narrow import share
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 
-_FEW = 0.55  # of what the lobes of a BRDF reflect: where less than this would be traced, harmonics keep it all
-_LITTLE = 0.01  # of all that is reflected
-_GOLDEN = (5**0.5 - 1) / 2  # of a turn, from one ray to the next
+_FEW = 0.55  # smallest traced fraction of what a BRDF's lobes reflect for which rays are traced
+_LITTLE = 0.01  # smallest traced fraction of all reflected light for which rays are traced
+_GOLDEN = (5**0.5 - 1) / 2  # fraction of a turn from one ray to the next
 _TINY = 1e-12
 
 
@@ -39,9 +39,9 @@ class Rays(eqx.Module):
     """The rays of some vertices or points.
 
     Attributes:
-        direction: Unit directions in the world.
-        lobe: Number of the lobe that each samples.
-        chance: How likely that one was; 0 where nothing is traced.
+        direction: Unit directions in world space.
+        lobe: Index of the lobe that each ray samples.
+        chance: Probability of that lobe; 0 where nothing is traced.
     """
 
     direction: Float[Array, "j v 3"]
@@ -50,18 +50,18 @@ class Rays(eqx.Module):
 
 
 class SharpPart(ReflectingPart):
-    """A part some of whose lobes are traced. `view` leaves these out; `rays` tells where they go.
+    """A part some of whose lobes are traced. `view` omits these lobes; `rays` gives the rays that represent them.
 
     Attributes:
         lobe: The BRDF as lobes, from `jaxprt.lobe.tabulate`, with the channels and parameters of `brdf`.
-        count: Rays of each vertex or point.
+        count: Number of rays of each vertex or point.
     """
 
     lobe: LobeBrdf
     count: int = eqx.field(static=True, default=8)
 
     def __check_init__(self):
-        """Refuses tables of another kind."""
+        """Refuses tables of other kinds, and numbers of rays below 1."""
         require.kind("the lobes", self.lobe, LobeBrdf, source="jaxprt.lobe.tabulate")
         require.at_least("the number of rays", np.asarray(self.count), 1.0)
 
@@ -72,13 +72,13 @@ class SharpPart(ReflectingPart):
         points: Points | None = None,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
-        """Harmonics of the BRDF for the view of each vertex or point, without what rays carry.
+        """Harmonics of the BRDF at each vertex or point for its view direction, without what rays represent.
 
         Args:
             eye: Position of the viewer.
-            blend: What the vertices or points are made of.
-            points: Where; None for the vertices.
-            seen: What rays carry is multiplied by this at each vertex or point; None for 1.
+            blend: Weights and parameters of the channels at the vertices or points.
+            points: The points; None for the vertices.
+            seen: Factor of what rays represent, at each vertex or point; None for 1.
         """
         return self.plain.view(eye, blend, points) - self.carried(eye, blend, points, seen)
 
@@ -89,12 +89,12 @@ class SharpPart(ReflectingPart):
         points: Points | None = None,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
-        """Harmonics of what rays carry. Arguments are those of `view`."""
+        """Harmonics of what rays represent. The arguments are those of `view`."""
         return _carried(self._lobes(eye, blend, points), blend, seen)
 
     @property
     def plain(self) -> ReflectingPart:
-        """The same part, of which nothing is traced."""
+        """The same part without tracing."""
         return ReflectingPart(self.position, self.frame, self.brdf, sent=self.sent)
 
     def rays(
@@ -104,13 +104,13 @@ class SharpPart(ReflectingPart):
         points: Points | None = None,
         seen: Float[Array, " _"] | None = None,
     ) -> Rays:
-        """The rays of each vertex or point, which colors do not move.
+        """The rays of each vertex or point. Colors do not change them.
 
         Args:
             eye: Position of the viewer.
-            parameter: That of `Blend`, for a table over some.
-            points: Where; None for the vertices.
-            seen: As in `view`.
+            parameter: Parameters of the table at the vertices or points, as in `Blend`.
+            points: The points; None for the vertices.
+            seen: Factor of what rays represent, at each vertex or point; None for 1.
         """
         position, frame = placed(self.position, self.frame, points)
         lobes = _looked_up(self.lobe, position, frame, eye, parameter)
@@ -124,7 +124,7 @@ class SharpPart(ReflectingPart):
         points: Points | None = None,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "j _ c"]:
-        """What the radiance along each ray is multiplied by: the sum over the rays is the albedo of what is traced."""
+        """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
         return _weighed(self._lobes(eye, blend, points), rays, blend, seen)
 
     def concentrations(
@@ -140,9 +140,10 @@ class SharpPart(ReflectingPart):
 
 @jit
 def _narrow(table: LobeBrdf) -> Float[Array, ""]:
-    """Part of what the lobes of a table reflect that would be traced, over views by projected solid angle.
+    """Fraction of the light reflected by a table's lobes that would be traced, averaged over views.
 
-    The largest over the table's parameters; 0 where next to all of the light is reflected by the diffuse part.
+    Views are weighted by projected solid angle. The result is the largest fraction for any parameters of the table; 0
+    if nearly all light is reflected by the diffuse part.
     """
     views = table.scale.shape[len(table.knot) + 1 :]
     if table.isotropic:
@@ -152,7 +153,7 @@ def _narrow(table: LobeBrdf) -> Float[Array, ""]:
         place = (jnp.arange(views[0]) + 0.5) / views[0] * 2 - 1
         radius = jnp.minimum(jnp.hypot(place[:, None], place), 1)
         area = jnp.ones_like(radius)
-    # Of the parabolic map with the tangent of half the angle as its radius.
+    # Projected solid angle in the parabolic map, whose radius is the tangent of half the angle.
     area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
     axes = tuple(range(-len(views), 0))
     lobe = jnp.sum(table.weight, 0)
@@ -163,13 +164,13 @@ def _narrow(table: LobeBrdf) -> Float[Array, ""]:
 
 
 def is_sharp(table: LobeBrdf) -> bool:
-    """Whether enough of what a table reflects would be traced."""
+    """Whether the traced fraction of a table's reflection is large enough to trace rays."""
     return bool(_narrow(table) > _FEW)
 
 
 @jit
 def _carried(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
-    """Harmonics, in the local frames, of what rays carry."""
+    """Harmonics, in local frames, of what rays represent."""
     strong = _strength(lobes, blend, seen)
     band = mixture.bands(lobes.concentration, degree=DEGREE)
     basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(lobes.mean, 0, -1), degree=DEGREE), -1, 0)
@@ -187,7 +188,7 @@ def _looked_up(table: LobeBrdf, position: Array, frame: Array, eye: Array, param
 
 
 def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
-    """What each lobe counts in each color, as far as it is traced."""
+    """Weight of the traced fraction of each lobe in each color."""
     traced = share(lobes.concentration)
     weight = lobes.weight * (traced if seen is None else traced * seen)
     if blend is None:
@@ -197,7 +198,7 @@ def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Ar
 
 @partial(jit, static_argnames="count")
 def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, count: int) -> Rays:
-    """Quantiles of the mixture of the narrow lobes, turned at each point by angles of its own."""
+    """Quantiles of the mixture of the narrow lobes, rotated by a random angle at each point."""
     mass = jnp.maximum(jnp.sum(lobes.weight, 0), 0) * share(lobes.concentration)
     total = jnp.sum(mass if seen is None else mass * seen, 0)
     chance = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
@@ -223,15 +224,15 @@ def _weighed(lobes: Lobes, rays: Rays, blend: Blend | None, seen: Array | None) 
     strong = _strength(lobes, blend, seen)
     taken = jnp.stack([jnp.take_along_axis(each, rays.lobe, 0) for each in strong], -1)
     weight = jnp.where(rays.chance > 0, 1 / jnp.where(rays.chance > 0, rays.chance, 1), 0)[..., None] * taken
-    # The rays hold the energy of the lobes exactly, in every color.
+    # Normalize, so that the rays have exactly the energy of the lobes in every color.
     whole, found = jnp.sum(strong, 1).T, jnp.sum(weight, 0)
     return weight * (whole / jnp.where(found > _TINY, found, 1))
 
 
 def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:
-    """Directions at angles around means, their cosine less than 1 by a drop; those below the horizon turned up."""
+    """Directions at given angles around means, with cosine 1 - drop to them. Those below the horizon are mirrored."""
     x, y, z = mean
-    # An orthonormal basis without branches: Duff et al. 2017.
+    # Branchless orthonormal basis: Duff et al. 2017.
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(z.dtype)
     a = -1 / (sign + z)
     b = x * y * a
@@ -244,7 +245,7 @@ def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:
 
 @jit
 def _scattered(position: Float[Array, "v 3"]) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
-    """Two numbers from 0 to 1 for each position, the same ones for the same position and unlike ones for neighbors."""
+    """Two hashed numbers in [0, 1) for each position: equal for equal positions, unrelated for neighbors."""
     bits = position.astype(jnp.float32).view(jnp.uint32)
     state = (
         bits[:, 0] * np.uint32(0x9E3779B1) ^ (bits[:, 1] * np.uint32(0x85EBCA77)) ^ (bits[:, 2] * np.uint32(0xC2B2AE3D))

@@ -1,9 +1,9 @@
-"""What a part whose roughness varies sends to others: weights of path functions by channel and roughness.
+"""Weights of path functions for a part whose roughness varies, by channel and roughness.
 
     H_p = sum_k w_k A(k, p, r)
 
 w_k are the weights of the channels of a `Blend`, r is the roughness or another parameter, and A is tabulated at knots
-of r. So light that is sent to other surfaces has the roughness that is seen, at each vertex.
+of r. Light that a vertex sends to other surfaces thus has the same roughness as light that it sends to the eye.
 """
 
 import equinox as eqx
@@ -16,10 +16,10 @@ from jaxprt.systems.protocol import Blend
 
 
 class Sent(eqx.Module):
-    """Weights of path functions for channels of a BRDF.
+    """Weights of path functions for the channels of a BRDF.
 
     Attributes:
-        knot: Increasing values of the parameter; empty for a BRDF without one.
+        knot: Increasing values of the parameter; empty for a BRDF without a parameter.
         factor: Weight of each function p for each channel k at each knot; one row without knots.
     """
 
@@ -27,7 +27,7 @@ class Sent(eqx.Module):
     factor: Float[Array, "n k p"]
 
     def __check_init__(self):
-        """Refuses factors of another number of knots."""
+        """Refuses factors for another number of knots."""
         knots = len(self.knot[0]) if self.knot else 1
         if len(self.knot) > 1 or len(self.factor) != knots:
             raise ValueError(
@@ -35,16 +35,16 @@ class Sent(eqx.Module):
             )
 
     def mean(self, blend: Blend, area: Float[Array, " v"]) -> Float[Array, "p c"]:
-        """Weights of the functions in the mean over a surface, given the area of each vertex."""
+        """Mean weights of the functions over a surface, given the area of each vertex."""
         return _mean(self, blend, area)
 
     def values(self, blend: Blend, value: Float[Array, " p"]) -> Float[Array, "v c"]:
-        """What the material of each vertex has of something that each function has, such as albedo."""
+        """Value of each vertex's material, given the value (such as albedo) of each function."""
         return _values(self, blend, value)
 
 
 def _shares(sent: Sent, blend: Blend) -> Float[Array, "v n"]:
-    """Weight of each knot for each vertex: linear between two of them."""
+    """Weight of each knot at each vertex, for linear interpolation."""
     if not sent.knot:
         return jnp.ones((len(blend.weight), 1), blend.weight.dtype)
     (knot,), (parameter,) = sent.knot, blend.parameter

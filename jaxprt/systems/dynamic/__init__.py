@@ -1,4 +1,4 @@
-"""The dynamic system: materials that change at run time, direct light (Sun et al. 2007)."""
+"""The dynamic system: direct light, with materials that can change at run time (Sun et al. 2007)."""
 
 from jaxprt.systems.dynamic import brdf_set, published, reflected, relight, system, transport
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed, factor, separate

@@ -1,10 +1,11 @@
-"""A set of BRDFs in a form that can change at run time: lobes of each, and what they leave as one small tensor.
+"""A set of BRDFs that can be interpolated at run time: lobes of each BRDF, and the residual as one small tensor.
 
     f(h, wi, wo) ~ lobes_h(wi, wo) + sum_ijk D(i, j, k) U^h(h, i) U^wo(wo, j) U^wi(wi, k)
 
-Transport needs the light factors U^wi alone, which all BRDFs of the set share. A BRDF chosen at run time is a
-separable one on these, with view maps of its own, and a table of lobes. Diffuse parts are kept out of the set: every
-transport has a term for them. The set is gray where its BRDFs are; of colored ones each color is a BRDF of its own.
+Transport depends only on the light factors U^wi, which all BRDFs of the set share. A BRDF that is chosen at run time is
+a separable BRDF with these light factors and its own view maps, plus a table of lobes. Diffuse parts do not belong to
+the set: every transport has a separate term for them. A set of gray BRDFs is gray. In a set of colored BRDFs, the
+tensor treats each color as a separate BRDF.
 """
 
 import math
@@ -25,17 +26,17 @@ from jaxprt.systems.lobe import LobeBrdf, tabulate
 from jaxprt.systems.lobe.table import mean
 from jaxprt.systems.separable import SeparableBrdf
 
-_GRAZING = 1e-3  # least cosine that a product with it is divided by
-_RANK = 1e-3  # of the largest singular value, below which float32 has no more
+_GRAZING = 1e-3  # smallest cosine in a division
+_RANK = 1e-3  # smaller singular values, relative to the largest, are rounding in float32
 
 
 class Mixed(eqx.Module):
-    """The BRDF at one place of a set; `__call__` gives its value in 1/sr, as far as lobes and terms carry it.
+    """The BRDF at one place of a set. `__call__` gives its value in 1/sr, as represented by lobes and terms.
 
     Attributes:
-        terms: What the lobes leave.
-        lobe: The lobes, if the set has any.
-        brdf: The model whose parameters are between those of the set, where they have such a mean.
+        terms: The separable BRDF of the residual.
+        lobe: The lobes; None if the set has none.
+        brdf: The analytic model with interpolated parameters; None if the BRDFs of the set are not of one model.
     """
 
     terms: SeparableBrdf
@@ -51,17 +52,18 @@ class Mixed(eqx.Module):
 
 
 class DynamicBrdf(eqx.Module):
-    """A set of BRDFs, without their diffuse parts.
+    """A set of BRDFs without their diffuse parts.
 
     Attributes:
-        core: D, with as many numbers along each axis as its rank: of the set, of the view, of the light.
-        factor: U^h of each BRDF and color, gray or per color; or of each pair of BRDFs, see `combined`.
-        view_map: U^wo on the view direction.
-        light_map: U^wi on the incident direction, in 1/sr; view factors of a BRDF have a mean square of about one.
-        lobe: Lobes of each BRDF, along the one parameter of the table; none if None.
-        brdf: The set as one model whose parameters have a leading axis; None where the BRDFs have no such form.
-        error: Relative L2 error of the light that all BRDFs reflect to all views, under light of natural spectrum.
-        coordinates: From local direction to coordinates in the maps.
+        core: Core tensor D, with the ranks of the set, the view and the light as its dimensions.
+        factor: Factor U^h of each BRDF and color. In sets for light paths, of each pair of BRDFs; see `combined`.
+        view_map: Factor U^wo as maps over the view direction.
+        light_map: Factor U^wi as maps over the incident direction, in 1/sr. They are scaled such that the view factors
+            of a BRDF have a mean square of about one.
+        lobe: Lobes of each BRDF, along the single parameter of the table; None without lobes.
+        brdf: The set as one model whose parameters have a leading axis; None if the BRDFs are not of one model.
+        error: Relative L2 error of the light that all BRDFs reflect to all views, under light with a natural spectrum.
+        coordinates: Function from a local direction to coordinates in the maps.
     """
 
     core: Float[Array, "h o i"]
@@ -74,7 +76,7 @@ class DynamicBrdf(eqx.Module):
     coordinates: Callable = eqx.field(static=True, default=hemisphere.parabolic_coordinates)
 
     def __reduce__(self):
-        """Pickles the function of coordinates by its name: pickle cannot take jitted functions."""
+        """Pickles the function of coordinates by name, because pickle cannot store jitted functions."""
         return objects.reduced(self)
 
     @property
@@ -90,14 +92,13 @@ class DynamicBrdf(eqx.Module):
 
     @jit
     def at(self, weight: Float[Array, " m"]) -> Mixed:
-        """The BRDF with a weight for each of the set, as `jaxprt.brdf.navigation` makes them from coordinates.
+        """The BRDF for given weights of the set's BRDFs. `jaxprt.brdf.navigation` makes weights from coordinates.
 
-        Weights sum to one. Terms are mixed, as `combined` has it. Lobes move from the place and width that they have in
-        one BRDF to those that they have in the next; the published ones are the same in all. Differentiable in the
-        weights.
+        Weights should sum to one. Factors are interpolated by `combined`. Free lobes are interpolated in position and
+        width; published lobes are the same in all BRDFs. Differentiable in the weights.
 
         Raises:
-            ValueError: The weights are not one for each BRDF of the set.
+            ValueError: There is not one weight for each BRDF of the set.
         """
         if weight.shape != (self.size,):
             raise ValueError(f"weights must be one for each of {self.size} BRDFs, got {list(weight.shape)}")
@@ -109,14 +110,15 @@ class DynamicBrdf(eqx.Module):
 
 @jit
 def combined(factor: Float[Array, "m *_ c h"], weight: Float[Array, " m"]) -> Float[Array, "c h"]:
-    """Factors of a BRDF between those of a set.
+    """Interpolated factors of a BRDF between those of a set.
 
-    Factors of each BRDF are mixed linearly. Those of each pair are mixed by a quadratic form, divided by the sum of the
-    weights: what one pair makes half and half is then free, and can be that of the BRDF which is really there.
+    Factors of single BRDFs are interpolated linearly. Factors of pairs are interpolated by a quadratic form, divided by
+    the sum of the weights. The factor of a pair can then be chosen such that equal weights of the two BRDFs give the
+    model whose parameters are halfway between.
 
     Args:
-        factor: Of each BRDF, or of each pair, with colors.
-        weight: The weight of each BRDF.
+        factor: Factors of each BRDF and color, or of each pair of BRDFs and color.
+        weight: Weight of each BRDF.
     """
     if factor.ndim == 3:
         return jnp.tensordot(weight, factor, 1)
@@ -126,10 +128,14 @@ def combined(factor: Float[Array, "m *_ c h"], weight: Float[Array, " m"]) -> Fl
 
 @jit
 def between(parameter: Float[Array, "m *c"], weight: Float[Array, " m"]) -> Float[Array, "*c"]:
-    """A parameter of a model between those of a set.
+    """Interpolated parameter of a model.
 
-    A width or exponent, which has no colors, has its mean in the logarithm if it is positive in the whole set, as lobes
-    have it; all others are mixed linearly.
+    A parameter without colors that is positive in the whole set (a width or an exponent) is interpolated in its
+    logarithm, as the lobes are. All others are interpolated linearly.
+
+    Args:
+        parameter: Value of the parameter for each BRDF of the set.
+        weight: Weight of each BRDF.
     """
     linear = jnp.tensordot(weight, parameter, 1)
     if parameter.ndim > 1:
@@ -139,15 +145,17 @@ def between(parameter: Float[Array, "m *c"], weight: Float[Array, " m"]) -> Floa
 
 
 def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable | None = None) -> LobeBrdf:
-    """Lobes of every BRDF of a set, as one table along the number of the BRDF.
+    """Fits lobes to every BRDF of a set; returns one table whose parameter is the index of the BRDF.
 
     Args:
-        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr, all isotropic or none.
-        lobes: Number of free lobes, which `jaxprt.lobe.tabulate` fits; or
-        separator: what makes a table of one BRDF: `jaxprt.lobe.published.mirror_lobes` for the published form.
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr, either all isotropic or all anisotropic.
+        lobes: Number of free lobes that `jaxprt.lobe.tabulate` fits to each BRDF.
+        separator: Function from a BRDF to its table, in place of that fit. The published form is
+            `jaxprt.lobe.published.mirror_lobes`.
 
     Raises:
-        ValueError: No BRDFs, some isotropic and some not, or as of `jaxprt.lobe.tabulate`.
+        ValueError: There are no BRDFs, some are isotropic and some are not, or for the reasons that
+            `jaxprt.lobe.tabulate` gives.
 
     Reference: Sun et al. 2007, section 4.1.
     """
@@ -177,31 +185,32 @@ def factor(
     ranks: tuple[int, int, int] | None = None,
     resolution: int = 32,
 ) -> DynamicBrdf:
-    """Makes a set of BRDFs of their lobes, and decomposes what these leave, for the light that it will meet.
+    """Makes a set of BRDFs from their lobes and a Tucker decomposition of the residual.
 
-    Of eight free lobes a percent of the light is left, and terms of that change nothing that can be seen: they need no
-    ranks. The published lobes, or none, do.
+    Eight free lobes leave a residual of about 1 %, which is not visible, so `ranks` can be None. With the published
+    lobes, or without lobes, give `ranks`.
 
-    The tensor is the light that each BRDF reflects to each view from each spherical harmonic, weighted as natural light
-    has it: least squares for the picture, as in `jaxprt.separable.factor`, whatever sharp peaks there are. Maps
-    are parabolic, and light maps limited to the band of the harmonics. The published norm and maps are
-    `jaxprt.dynamic.published.factor_tensor`.
+    The decomposed tensor holds the light that each BRDF reflects to each view from each spherical harmonic, weighted by
+    the natural power spectrum. This minimizes the squared error of pictures, as in `jaxprt.separable.factor`, even with
+    sharp peaks. Maps are parabolic. Light maps are limited to the bandwidth of the harmonics. For the published norm
+    and maps, use `jaxprt.dynamic.published.factor_tensor`.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
-        lobe: Their lobes, from `separate`; None decomposes the BRDFs whole.
-        ranks: Factors of the set, of the view and of the light; no terms if None. The published ones are (4, 8, 8) for
-            Cook-Torrance's model, 3 of the set for Blinn-Phong's.
+        lobe: Lobes of the BRDFs, from `separate`; None decomposes the whole BRDFs.
+        ranks: Ranks of the set, the view and the light; None for no tensor. The published ranks are (4, 8, 8) for
+            Cook-Torrance; Blinn-Phong has 3 for the set.
         resolution: Edge of the square maps in texels.
 
     Returns:
-        The set. Its error is what lobes and terms together leave; without terms the largest error of the lobes.
+        The set. Its error is that of lobes and tensor together; without a tensor, the largest error of the lobes.
 
     Raises:
-        ValueError: Neither lobes nor ranks, no BRDFs, lobes of another number of them, BRDFs that are negative or not
-            finite or of unequal numbers of colors, a rank below 1 or above the tensor's size, or a resolution below 4.
+        ValueError: Neither lobes nor ranks are given; there are no BRDFs; the lobes are those of another number of
+            BRDFs; a BRDF is negative or not finite; BRDFs have different numbers of colors; a rank is below 1 or above
+            the size of the tensor; or `resolution` is below 4.
 
-    Reference: Sun et al. 2007, section 3.2, equation 2, with the prior in place of their Frobenius norm.
+    Reference: Sun et al. 2007, section 3.2, equation 2, with the natural power spectrum in place of the Frobenius norm.
     """
     colors = check(brdfs, lobe, resolution=resolution)
     together = reflected.stacked(brdfs)
@@ -227,21 +236,22 @@ def decompose(
     rest: tuple[LobeBrdf | None, Callable | None],
     coordinates: Callable,
 ) -> DynamicBrdf:
-    """Tucker decomposition of what a set of BRDFs reflects, and the maps of its factors.
+    """Tucker decomposition of the light that a set of BRDFs reflects, and the maps of its factors.
 
-    View maps and then light maps are least squares with all other factors as they are, also on texels of no weight.
+    View maps, and then light maps, are the least-squares solution for fixed other factors. View maps also cover texels
+    of zero weight.
 
     Args:
-        tensor: What each BRDF and color reflects to the view of each texel from each of some kinds of light.
-        to_map: Light maps of what reflects one kind of light each.
-        weight: Root of what the square of each view counts.
-        whole: Squared norm of what the whole BRDFs reflect.
-        ranks: As of `factor`.
+        tensor: Light that each BRDF and color reflects to the view of each texel from each basis function of the light.
+        to_map: Light map that reflects the light of one basis function only, for each basis function.
+        weight: Square root of the weight of each view.
+        whole: Squared norm of the light that the whole BRDFs reflect.
+        ranks: Ranks of the set, the view and the light.
         rest: Lobes and model of the set.
-        coordinates: Of the maps.
+        coordinates: Function from a local direction to coordinates in the maps.
 
     Raises:
-        ValueError: Ranks below 1 or above the tensor's size.
+        ValueError: A rank is below 1 or above the size of the tensor.
     """
     count, colors = tensor.shape[:2]
     inside = np.flatnonzero(np.asarray(weight))
@@ -254,7 +264,7 @@ def decompose(
 
 @jit
 def _met(tensor: Array, weight: Array, inside: Array) -> tuple[Array, Array]:
-    """The tensor with BRDFs and colors in one mode, whole and with the weights of the views that have one."""
+    """The tensor with BRDFs and colors in one mode; and the same, weighted, for the views of nonzero weight only."""
     flat = tensor.reshape(-1, *tensor.shape[2:])
     return flat, flat[:, inside] * weight[inside, None]
 
@@ -263,7 +273,7 @@ def _met(tensor: Array, weight: Array, inside: Array) -> tuple[Array, Array]:
 def _maps(
     found: tucker.Tucker, flat: Array, met: Array, to_map: Array, weight: Array, whole: Array, inside: Array
 ) -> tuple[Array, ...]:
-    """Core, factor of the set, view maps and light maps of a decomposition, and their error."""
+    """Core, factor of the set, view maps, light maps and relative error of a decomposition."""
     core, (along, _, across) = found.core, found.factor
     seen = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, view, k]
     unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)
@@ -272,7 +282,7 @@ def _maps(
     square = jnp.einsum("mdk,mdl->kl", made, made)
     light = jnp.linalg.pinv(square, rtol=_RANK**2, hermitian=True) @ jnp.einsum("mdk,mdb->kb", made, met)
     left = jnp.vdot(met, met) - jnp.vdot(light, square @ light)
-    # Light maps carry the size, so that what compresses transport knows what each is worth.
+    # Light maps carry the size of each term, so that the compression of transport can weight terms by it.
     size = jnp.sqrt(jnp.diagonal(square) / (jnp.sum(weight**2) * len(flat)))
     edge = math.isqrt(len(weight))
     view, light = (each.reshape(-1, edge, edge) for each in (view.T, size[:, None] * light @ to_map))
@@ -286,7 +296,7 @@ def _maps(
 
 
 def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> int:
-    """Refuses a set without BRDFs, lobes of another set, and maps too small; returns the number of colors."""
+    """Refuses an empty set, lobes of another set, and maps that are too small; returns the number of colors."""
     if resolution < 4:
         raise ValueError(f"resolution must be at least 4, got {resolution}")
     _check_sequence(brdfs)

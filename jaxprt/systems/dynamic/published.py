@@ -1,4 +1,4 @@
-"""Sets of BRDFs as published: a Tucker decomposition of their samples."""
+"""Sets of BRDFs as in the paper: a Tucker decomposition of BRDF samples."""
 
 from collections.abc import Callable, Sequence
 
@@ -16,18 +16,27 @@ def factor_tensor(
 ) -> brdf_set.DynamicBrdf:
     """Decomposes a set of BRDFs, sampled at the texels of the orthographic disk.
 
-    Optimal in the Frobenius norm of the disk, which the largest values, those of sharp lobes and at grazing angles,
-    dominate: prefer `jaxprt.dynamic.factor` unless the published form itself is wanted. Lobes are
-    narrower than its texels and cannot be taken out of these samples; with lobes, too, take the other. The error is
-    relative, in the same norm.
+    The result is optimal in the Frobenius norm over the disk. This norm is dominated by the largest values, in sharp
+    lobes and at grazing angles: prefer `jaxprt.dynamic.factor` unless you need the published form. Lobes are narrower
+    than the texels, so they cannot be subtracted from these samples; use `jaxprt.dynamic.factor` for sets with lobes.
 
-    Arguments, result and errors as of `jaxprt.dynamic.factor`.
+    Args:
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
+        ranks: Ranks of the set, the view and the light.
+        resolution: Edge of the square maps in texels.
+
+    Returns:
+        The set. Its error is relative, in the same norm.
+
+    Raises:
+        ValueError: There are no BRDFs; a BRDF is negative or not finite; BRDFs have different numbers of colors; a rank
+            is below 1 or above the size of the tensor; or `resolution` is below 4.
 
     Reference: Sun et al. 2007, section 3.2, equation 2.
     """
     brdf_set.check(brdfs, None, resolution=resolution)
     direction, area = texels(resolution, hemisphere.disk_coordinates)
-    # Texels outside the disk, which bilinear lookup needs at the rim, count next to nothing.
+    # Texels outside the disk are needed for bilinear lookup at the rim. They get a very small weight.
     flux = jnp.sqrt(jnp.maximum(area, 1e-6 * jnp.max(area)))
     tensor = jnp.asarray(np.stack([np.asarray(tabulate(brdf, direction) * flux) for brdf in brdfs]))
     reflected.check_values([jnp.min(tensor, (1, 2, 3))])

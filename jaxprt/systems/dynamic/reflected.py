@@ -1,4 +1,4 @@
-"""What a set of BRDFs reflects of natural light: the tensor that sets and light paths decompose."""
+"""The light that a set of BRDFs reflects under natural light, as a tensor. Sets and light paths decompose it."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -18,22 +18,22 @@ from jaxprt.systems import lobe as lobe_system
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import is_isotropic
 
-DEGREE = 24  # of the natural light that the factors are chosen for
-_RINGS, _SECTORS = 48, 64  # of the quadrature around the mirror direction
-_NULL = 1e-4  # of the largest eigenvalue: harmonics that are the same on a hemisphere
+DEGREE = 24  # degree of the harmonics of natural light for which factors are chosen
+_RINGS, _SECTORS = 48, 64  # quadrature around the mirror direction
+_NULL = 1e-4  # smaller eigenvalues, relative to the largest: harmonics are linearly dependent on a hemisphere
 
 _stack = jit(lambda brdfs: jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
 
 
 class Reflected(NamedTuple):
-    """What each of some BRDFs reflects to views in the texels of a parabolic map, of light of natural spectrum.
+    """Light that BRDFs reflect to the views of a parabolic map's texels, under light with a natural power spectrum.
 
     Attributes:
-        tensor: Reflected radiance for each BRDF, color, view and harmonic.
-        to_map: Light maps of what reflects one harmonic each.
+        tensor: Reflected radiance for each BRDF, color, view and spherical harmonic of the light.
+        to_map: For each harmonic, the light map that reflects this harmonic and no other.
         direction: Unit direction of each view.
-        area: Solid angle of each view, zero outside the map's disk.
-        whole: Squared norm of what they reflect before lobes are taken out.
+        area: Solid angle of each view; zero outside the map's disk.
+        whole: Squared norm of the reflected light before lobes are subtracted.
     """
 
     tensor: Float[Array, "m c d b"]
@@ -44,11 +44,11 @@ class Reflected(NamedTuple):
 
 
 def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) -> Reflected:
-    """What BRDFs reflect without their lobes.
+    """The light that BRDFs reflect, minus that of their lobes.
 
     Args:
-        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all of as many colors.
-        lobe: Their lobes, one table along the number of the BRDF; None keeps the BRDFs whole.
+        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all with the same number of colors.
+        lobe: Lobes of the BRDFs, one table along the index of the BRDF; None to subtract nothing.
         resolution: Edge of the map of views in texels.
 
     Raises:
@@ -57,11 +57,11 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
     direction = jnp.asarray(np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3))
     area = jnp.asarray(np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel())
     together = stacked(brdfs)
-    # All at once where they are of one kind, and else one by one.
+    # BRDFs of one model are evaluated together, others one by one.
     parts = [(together, np.arange(len(brdfs)))]
     if together is None:
         parts = [(_stack((grid.as_argument(each),)), np.array([n])) for n, each in enumerate(brdfs)]
-    # Isotropic BRDFs need only one view of each height.
+    # Isotropic BRDFs need only one view at each height.
     turned = all(map(is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
     found = [_reflected(part, lobe, number, view) for part, number in parts]
@@ -73,7 +73,7 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
 
 
 def check_values(least: Sequence[Float[Array, " _"]]) -> None:
-    """Refuses BRDFs by their least values, which are not a number where any is not finite."""
+    """Refuses BRDFs by their minimum values, which are negative or NaN for a BRDF that is negative or not finite."""
     value = np.concatenate([np.asarray(each) for each in least])
     wrong = np.flatnonzero(~(value >= 0))
     if wrong.size:
@@ -84,7 +84,7 @@ def check_values(least: Sequence[Float[Array, " _"]]) -> None:
 
 
 def stacked(brdfs: Sequence[Callable]) -> Callable | None:
-    """One model whose parameters have a leading axis along the set, if all BRDFs are of one kind."""
+    """One model whose parameters have a leading axis along the set; None if the BRDFs are not of one model."""
     leaves = [jax.tree.leaves(each) for each in brdfs]
     if not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
         return None
@@ -98,7 +98,7 @@ def stacked(brdfs: Sequence[Callable]) -> Callable | None:
 def _reflected(
     brdf: Callable, lobe: LobeBrdf | None, number: Array, view: Float[Array, "d 3"]
 ) -> tuple[Float[Array, "m c d b"], Float[Array, "m c d"], Float[Array, " m"]]:
-    """What is left of each harmonic reflected to each view, the square of the whole, and the least value of a BRDF."""
+    """Residual reflected from each harmonic to each view, squared norm of the whole, and minimum value of each BRDF."""
 
     def row(wo):
         wi, area = hemisphere.arcs(lobe_system.em.mirror(wo), rings=_RINGS, sectors=_SECTORS)
@@ -121,14 +121,14 @@ def _reflected(
 
 @jit
 def _to_map(direction: Array, dual: Array) -> Array:
-    """Smooth functions of the direction of light that reflect one harmonic each, and no other."""
+    """For each harmonic, a smooth function of the light's direction that reflects this harmonic and no other."""
     smooth = dual.astype(direction.dtype) @ harmonics.evaluate(direction, degree=DEGREE).T
     return harmonics.convolve(smooth, 1 / harmonics.natural(degree=DEGREE))
 
 
 @lru_cache(maxsize=1)
 def _dual() -> np.ndarray:
-    """Inverse of the products of harmonics with each other and the cosine, on the hemisphere."""
+    """Inverse of the Gram matrix of the harmonics on the hemisphere, with the cosine as weight."""
     wi, area = hemisphere.arcs(jnp.array([0.0, 0, 1]), rings=_RINGS, sectors=_SECTORS)
     light = np.asarray(harmonics.evaluate(wi, degree=DEGREE), np.float64)
     value, vector = np.linalg.eigh(light.T @ (light * np.asarray(wi[:, 2:] * area[:, None], np.float64)))
@@ -137,7 +137,7 @@ def _dual() -> np.ndarray:
 
 
 def _heights(direction: Array) -> tuple[Array, np.ndarray]:
-    """A view in the x z plane for each height among some, and which of these every direction has."""
+    """One view in the xz plane for each height among some directions, and the index of each direction's height."""
     height, first, back = np.unique(np.round(np.asarray(direction)[:, 2], 5), return_index=True, return_inverse=True)
     height = np.asarray(direction)[first, 2]
     return jnp.asarray(np.stack([np.sqrt(1 - height**2), 0 * height, height], -1)), back
@@ -145,7 +145,7 @@ def _heights(direction: Array) -> tuple[Array, np.ndarray]:
 
 @jit
 def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float[Array, "d 3"]) -> Array:
-    """Harmonics of what is reflected to views in the x z plane, turned about the normal to where the views are."""
+    """Rotates the harmonics reflected to views in the xz plane about the normal, to the azimuth of each view."""
     azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])
     order = np.concatenate([np.arange(-each, each + 1) for each in range(DEGREE + 1)])
     opposite = np.arange(len(order)) - 2 * order
@@ -155,6 +155,6 @@ def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float
 
 
 def _one(table: LobeBrdf, number) -> LobeBrdf:
-    """Lobes of one of the set."""
+    """Lobes of one BRDF of the set."""
     mean, weight = table.mean[:, :, number], table.weight[:, :, number]
     return LobeBrdf(mean, table.scale[:, number], weight, table.diffuse[:, number], (), table.error)

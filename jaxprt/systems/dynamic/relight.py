@@ -1,9 +1,9 @@
-"""Relighting with materials that change: light, view and the BRDF of every region are free.
+"""Relighting with materials that change: the light, the view and the BRDF of every region are free.
 
     B(x, wo) = sum_ijk D(i, j, k) U^h(h, i) U^wo(wo, j) sum_l C_l U_x^I(l, k) + lobes + diffuse
 
-A change of light redoes `light_side`, a change of view or of materials `view_side`; the caller keeps the other, and
-`combine` makes radiance of both.
+`light_side` is recomputed when the light changes, and `view_side` when the view or the materials change. The caller
+keeps the other result. `combine` computes radiance from both.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.separable.factorization import check_mark
 from jaxprt.visibility.points import PointVisibility
 
-_ROUNDED = 1e-4  # By which a sum of weights is off where they are in single precision.
+_ROUNDED = 1e-4  # tolerance for the sum of weights in single precision
 
 
 def _floating(value: ArrayLike) -> Array:
@@ -35,16 +35,17 @@ def _floating(value: ArrayLike) -> Array:
 
 
 class Material(eqx.Module):
-    """What a region is made of at present. Numbers, lists and NumPy arrays become arrays.
+    """The current material of a region. Numbers, lists and NumPy arrays are converted to JAX arrays.
 
     Relighting refuses weights that are negative or do not sum to one, negative colors, and values that are not finite.
-    Inside `jax.jit`, `jax.grad` and the like values are not known, and nothing is refused: weights that sum to two make
-    twice as bright lobes, and a NaN in one region reaches every vertex to which that region sends light.
+    Inside `jax.jit`, `jax.grad` and other transformations, values are unknown and not checked: weights that sum to two
+    make the lobes twice as bright, and a NaN in one region reaches every vertex that receives light from it.
 
     Attributes:
-        weight: The weight of each BRDF in the region's set; `jaxprt.brdf.navigation` makes weights from coordinates.
-        diffuse: Albedo of the diffuse part: gray, a color, or a texture of one for each vertex of the mesh.
-        specular: What the BRDF of the set is multiplied by; the same.
+        weight: Weight of each BRDF in the region's set. `jaxprt.brdf.navigation` makes weights from coordinates.
+        diffuse: Albedo of the diffuse part: gray [1], a color [3], or one of these for each vertex of the mesh (a
+            texture).
+        specular: Factor of the set's BRDF, in the same form.
     """
 
     weight: Float[Array, " m"] = eqx.field(converter=_floating)
@@ -53,14 +54,14 @@ class Material(eqx.Module):
 
 
 class DynamicLight(eqx.Module):
-    """What a light is for all regions.
+    """The light, projected for all regions.
 
     Attributes:
-        met: What each row and term of each region takes of it.
-        blurred: The same light for lobes; None where no region has any.
-        texel: Its brightest texels, which are lit by one by one.
+        met: Projection on the transport of each vertex and term, for each region.
+        blurred: The light, prefiltered for lobes; None if no region has lobes.
+        texel: Indices of the brightest texels, which are summed one by one.
         excess: Their radiance.
-        matte: What white diffuse rows make of them.
+        matte: Their irradiance over pi at the vertices of each region.
     """
 
     met: tuple[Float[Array, "_ _ c"], ...]
@@ -71,12 +72,12 @@ class DynamicLight(eqx.Module):
 
 
 class RegionBrdf(eqx.Module):
-    """What a region reflects with at present: the BRDF that its material makes of its set.
+    """The current BRDF of a region: the one that its material selects from its set.
 
     Attributes:
-        brdf: The BRDF.
-        diffuse: Albedo of each row or of all; None in a region that does not change.
-        specular: What all but the diffuse part is multiplied by, of each row or of all; None likewise.
+        brdf: The BRDF without its diffuse part, or the fixed BRDF.
+        diffuse: Albedo of the diffuse part, at each vertex or point, or one for all; None for a fixed BRDF.
+        specular: Factor of the BRDF without its diffuse part, in the same form; None for a fixed BRDF.
     """
 
     brdf: Mixed | SeparableBrdf
@@ -85,13 +86,13 @@ class RegionBrdf(eqx.Module):
 
 
 class RegionView(eqx.Module):
-    """What a view and a material are for one region.
+    """What depends on the view and the material, for one region.
 
     Attributes:
-        surface: What the region reflects with.
-        factor: Of each row and term without the diffuse one, if there are others.
-        looked: Where rows read the light for their lobes, if there are any.
-        points: Whose rows these are, numbered as the region's vertices are; None for these.
+        surface: The current BRDF of the region.
+        factor: View factors of each vertex or point and term, without the diffuse term; None if there is no other term.
+        looked: Where each vertex or point reads the prefiltered light for its lobes; None without lobes.
+        points: The points, whose corners are indices within the region; None for the vertices.
     """
 
     surface: RegionBrdf
@@ -101,11 +102,11 @@ class RegionView(eqx.Module):
 
 
 class DynamicView(eqx.Module):
-    """What a view and all materials are.
+    """What depends on the view and all materials.
 
     Attributes:
         eye: Position of the viewer in world units.
-        region: Of each region.
+        region: View of each region.
     """
 
     eye: Float[Array, "3"]
@@ -126,24 +127,26 @@ def radiance(
 
     Args:
         transport: Precomputed transport.
-        brdfs: Of each region, those that the transport was made for.
-        materials: Of each region, what it is made of at present; None where that does not change.
+        brdfs: For each region, the BRDF that the transport was made for.
+        materials: For each region, its current material; None for a region with one fixed BRDF.
         light: The environment.
         eye: Position of the viewer in world units.
-        texels: How many of the brightest texels light the vertices one by one.
-        samples: Points along the edge of each at which the BRDF is taken; `jaxprt.bright_texels.samples_for` of the
-            sharpest material tells how many it needs.
+        texels: Number of brightest texels that are summed one by one.
+        samples: Number of points along the edge of each of them at which the BRDF is evaluated.
+            `jaxprt.bright_texels.samples_for` computes the number that a BRDF needs; use the sharpest material.
 
     Returns:
-        Linear radiance per vertex in the light's units; slightly negative values occur at shadow boundaries.
+        Linear radiance of each vertex in the units of the light. Slightly negative values occur at shadow boundaries.
         Differentiable in the light, the eye and the materials.
 
     Raises:
-        TypeError: The light is no Environment, a BRDF is neither dynamic nor factored, or a material is no Material.
-        ValueError: Not one BRDF and material for each region, a material where none can change or none where one must
-            be, weights of another number of BRDFs, colors of two or more than three channels, values that `Material`
-            refuses, an eye that is not one position, a light of another size, or an eye or a light that is not finite.
-            Inside `jax.jit` values are not known: NaN then reaches the vertices that read it.
+        TypeError: `light` is not an `Environment`, a BRDF is neither a set nor factored, or a material is not a
+            `Material`.
+        ValueError: There is not one BRDF and one material for each region; a material is given for a fixed BRDF, or
+            missing for a set; the number of weights differs from that of the set's BRDFs; a color does not have one or
+            three channels; a material has values that `Material` refuses; the light has another size; or the eye or the
+            light has a wrong shape or is not finite. Inside `jax.jit` values are unknown: NaN then reaches the vertices
+            that read it.
 
     Reference: Sun et al. 2007, equation 3 with direct lighting, and section 4.1.
     """
@@ -152,9 +155,16 @@ def radiance(
 
 
 def light_side(transport: DynamicTransport, light: Environment, *, texels: int = 16) -> DynamicLight:
-    """What changes with the light.
+    """Computes everything that depends on the light only.
 
-    Arguments and errors are those of `radiance`.
+    Args:
+        transport: Precomputed transport.
+        light: The environment.
+        texels: Number of brightest texels that are summed one by one.
+
+    Raises:
+        TypeError: `light` is not an `Environment`.
+        ValueError: The light is a batch, has another size than the transport requires, or is not finite.
     """
     size = transport.size
     if not isinstance(light, Environment):
@@ -180,9 +190,16 @@ def view_side(
     eye: Float[Array, "3"],
     points: Sequence[Points] | None = None,
 ) -> DynamicView:
-    """What changes with the view and the materials, at the vertices or at points of each region.
+    """Computes everything that depends on the view and the materials, at the vertices or at points of each region.
 
-    Arguments and errors are those of `radiance`.
+    `radiance` gives the errors.
+
+    Args:
+        transport: Precomputed transport.
+        brdfs: For each region, the BRDF that the transport was made for.
+        materials: For each region, its current material; None for a region with one fixed BRDF.
+        eye: Position of the viewer in world units.
+        points: Points of each region; None for the vertices.
     """
     eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
     require.position("the eye", eye)
@@ -213,9 +230,15 @@ def mix(
     *,
     points: Sequence[Points] | None = None,
 ) -> tuple[RegionBrdf, ...]:
-    """What each region reflects with, at its vertices or at points: what changes with the materials alone.
+    """Computes the current BRDF of each region, at its vertices or at points. It depends on the materials only.
 
-    Arguments and errors are those of `radiance`.
+    `radiance` gives the errors.
+
+    Args:
+        transport: Precomputed transport.
+        brdfs: For each region, the BRDF that the transport was made for.
+        materials: For each region, its current material; None for a region with one fixed BRDF.
+        points: Points of each region; None for the vertices.
     """
     _check_all(transport, brdfs, materials)
     return _mix(transport, brdfs, materials, [None] * len(transport.region) if points is None else points)
@@ -240,10 +263,10 @@ def combine(
     """Radiance of a view under a light.
 
     Args:
-        transport: The transport of both.
-        light: From `light_side`.
-        view: From `view_side`.
-        samples: As in `radiance`.
+        transport: The transport that both were made with.
+        light: Result of `light_side`.
+        view: Result of `view_side`.
+        samples: Number of points along the edge of each bright texel at which the BRDF is evaluated.
     """
     result = []
     for own, met, matte, each in zip(transport.region, light.met, light.matte, view.region, strict=True):
@@ -270,7 +293,7 @@ def _mixed(brdf: DynamicBrdf, weight: Array) -> Mixed:
 
 
 def _glossy(view: LobeView) -> LobeView:
-    """Lobes alone: their diffuse part is lit by the diffuse term."""
+    """The lobes without their diffuse part, which the diffuse term lights instead."""
     return eqx.tree_at(lambda each: each.diffuse, view, jnp.zeros_like(view.diffuse))
 
 
@@ -287,7 +310,7 @@ def _sum(met, factor, glossy, single, matte, diffuse, specular) -> Array:
 
 @jit
 def _gathered(rows: tuple[Array, ...], place: Array | None) -> Array:
-    """Rows of all regions in the mesh's order of vertices; those of points one region after the other."""
+    """Values of all regions in the mesh's order of vertices; values at points are concatenated region by region."""
     colors = max(each.shape[1] for each in rows)
     whole = jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
     return whole if place is None else whole[place]
@@ -315,7 +338,7 @@ def _check_all(transport: DynamicTransport, brdfs: Sequence, materials: Sequence
 
 
 def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:
-    """Refuses what does not fit a region."""
+    """Refuses a BRDF and a material that do not fit a region."""
     source = "jaxprt.dynamic.factor or jaxprt.separable.factor"
     require.kind(f"the BRDF of region {number}", brdf, DynamicBrdf, SeparableBrdf, source=source)
     changes = isinstance(brdf, DynamicBrdf)
@@ -331,17 +354,17 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
 
 
 def check_material(number: int, material: Material, brdfs: int, vertices: int) -> None:
-    """Refuses a material that does not fit its region, or has values that no material has.
+    """Refuses a material that does not fit its region, or has invalid values.
 
     Args:
-        number: Of the region, for the message.
-        material: What the region is made of. Inside `jax.jit` only its shapes are checked.
-        brdfs: How many the region's set has.
-        vertices: Of the mesh.
+        number: Number of the region, for the message.
+        material: Material of the region. Inside `jax.jit` only its shapes are checked.
+        brdfs: Number of BRDFs in the region's set.
+        vertices: Number of vertices of the mesh.
 
     Raises:
-        TypeError: It is no Material.
-        ValueError: As `Material` and `radiance` have it.
+        TypeError: `material` is not a `Material`.
+        ValueError: The number of weights or the shape of a color is wrong, or a value is one that `Material` refuses.
     """
     if not isinstance(material, Material):
         raise TypeError(f"the material of region {number} must be a Material, got {type(material).__name__}")

@@ -1,4 +1,4 @@
-"""The dynamic system: its four verbs."""
+"""The dynamic system: light, view, combine and points."""
 
 from collections.abc import Sequence
 
@@ -16,16 +16,17 @@ from jaxprt.systems.separable import SeparableBrdf
 
 
 class DynamicSystem(protocol.System):
-    """Transport by regions, and for each region a set of BRDFs among which its material moves. Direct light.
+    """Direct light on a mesh of regions. Each region has a set of BRDFs, within which its material can change.
 
-    Materials are one `Material` for each region, None for one that has its BRDF for good.
+    Materials are a list with one `Material` for each region, None for a region with one fixed BRDF.
 
     Attributes:
-        transport: From `jaxprt.dynamic.precompute`.
-        brdf: One for each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
-        texels: How many of the brightest texels light the vertices one by one.
-        samples: Points along the edge of each at which the BRDF is taken, see `jaxprt.bright_texels.samples_for`.
-        points: Where in each region radiance is asked for; None for the vertices.
+        transport: Transport from `jaxprt.dynamic.precompute`.
+        brdf: BRDF of each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
+        texels: Number of brightest texels that are summed one by one.
+        samples: Number of points along the edge of each of them at which the BRDF is evaluated; see
+            `jaxprt.bright_texels.samples_for`.
+        points: Points on each region at which radiance is computed; None for the vertices.
     """
 
     transport: DynamicTransport
@@ -46,24 +47,24 @@ class DynamicSystem(protocol.System):
             )
 
     def light(self, environment: Environment) -> DynamicLight:
-        """What a light is for all regions: `jaxprt.dynamic.light_side`."""
+        """Projects an environment for all regions: `jaxprt.dynamic.light_side`."""
         return light_side(self.transport, environment, texels=self.texels)
 
     def view(self, eye: Float[Array, "3"], materials: Sequence[Material | None] | None = None) -> DynamicView:
-        """What a view and all materials are: `jaxprt.dynamic.view_side`."""
+        """What depends on the view and the materials: `jaxprt.dynamic.view_side`."""
         return view_side(self.transport, self.brdf, self.given(materials), eye=eye, points=self.points)
 
     def combine(self, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
-        """Radiance of direct light."""
+        """Radiance in direct light."""
         require.kind("the light", light, DynamicLight, source="DynamicSystem.light")
         require.kind("the view", view, DynamicView, source="DynamicSystem.view")
         return combine(self.transport, light, view, samples=self.samples)
 
     def given(self, materials: Sequence[Material | None] | None) -> Sequence[Material | None]:
-        """The materials; where none are given, None for each region.
+        """The materials; None for each region if none are given.
 
         Raises:
-            TypeError: They are no sequence.
+            TypeError: `materials` is not a sequence.
         """
         if materials is None:
             return [None] * len(self.brdf)
@@ -72,11 +73,14 @@ class DynamicSystem(protocol.System):
         return materials
 
     def at(self, points: Sequence[Points]) -> "DynamicSystem":
-        """Points of each region, numbered as its vertices are, one list after the other: `System.at`."""
+        """The same system at points of each region, concatenated; see `System.at`.
+
+        Corners of the points are indices into the vertices of their region.
+        """
         given = protocol.check_points(points, [len(each.seen.position) for each in self.transport.region])
         return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices, or of points if the system was moved to points by `at`."""
         return len(self.transport.place) if self.points is None else sum(map(len, self.points))

@@ -1,8 +1,8 @@
-"""Transport of scenes whose materials change: what each region of a mesh needs for the BRDFs that it can have.
+"""Transport of scenes whose materials change: for each region of a mesh, what its set of BRDFs requires.
 
-Direct light meets the light factors of a region's set of BRDFs, which all of the set share, and a constant one for its
-diffuse part; what the vertices see, for lobes and single texels, serves any BRDF. A region with one BRDF that does not
-change has the light factors of that one, and of visibility only the bits that single texels are lit by.
+Direct light is projected on the light factors of a region's set, which all BRDFs of the set share, and on a constant
+factor for the diffuse part. Visibility for lobes and single texels does not depend on the BRDF. A region with one fixed
+BRDF uses the light factors of that BRDF, and stores only the visibility bits for single texels.
 """
 
 import os
@@ -23,8 +23,8 @@ from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
 
-_MEMBERS = 230  # vertices of a cluster in a large region
-_CLUSTERS = 64  # of a smaller one, as long as they have
+_MEMBERS = 230  # number of vertices of a cluster in a large region
+_CLUSTERS = 64  # number of clusters of a smaller region, if each then has at least
 _FEWEST = 32  # vertices
 
 
@@ -32,9 +32,10 @@ class RegionTransport(eqx.Module):
     """Transport of the vertices of one region, in the mesh's order.
 
     Attributes:
-        terms: Of the light factors; the last term is constant, for the diffuse part, where BRDFs change.
-        seen: What each vertex sees: bits of all texels, and pyramids where the BRDFs have lobes.
-        vertex: Number of each vertex in the mesh.
+        terms: Transport of the light factors. If the BRDF can change, the last term is the constant one of the diffuse
+            part.
+        seen: Visibility of each vertex: bits of all texels, and pyramids if the BRDFs have lobes.
+        vertex: Index of each vertex in the mesh.
     """
 
     terms: ClusteredTransport
@@ -52,8 +53,8 @@ class DynamicTransport(eqx.Module):
 
     Attributes:
         region: Transport of each region, in the order of their numbers.
-        place: Of each vertex of the mesh, its number among the vertices of all regions one after another.
-        mesh: Fingerprint of the mesh, by which bounces of another one are refused; empty if made by hand.
+        place: Index of each vertex of the mesh among the vertices of all regions, concatenated.
+        mesh: Fingerprint of the mesh. Bounces of another mesh are refused. Empty if the transport was made by hand.
     """
 
     region: tuple[RegionTransport, ...]
@@ -84,26 +85,28 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> DynamicTransport:
-    """Traces what each vertex sees, and compresses what that makes of the light factors of its region.
+    """Traces the visibility of each vertex, and compresses the transport of the light factors of its region.
 
     Args:
-        mesh: The vertices to light.
-        brdfs: Of each region, in the order of their numbers: a set, or the one BRDF that it has for good, factored.
-        components: Principal components along the vertices of a cluster, or as many as it has.
-        modes: Principal components along the light, which all components and terms of a cluster share; likewise.
-        keep: Wavelets of each cluster.
+        mesh: Mesh with the vertices to light.
+        brdfs: For each region, in the order of their numbers: a set of BRDFs, or one factored BRDF that cannot change.
+        components: Number of principal components over the vertices of a cluster, limited by the number of vertices.
+        modes: Number of principal components over the light, shared by all components and terms of a cluster; limited
+            by `keep` and by the number of components times terms.
+        keep: Number of wavelet coefficients of each cluster.
         size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        path: Folder that keeps what is finished; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed; this machine's cores if None.
+        occluder: Mesh that casts shadows: the whole scene, or a simplified one. If None, the mesh itself.
+        path: Folder in which finished work is stored. A call that was interrupted resumes from there.
+        executor: Executor that computes the blocks of work; all cores of this machine if None.
         progress: Whether to show progress bars.
 
     Returns:
-        The transport; 3 kB of bits a vertex, 3 kB more of pyramids where there are lobes, and the terms.
+        The transport: 3 kB of bits for each vertex, another 3 kB of pyramids if there are lobes, and the terms.
 
     Raises:
-        TypeError: `brdfs` is no sequence, or one of them neither a set nor factored.
-        ValueError: Not one BRDF for each region, light maps per color, or as in `jaxprt.visibility.precompute`.
+        TypeError: `brdfs` is not a sequence, or a BRDF is neither a set nor factored.
+        ValueError: There is not one BRDF for each region, light maps differ by color, or for the reasons that
+            `jaxprt.visibility.precompute` gives.
 
     Reference: Sun et al. 2007, sections 3.3 and 4.3, direct lighting.
     """
@@ -152,9 +155,17 @@ def compress(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> RegionTransport:
-    """The same of one region whose visibility is known; `vertex` then counts the vertices of that.
+    """Compresses the transport of one region from its visibility. `vertex` of the result numbers the given vertices.
 
-    The arguments are those of `precompute`.
+    Args:
+        visible: Visibility of the region's vertices.
+        brdf: The region's set of BRDFs, or its one factored BRDF.
+        components: Number of principal components over the vertices of a cluster.
+        modes: Number of principal components over the light.
+        keep: Number of wavelet coefficients of each cluster.
+        path: Folder in which finished work is stored.
+        executor: Executor that computes the blocks of work; all cores of this machine if None.
+        progress: Whether to show progress bars.
     """
     count = len(visible.position)
     factors = light_factors(brdf)
@@ -173,7 +184,7 @@ def compress(
         progress=progress,
     )
     seen = lobe.compress(visible)
-    # The diffuse part is a term: no transfer vectors. Without lobes nothing reads means.
+    # The diffuse part is a term, so transfer vectors are not needed. Only lobes read the pyramid's means.
     lobes = isinstance(brdf, DynamicBrdf) and brdf.lobe is not None
     pyramid = seen.pyramid if lobes else seen.pyramid[:, : 6 * seen.size**2 // 8]
     seen = LobeTransport(pyramid, seen.vector[:0], seen.position, seen.frame, seen.size)
@@ -181,9 +192,9 @@ def compress(
 
 
 def light_factors(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
-    """What a region's transport is made for: the light factors of its BRDFs; of a set's, with a constant 1 / pi last.
+    """The light factors that a region's transport is made for. For a set, a constant factor 1 / pi follows them.
 
-    The view maps are ones: no transport depends on them.
+    The view maps are all ones, because transport does not depend on them.
     """
     if isinstance(brdf, SeparableBrdf):
         return brdf
