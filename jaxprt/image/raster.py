@@ -23,7 +23,7 @@ from jaxprt.scene.mesh import Mesh
 FACES = (1 << 24) - 1  # largest number of triangles whose indices float32 represents exactly
 PATCH = {1: 3, 2: 4}  # edge of the square patches that triangles are cut into, in cells, by cells per pixel edge
 EDGE_ON = 1e-3  # sine of the angle between triangle and view direction below which both sides count as front
-TILE = 8  # edge in pixels of the tiles for occlusion culling, which compares the farthest depth
+TILE = 8  # edge in cells (one per sample) of the tiles whose farthest depth culls hidden triangles
 
 
 # Positions of a pixel's samples, in pixels to the right and down from its center. The four samples lie on a rotated
