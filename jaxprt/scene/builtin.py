@@ -82,12 +82,7 @@ _PIECES = [
     (0.3, _PAWN, (-0.5, 0.5)),
     (0.3, _PAWN, (0.5, 1.5)),
 ]
-_CORONET = (
-    range(7, 10),
-    1.3,
-    1.38,
-    0.035,
-)  # the queen's: curves with teeth, lowest and highest point, depth
+_CORONET = range(7, 10), 1.3, 1.38, 0.035  # the queen's: curves with teeth, lowest and highest point, depth
 _MERLON, _NOTCH, _TOP = 5, 3, 0.99  # widths of the rook's merlons and notches in sectors, and height of its top
 _SQUARES = 6
 _CELLS = 12  # cells along the edge of a square of the board
