@@ -3,7 +3,7 @@
 Conventions, everywhere in this package:
 
 * The world is right-handed and +y is up. Latitude-longitude images have +y in the top row, +z in the
-  centre column and +x a quarter of the width from the left.
+  center column and +x a quarter of the width from the left.
 * The local frame of a surface point is (tangent, bitangent, normal) = (x, y, z).
 * ``wi`` points to the light and ``wo`` to the viewer: unit vectors away from the surface, in the local frame;
   a name that ends in ``_world`` is in the world's frame. Angles are in radians.

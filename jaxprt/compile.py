@@ -1,10 +1,11 @@
-"""What a compiler is told beyond the mathematics: precision, steps that are compiled apart, loops, and transposes.
+"""Control of compilation: precision, separately compiled steps, loops, and transposes of linear maps.
 
-GPUs round the factors of float32 products to ten bits unless told otherwise: `jit` tells. XLA's CPU code repeats a step
-for each of its uses where it fuses the two; gathers, and loops over vertices, are then done many times over. JAX makes
-gradients of linear maps by transposing what it was given, step by step; that of a gather is a scatter, which is five
-times as slow. `isolated` and `linear` are the cures, under all transformations. CPUs like loops whose steps stay in the
-cache, GPUs few kernels with much to do: `total` and `mapped` are such loops, each in the form that suits the device.
+`jit` requests full precision, because GPUs otherwise round the factors of float32 products to ten bits. `isolated`
+compiles a step separately, because XLA on CPUs may fuse a step into each of its uses and repeat it there, gathers and
+loops over vertices included. `linear` takes the transpose of a linear map explicitly, because JAX would otherwise
+derive gradients by transposing each operation, and the transpose of a gather is a scatter, which is five times as slow.
+Both work under all JAX transformations. `total` and `mapped` are loops in the form that suits the device: CPUs prefer
+steps that stay in the cache, GPUs few large kernels.
 """
 
 import functools
@@ -21,20 +22,21 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-Between = Callable[[], None] | None  # called between steps of long work
+Between = Callable[[], None] | None  # called between the steps of a long computation
 Fixed = TypeVar("Fixed", bound=PyTree)
 
-_ROOM = 1 << 28  # bytes of what loops make at once on GPUs
+_ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
 
 def jit(function: Callable, **options: Any) -> Any:
-    """`jax.jit` of a function whose matrix products are exact to its dtype on every device.
+    """`jax.jit` with matrix products that have the full precision of their dtype on every device.
 
-    Holds for whatever the function calls while it is traced, BRDFs of users included, and for its derivatives.
+    This applies to everything that the function calls while it is traced, including user-defined BRDFs, and to its
+    derivatives.
 
     Args:
         function: A function whose arguments are arrays and pytrees of arrays.
-        options: As `jax.jit` has them.
+        options: Options of `jax.jit`.
     """
     return jax.jit(_exact(function), **options)
 
@@ -49,11 +51,11 @@ def _exact(function: Callable) -> Callable:
 
 
 def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
-    """Decorates a step that is compiled by itself: like `jit`, and on CPUs also where another program holds it.
+    """Decorates a function like `jit`. On CPUs it is not fused with the rest when another program calls it.
 
     Args:
-        function: A function whose arguments are arrays and pytrees of arrays; static options are passed by name.
-        static: Names of the options.
+        function: A function whose arguments are arrays and pytrees of arrays. Static options are passed by name.
+        static: Names of the static options.
     """
     compiled = jit(function, static_argnames=static)
 
@@ -68,14 +70,15 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
         shape = jax.eval_shape(own, argument, named)
         first = next(each for each in jax.tree.leaves((argument, named)) if each.size)
-        # Branches are not fused with what is around them. CPUs' compiler does not see that this one is always taken;
-        # others see it, and no branch is left.
+        # A branch is not fused with its surroundings. The CPU compiler does not detect that this branch is always
+        # taken;
+        # other compilers do, and remove the branch.
         taken = jax.lax.platform_dependent(
             jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32), cpu=lambda x: (x | 1) != 0, default=_always
         )
         return jax.lax.cond(taken, own, never, argument, named)
 
-    inside = jit(branched, static_argnames=static)  # Traced once, also where derivatives are taken outside any jit.
+    inside = jit(branched, static_argnames=static)  # traced once, also for derivatives outside of any jit
 
     @functools.wraps(function)
     def step(*argument, **named):
@@ -87,9 +90,10 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
 
 def finished(made: PyTree, between: Between) -> PyTree:
-    """The result of a step, after the device has computed it and `between` was called, which may raise to give up.
+    """Waits until the device has computed the result of a step, calls `between`, and returns the result.
 
-    Without `between` the result is returned at once, while the device may still compute it. Not for `jax.jit`.
+    `between` may raise to abort the computation. If it is None, the result is returned immediately, while the device
+    may still be computing it. Do not use this inside `jax.jit`.
     """
     if between is not None:
         jax.block_until_ready(made)
@@ -102,11 +106,11 @@ def _always(_: Array) -> Array:
 
 
 def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
-    """The sum of a function over rows: on CPUs one row after another, elsewhere as many at once as there is room for.
+    """Sums a function over rows: on CPUs one row after another, elsewhere as many rows at once as memory permits.
 
     Args:
-        term: The function of one row.
-        rows: Arrays whose first axis is summed over.
+        term: Function of one row.
+        rows: Arrays with the rows along the first axis.
     """
     shape = jax.eval_shape(term, _first(rows))
     start = jnp.zeros(shape.shape, shape.dtype)
@@ -127,11 +131,11 @@ def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
 
 
 def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
-    """`jax.lax.map`: on CPUs one row after another, elsewhere as many at once as there is room for.
+    """`jax.lax.map`: on CPUs one row after another, elsewhere as many rows at once as memory permits.
 
     Args:
-        function: The function of one row.
-        rows: Arrays along whose first axis it is mapped.
+        function: Function of one row.
+        rows: Arrays with the rows along the first axis.
     """
     one = _first(rows)
     size = sum(each.size for each in jax.tree.leaves((one, jax.eval_shape(function, one))))
@@ -145,17 +149,17 @@ def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
 
 
 def _first(rows: PyTree) -> PyTree:
-    """Shapes of one row."""
+    """Shapes and types of one row."""
     return jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape[1:], each.dtype), rows)
 
 
 def _at_once(count: int, size: int) -> int:
-    """How many rows of so many bytes are made at once."""
+    """Number of rows to compute at once, if each takes `size` bytes."""
     return max(1, min(count, _ROOM // max(1, size)))
 
 
 def _blocks(rows: PyTree, size: int) -> tuple[PyTree | None, PyTree]:
-    """Rows in blocks of as many as are made at once, and the rest: all of them where one block has room for all."""
+    """Rows in full blocks, and the remaining rows. If all rows fit into one block, all of them remain."""
     count = len(jax.tree.leaves(rows)[0])
     most = _at_once(count, size)
     whole = max(0, (count - 1) // most)
@@ -168,17 +172,17 @@ def _blocks(rows: PyTree, size: int) -> tuple[PyTree | None, PyTree]:
 def linear(
     forward: Callable[[Fixed, Array], Array], backward: Callable[[Fixed, Array], Array], fixed: Fixed, x: Array
 ) -> Array:
-    """A linear map of an array, with its transpose.
+    """Applies a linear map whose transpose is given explicitly.
 
     Args:
-        forward: The map, (fixed, x) -> y, linear in x. Derivatives by `fixed` are taken of it, of those of the
-            transpose too, by JAX.
-        backward: Its transpose, (fixed, y) -> an array like x. That it is the transpose is not checked.
-        fixed: What the map is made of. The transpose may read more of it than the map does.
+        forward: Function (fixed, x) -> y, linear in x. JAX differentiates it with respect to `fixed`, also for the
+            derivatives of the transpose.
+        backward: Transpose of `forward`, (fixed, y) -> array like x. It is not checked to be the transpose.
+        fixed: Parameters of the map. The transpose may use more of them than the map.
         x: An array.
 
     Returns:
-        The map of x. Its gradient in x is `backward`, that of the gradient `forward`, and so on.
+        The map applied to x. Its gradient in x uses `backward`, the gradient of that uses `forward`, and so on.
     """
     leaf, tree = jax.tree.flatten(fixed)
     return _linear.bind(x, *leaf, pair=_Pair(forward, backward, tree, x.shape, x.dtype), back=False)
@@ -186,7 +190,7 @@ def linear(
 
 @dataclass(frozen=True)
 class _Pair:
-    """A map and its transpose, without their arrays."""
+    """A linear map and its transpose, without their arrays."""
 
     forward: Callable
     backward: Callable
@@ -199,7 +203,7 @@ class _Pair:
         return self.backward(fixed, x).astype(self.dtype) if back else self.forward(fixed, x)
 
     def derived(self, x: Array, *leaf: Array, back: bool) -> Array:
-        """The same by the map alone: what derivatives by the leaves are of."""
+        """The same result, computed by the map only. Derivatives with respect to the leaves use it."""
         if not back:
             return self.run(x, *leaf, back=False)
         shape = jax.ShapeDtypeStruct(self.shape, self.dtype)
@@ -208,7 +212,7 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Batch:
-    """A function of a batch, and of leaves with it or without."""
+    """A function applied to a batch. Leaves may have the batch axis or not."""
 
     function: Callable
     axis: tuple[int | None, ...]

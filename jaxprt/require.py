@@ -1,7 +1,7 @@
-"""Checks of arguments where they enter the package, with errors that name what was required and what came.
+"""Checks of arguments at the package's interface. Errors state what was required and what was given.
 
-Values inside `jax.jit`, `jax.vmap` or `jax.grad` are not known while Python runs: these checks let them pass. There a
-NaN reaches every vertex that reads it.
+Values inside `jax.jit`, `jax.vmap` or `jax.grad` are not known while Python runs, so these checks let them pass. A NaN
+then reaches every vertex that depends on it.
 """
 
 import functools
@@ -21,11 +21,11 @@ def finite(name: str, value: Any) -> None:
     """Refuses NaN and infinity.
 
     Args:
-        name: What the value is, for the message: "the eye".
+        name: Description of the value for the message, such as "the eye".
         value: A number or an array.
 
     Raises:
-        ValueError: Some values are not finite; says how many, and where the first one is.
+        ValueError: Some values are not finite. The message states how many, and the position of the first.
     """
     if isinstance(value, Tracer):
         return
@@ -38,13 +38,14 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
     """Refuses NaN, infinity and values below a bound.
 
     Args:
-        name: What the value is, for the message: "the albedo".
+        name: Description of the value for the message, such as "the albedo".
         value: A number or an array.
         least: The bound.
-        slack: By how much rounding may miss it.
+        slack: Tolerance for rounding errors.
 
     Raises:
-        ValueError: Some values are not finite, or below the bound; says how many, and where the first one is.
+        ValueError: Some values are not finite, or below the bound. The message states how many, and the position of the
+            first.
     """
     finite(name, value)
     if not isinstance(value, Tracer):
@@ -53,15 +54,15 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
 
 
 def position(name: str, value: Any, *, each: int | None = None) -> None:
-    """Refuses what is not one finite position. Shapes are known inside `jax.jit` too.
+    """Refuses values that are not a finite position. The shape is checked inside `jax.jit` too.
 
     Args:
-        name: What the value is, for the message: "the eye".
+        name: Description of the value for the message, such as "the eye".
         value: An array or a list.
-        each: A number of points for each of which there may be a position of its own.
+        each: Number of points if the value may be one position for each point; None if it must be a single position.
 
     Raises:
-        ValueError: It has not three values in one row, or in one row for each point, or some are not finite.
+        ValueError: The shape is neither [3] nor, with `each`, [each 3], or some values are not finite.
     """
     if np.shape(value) not in ((3,), (each, 3)):
         raise ValueError(f"{name} must be one position, [3], got an array of shape {list(np.shape(value))}")
@@ -82,10 +83,10 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
     """Refuses a number outside a range.
 
     Args:
-        name: What the number is, for the message: "terms".
+        name: Description of the number for the message, such as "terms".
         value: The number; None passes.
-        low: The least that is allowed.
-        high: The most that is allowed.
+        low: Smallest allowed value.
+        high: Largest allowed value.
 
     Raises:
         ValueError: The number is outside the range.
@@ -95,16 +96,16 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
 
 
 def within(name: str, value: Any, low: int, high: int) -> None:
-    """Refuses arrays with whole numbers outside a range.
+    """Refuses arrays with integers outside a range.
 
     Args:
-        name: What the numbers are, for the message: "the texels".
+        name: Description of the numbers for the message, such as "the texels".
         value: The array.
-        low: The least that is allowed.
-        high: The most that is allowed.
+        low: Smallest allowed value.
+        high: Largest allowed value.
 
     Raises:
-        ValueError: Some numbers are outside the range; says how many, and where the first one is.
+        ValueError: Some numbers are outside the range. The message states how many, and the position of the first.
     """
     if not isinstance(value, Tracer):
         known = np.asarray(value)
@@ -112,12 +113,12 @@ def within(name: str, value: Any, low: int, high: int) -> None:
 
 
 def length(name: str, value: Any, count: int) -> None:
-    """Refuses an array with another number of rows.
+    """Refuses an array with a wrong number of rows.
 
     Args:
-        name: What the array is, for the message: "the light's coefficients".
+        name: Description of the array for the message, such as "the light's coefficients".
         value: The array.
-        count: The number of rows that it must have.
+        count: Required number of rows.
 
     Raises:
         ValueError: The array has another number of rows.
@@ -127,19 +128,20 @@ def length(name: str, value: Any, count: int) -> None:
 
 
 def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> None:
-    """Refuses work whose result does not fit into the memory of the device, or of this machine, before it begins.
+    """Refuses a computation, before it starts, whose result does not fit into the memory of the device or machine.
 
-    What is free on this machine is Linux's MemAvailable, and what a limit of the process's group leaves; elsewhere
-    nothing is refused.
+    On Linux the free memory of this machine is MemAvailable, limited by the process's control group. On other systems
+    it is not known, and nothing is refused.
 
     Args:
-        what: What takes the memory, for the message: "transfer matrices of degree 14 for 36,000 vertices".
-        needed: Its bytes.
-        advice: What takes less.
-        in_files: Whether it stays in files that are mapped. Where JAX computes on the processor that is a warning.
+        what: Description of the data for the message: "transfer matrices of degree 14 for 36,000 vertices".
+        needed: Required bytes.
+        advice: How to reduce the required memory, for the message.
+        in_files: Whether the result is in memory-mapped files. If JAX computes on the CPU, a lack of memory is then
+            only a warning.
 
     Raises:
-        MemoryError: It does not fit; says how much is needed, how much is free, and what to do.
+        MemoryError: The result does not fit. The message states how much is needed, how much is free, and what to do.
     """
     free = available_memory()
     if free is None or needed <= free:
@@ -151,7 +153,7 @@ def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> No
 
 
 def available_memory() -> int | None:
-    """Bytes that an array may take where JAX puts it; None where that is not known."""
+    """Bytes that are free for arrays on JAX's default device; None if not known."""
     free = [_host_memory()]
     device = jax.devices()[0]
     if device.platform != "cpu":
@@ -163,7 +165,7 @@ def available_memory() -> int | None:
 
 
 def _host_memory() -> int | None:
-    """Bytes that are free on this machine for this process."""
+    """Bytes of memory that are free on this machine for this process; None if not known."""
     try:
         with open("/proc/meminfo") as file:
             lines = dict(line.split(":", 1) for line in file)
@@ -173,18 +175,18 @@ def _host_memory() -> int | None:
     try:
         with open("/sys/fs/cgroup/memory.max") as limit, open("/sys/fs/cgroup/memory.current") as used:
             return min(free, int(limit.read()) - int(used.read()))
-    except (OSError, ValueError):  # No group, or one without a limit.
+    except (OSError, ValueError):  # no control group, or one without a limit
         return free
 
 
 def kind(name: str, value: Any, *wanted: type, source: str) -> None:
-    """Refuses objects of other classes than those wanted.
+    """Refuses objects that are not of the wanted classes.
 
     Args:
-        name: What the value is, for the message: "the light".
+        name: Description of the value for the message, such as "the light".
         value: The object.
-        wanted: The classes.
-        source: The function that makes one.
+        wanted: The allowed classes.
+        source: Name of the function that makes such an object, for the message.
 
     Raises:
         TypeError: The object is of another class.
@@ -195,17 +197,17 @@ def kind(name: str, value: Any, *wanted: type, source: str) -> None:
 
 
 def array(name: str, value: Any, *axes: str, source: str = "") -> None:
-    """Refuses what is no array, or has other axes.
+    """Refuses values that are not arrays, or arrays of a wrong shape.
 
     Args:
-        name: What the value is, for the message: "the eye".
+        name: Description of the value for the message, such as "the eye".
         value: The array.
-        axes: Each way in which its axes may be, as "v 3": letters stand for any size.
-        source: The function that makes one, if there is one.
+        axes: Allowed shapes, such as "v 3". Letters stand for any size.
+        source: Name of the function that makes such an array, for the message; empty if there is none.
 
     Raises:
-        TypeError: The value is no array.
-        ValueError: It has another number of axes, or a size that is not the one required.
+        TypeError: The value is not an array.
+        ValueError: The array has a wrong number of axes or a wrong size.
     """
     shape = value.shape if isinstance(value, jax.Array | np.ndarray) else None
     if shape is not None and any(_fits(shape, each.split()) for each in axes):
@@ -217,14 +219,14 @@ def array(name: str, value: Any, *axes: str, source: str = "") -> None:
 
 
 def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
-    """Decorates a function with checks of its arguments, which run before it: outside `jax.jit` if they come first.
+    """Decorates a function with checks of its arguments. As the outermost decorator, the checks run outside `jax.jit`.
 
         @require.arguments(eye=partial(require.finite, "the eye"))
         @jax.jit
         def radiance(..., eye): ...
 
     Args:
-        check: For the name of each argument a function that raises.
+        check: A function for each argument, by its name, that raises an error if the argument is wrong.
     """
 
     def decorate(function: Function) -> Function:
@@ -244,7 +246,7 @@ def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
 
 
 def _fits(shape: tuple[int, ...], axes: list[str]) -> bool:
-    """Whether a shape has the axes, and the sizes of those that are numbers."""
+    """Whether a shape has the given number of axes, and the sizes of those axes that are numbers."""
     return len(shape) == len(axes) and all(
         not want.isdigit() or int(want) == got for want, got in zip(axes, shape, strict=True)
     )

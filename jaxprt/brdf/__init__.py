@@ -1,4 +1,4 @@
-"""BRDFs: analytic models and measured data."""
+"""BRDFs: analytic models, measured data, and families of BRDFs."""
 
 from jaxprt.brdf import cylinders, fitted, measured, microfacet, models, navigation, scattered
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves

@@ -1,23 +1,23 @@
-"""Anisotropic reflection of parallel cylinders on a plane, or of grooves cut by them, with their own shadows.
+"""Anisotropic BRDFs of surfaces with parallel cylinders or grooves, including self-shadowing (Poulin and Fournier).
 
-The profile repeats along the bitangent y; nothing changes along the tangent x, the direction of brushing. Each of its
-points reflects like a diffuse base with a Phong lobe of the half vector, f(n) = diffuse / pi + specular c (n.h)^e with
-Blinn's normalization c, and what the whole surface reflects, once, is the mean over one period,
+The profile repeats along the bitangent y and is constant along the tangent x, the direction of brushing. Each point
+of the profile reflects like a diffuse base with a Blinn-Phong lobe, f(n) = diffuse / pi + specular c (n.h)^e, where c
+is the normalization of `BlinnPhong`. The single-scattering BRDF of the whole surface is the mean over one period,
 
     f(wi, wo) = 1 / (distance cos_i cos_o) integral of f(n) (n.wi) (n.wo) over what is both lit and visible.
 
-In the cross-section a direction is the angle theta = atan(y / z) alone, because (n.w) / cos = cos(angle - theta) /
-cos(theta) for the normal at `angle`. What a direction sees of an arc is one interval of angles, what it sees of the
-plane one interval of y; the lit and the visible part is the common one of two such. The integral over it is by
-Gauss-Legendre quadrature with fixed nodes, the lobe's only where the lobe is.
+In the cross-section a direction is described by the angle theta = atan(y / z) alone, because (n.w) / cos =
+cos(angle - theta) / cos(theta) for the normal at `angle`. A direction sees one interval of angles of an arc and one
+interval of y of the plane. The part that is both lit and visible is the intersection of two such intervals. The
+integral over it uses Gauss-Legendre quadrature with fixed nodes; the integral of the lobe covers only the lobe's range.
 
-Both models are reciprocal and conserve energy for diffuse + specular <= 1; what is lost are further bounces. Values and
-gradients are finite everywhere: cosines below 1e-4 count as that. The parameters' gradients are those of the
-quadrature, its limits included.
+Both models are reciprocal and conserve energy for diffuse + specular <= 1. Light that hits the surface more than once
+is lost. Values and gradients are finite everywhere: cosines below 1e-4 are replaced by 1e-4. Gradients of parameters
+include those of the limits of integration.
 
-Reference: Poulin and Fournier 1990, "A model for anisotropic reflection": the surfaces, and the integral over what is
-lit and visible. They integrate the lobe by Chebyshev polynomials; the division by both cosines, which makes the result
-a reciprocal BRDF, and the closed forms of the limits are derived here.
+Reference: Poulin and Fournier 1990, "A model for anisotropic reflection", for the surfaces and the integral over the
+lit and visible part. They integrate the lobe by Chebyshev polynomials. The division by both cosines, which makes the
+result a reciprocal BRDF, and the closed forms of the limits are derived here.
 """
 
 from collections.abc import Callable
@@ -30,10 +30,10 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf.models import Model, color, scalar
 
-_GRAZING = 1e-4  # least cosine
+_GRAZING = 1e-4  # smallest cosine
 _DIFFUSE_NODES = 8  # The integrand is a trigonometric polynomial of degree 2: exact to 1e-9 over pi.
 _LOBE_NODES = 24  # exact to 1e-10 over twice _LOBE_WIDTH
-_LOBE_WIDTH = 6.0  # in 1 / sqrt(exponent): beyond, less than exp(-18) of the lobe's height is left
+_LOBE_WIDTH = 6.0  # in 1 / sqrt(exponent); farther out the lobe is below exp(-18) of its peak
 
 
 def _inside(cosine: Array) -> Array:
@@ -43,7 +43,7 @@ def _inside(cosine: Array) -> Array:
 
 
 def _nodes(low: Array, high: Array, count: int) -> tuple[Array, Array]:
-    """Gauss-Legendre nodes between two limits [*b], and their weights, [*b n]; none where they are in wrong order."""
+    """Gauss-Legendre nodes between two limits [*b], and their weights [*b n]; zero weights if low is above high."""
     node, weight = np.polynomial.legendre.leggauss(count)
     half = jnp.maximum(high - low, 0)[..., None] / 2
     return low[..., None] + half * jnp.asarray(1 + node, low.dtype), half * jnp.asarray(weight, low.dtype)
@@ -54,15 +54,15 @@ def _overlap(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Arra
 
 
 def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Array:
-    """The mean over one period.
+    """The BRDF as a mean over one period.
 
     Args:
         brdf: One of the two models.
         wi: Directions to the light.
         wo: Directions to the viewer.
-        arc: From theta to the limits of the normals that a direction sees of one arc.
-        plane: From theta to the limits of y of what it sees of the plane between two arcs, whose axes are at 0 and
-            `distance`.
+        arc: Function from theta to the interval of normal angles that a direction sees of one arc.
+        plane: Function from theta to the interval of y that it sees of the plane between two arcs, whose axes are at 0
+            and `distance`.
     """
     lit = (wi[..., 2] > 0) & (wo[..., 2] > 0)
     least = jnp.asarray([-2, -2, _GRAZING], wi.dtype)
@@ -78,7 +78,7 @@ def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Arra
         return one * other
 
     def lobe(angle):
-        # cos^n(x), and 1 - cos(x) = 2 sin^2(x / 2) keeps the digits that a large n needs.
+        # cos^n(x). Using 1 - cos(x) = 2 sin^2(x / 2) avoids the cancellation that a large n would amplify.
         return jnp.exp(n * jnp.log1p(-jnp.minimum(2 * jnp.sin(angle / 2) ** 2, 1 - _GRAZING)))
 
     limits = _overlap(arc(theta_i), arc(theta_o))
@@ -90,7 +90,7 @@ def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Arra
     low, high = _overlap(plane(theta_i), plane(theta_o))
     stretch = jnp.maximum(high - low, 0)
 
-    # (n.h)^e = cos^e(angle - theta_h) |h_yz|^e, the latter by its complement where that is small.
+    # (n.h)^e = cos^e(angle - theta_h) |h_yz|^e. The last factor is computed from 1 - |h_yz|^2 where that is small.
     along, across = half[..., 0] ** 2, half[..., 1] ** 2 + half[..., 2] ** 2
     near = along < across
     log_across = jnp.where(
@@ -103,20 +103,21 @@ def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Arra
 
 
 def _mirrored(theta: Array, low: Array, high: Array, period: Array | float = 0) -> tuple[Array, Array]:
-    """Limits as seen from the right, turned for directions from the left."""
+    """Limits that hold for directions from the right, mirrored for directions from the left."""
     right = theta >= 0
     return jnp.where(right, low, period - high), jnp.where(right, high, period - low)
 
 
 class PoulinFournier(Model):
-    """Cylinders of radius 1 laid parallel to the tangent, side by side on a plane or sunk into it.
+    """Cylinders of radius 1 parallel to the tangent, lying side by side on a plane or partly sunk into it.
 
     Attributes:
         diffuse: Reflectance of the material's base, not of the surface; gray or a color.
         specular: Reflectance of its lobe at normal incidence; gray or a color.
         exponent: Exponent of the lobe around the half vector, from 0.
-        distance: From axis to axis, in radii, above 0; cylinders that are less than 2 apart run into each other.
-        height: Of the axes above the plane, in radii: 1 for whole cylinders, 0 for half ones, -1 for none left.
+        distance: Distance between neighboring axes, in radii, above 0. Cylinders less than 2 apart intersect.
+        height: Height of the axes above the plane, in radii: 1 for whole cylinders, 0 for half cylinders, -1 for a flat
+            plane.
     """
 
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
@@ -138,15 +139,15 @@ class PoulinFournier(Model):
         return jnp.where(self.distance < 2, jnp.minimum(plane, neighbor), plane)
 
     def _arc(self, theta: Array) -> tuple[Array, Array]:
-        # Seen from the right (theta > 0), the left end is where the arc turns away. The right end is where the view
-        # just passes the neighbor's rim, at sin(angle - theta) = distance cos(theta) - 1, if that rim is exposed.
+        # Seen from the right (theta > 0), the left limit is where the arc faces away. The right limit is where the ray
+        # just passes the neighbor's silhouette, at sin(angle - theta) = distance cos(theta) - 1, if that is exposed.
         edge, turn = self._edge(), jnp.abs(theta)
         reach = jnp.arcsin(_inside(self.distance * jnp.cos(theta) - 1))
         reach = jnp.where(jnp.pi / 2 - turn < edge, reach, jnp.pi / 2)
         return _mirrored(theta, jnp.maximum(turn - jnp.pi / 2, -edge), jnp.minimum(turn + reach, edge))
 
     def _plane(self, theta: Array) -> tuple[Array, Array]:
-        # The view passes the rims of the left and of the right cylinder, or their feet where the rims are buried.
+        # The ray passes the silhouettes of the left and right cylinders, or their feet if the silhouettes are buried.
         edge, turn = self._edge(), jnp.abs(theta)
         sine, cosine = jnp.sin(turn), jnp.cos(turn)
         left = jnp.where(edge > jnp.pi / 2 + turn, (1 - self.height * sine) / cosine, jnp.sin(edge))
@@ -161,8 +162,8 @@ class PoulinFournierGrooves(Model):
         diffuse: Reflectance of the material's base, not of the surface; gray or a color.
         specular: Reflectance of its lobe at normal incidence; gray or a color.
         exponent: Exponent of the lobe around the half vector, from 0.
-        distance: From axis to axis, in radii, above 0; wider grooves run into each other.
-        height: Of the axes above the plane, in radii: 0 for grooves as deep as wide, 1 for none left.
+        distance: Distance between neighboring axes, in radii, above 0. Grooves wider than this intersect.
+        height: Height of the axes above the plane, in radii: 0 for half cylinders, 1 for a flat plane.
     """
 
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
@@ -183,8 +184,8 @@ class PoulinFournierGrooves(Model):
         return jnp.minimum(plane, jnp.arcsin(_inside(jnp.minimum(self.distance / 2, 1))))
 
     def _arc(self, theta: Array) -> tuple[Array, Array]:
-        # Normals right of the axis point left. Seen from the right, the right rim hides what lies between it and the
-        # other end of the chord of the view through it.
+        # Normals right of the axis point left. Seen from the right, the right rim hides the part of the arc between
+        # itself and the point where the ray through the rim meets the arc again.
         edge, turn = jnp.broadcast_to(self._edge(), theta.shape), jnp.abs(theta)
         return _mirrored(theta, jnp.maximum(edge + 2 * turn - jnp.pi, -edge), edge)
 

@@ -1,4 +1,4 @@
-"""Fits of analytic models to the measured materials of MERL, in the text files of the BSDF benchmark BBM."""
+"""Analytic models fitted to the MERL database, read from text files of the BSDF benchmark BBM."""
 
 import ast
 import pathlib
@@ -10,7 +10,7 @@ import numpy as np
 from jaxprt.brdf import measured, models
 from jaxprt.brdf.models import Model
 
-_SCALE = (1.0, 1.15, 1.66)  # of MERL's colors, which the data that was fitted lacked
+_SCALE = (1.0, 1.15, 1.66)  # MERL's color scale, which the fitted data lacked
 _LINE = re.compile(
     r"(?P<name>[\w-]+) *= *Aggregate\(Lambertian\(albedo = (?P<diffuse>\[[^\]]*\])\), *(?P<model>\w+)\((?P<rest>.*)\)\)"
 )
@@ -19,11 +19,11 @@ _MODELS = ("NganBlinnPhong", "NganCookTorrance", "NganLafortune", "NganWardDuer"
 
 
 def load_ngan(path: str | pathlib.Path, material: str) -> Model:
-    """Loads one material from a file of fits by Ngan, Durand and Matusik, in the form of the BSDF benchmark BBM.
+    """Loads one material from a file of fits by Ngan, Durand and Matusik, in the format of the BSDF benchmark BBM.
 
     Each line of the file is a material, `name = Aggregate(Lambertian(albedo = [..]), NganWardDuer(albedo = [..], ..))`.
-    Models are Blinn-Phong, Cook-Torrance, Lafortune and Ward-Duer. The fits are to data without MERL's scale of colors,
-    (1, 1.15, 1.66), by which all reflectances are multiplied here.
+    Supported models are Blinn-Phong, Cook-Torrance, Lafortune and Ward-Duer. The fitted data lacked MERL's color scale
+    (1, 1.15, 1.66), so all reflectances are multiplied by it here.
 
     Args:
         path: The file, such as `ngan_cooktorrance.fit`.
@@ -33,9 +33,9 @@ def load_ngan(path: str | pathlib.Path, material: str) -> Model:
         The BRDF in linear RGB.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file has no such lines, the material is unknown, its model is another one, or a number is out of
-            its range.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file has no such lines, the material is unknown, its model is not supported, or a number is out
+            of range.
 
     Reference: Ngan, Durand, Matusik 2005, "Experimental analysis of BRDF models"; BBM, include/bsdfmodel/ngan.h.
     """
@@ -64,7 +64,8 @@ def _model(name: str, diffuse: np.ndarray, field: dict[str, Any]) -> Model:
     n = field["sharpness"]
     if name == "NganBlinnPhong":  # ks (n + 2) / (2 pi) (n.h)^n in the paper
         return models.BlinnPhong(diffuse=diffuse, specular=specular * 4 * (2 ** (-n / 2) + n) / (n + 4), exponent=n)
-    # The lobe is divided by the larger coefficient and normalized as Phong's; heights belong into the coefficients.
+    # The published lobe is divided by the larger coefficient and normalized like Phong's. Here that scale is part of
+    # the coefficients.
     size = max(abs(field["Cxy"]), abs(field["Cz"]))
     height = (specular * (n + 2) / (2 * np.pi)) ** (1 / n) / size
     cxy, cz = ((height * field[key])[None] for key in ("Cxy", "Cz"))

@@ -1,4 +1,4 @@
-"""Tables of BRDFs over the view direction and over parameters: their knots, their neighbors, and how they are read."""
+"""Interpolation in tables of BRDFs over the view direction and parameters: knots, neighbors and weights."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,10 +11,10 @@ from jaxprt.compile import mapped
 
 
 def as_argument(brdf: Callable) -> Callable:
-    """A BRDF that jitted functions take: a plain function is not an array and must be wrapped.
+    """A BRDF as an argument for jitted functions. Plain functions are not arrays and are wrapped.
 
     Raises:
-        TypeError: It is a table whose values hold the cosine of the light's direction too.
+        TypeError: The BRDF is a table whose values already include the cosine of the light direction.
     """
     if getattr(brdf, "holds_cosine", False):
         raise TypeError(
@@ -25,10 +25,11 @@ def as_argument(brdf: Callable) -> Callable:
 
 
 def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """The knots of each parameter in float64.
+    """The knots of each parameter, converted to float64.
 
     Raises:
-        ValueError: There are more than two parameters, or knots are not at least two finite increasing numbers.
+        ValueError: There are more than two parameters, or a parameter does not have at least two finite increasing
+            knots.
     """
     if len(knot) > 2:
         raise ValueError(f"at most two parameters can be tabulated, got {len(knot)}")
@@ -42,16 +43,16 @@ def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
 
 
 def place(knot: Float[Array, " k"], parameter: Float[Array, "*v"]) -> Float[Array, "*v"]:
-    """Where parameters lie among knots: 1.5 halfway between the second and the third; the ends for those outside."""
+    """Fractional index of parameters among knots, such as 1.5 halfway from the second to the third; clamped."""
     low = jnp.clip(jnp.searchsorted(knot, parameter, side="right") - 1, 0, len(knot) - 2)
     fraction = (parameter - knot[low]) / (knot[low + 1] - knot[low])
     return jnp.clip(low + fraction, 0, len(knot) - 1)
 
 
 def neighbors(place: Float[Array, "*v"], *, size: int) -> tuple[Int[Array, "*v"], Float[Array, "*v"]]:
-    """The lower of the two neighbors of a place among so many, and the weight of the upper; the ends for those outside.
+    """Index of the lower neighbor of a fractional index, and the weight of the upper neighbor. Places are clamped.
 
-    Differentiable in the place within the ends.
+    It is differentiable in the place between the first and the last knot.
     """
     place = jnp.clip(place, 0, size - 1)
     low = jax.lax.stop_gradient(jnp.clip(jnp.floor(place), 0, size - 2))
@@ -59,13 +60,13 @@ def neighbors(place: Float[Array, "*v"], *, size: int) -> tuple[Int[Array, "*v"]
 
 
 def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float[Array, " v"]]]) -> Float[Array, "r v"]:
-    """Rows of a table, multilinearly between the neighbors on each of the axes of their nodes."""
+    """Rows of a table, interpolated multilinearly along each axis of nodes."""
     count = len(axis[0][0])
     spot, weight = jnp.zeros((1, count), jnp.int32), jnp.ones((1, count), axis[0][1].dtype)
     for size, (low, upper) in zip(row.shape[1:], axis, strict=True):
         spot = jnp.concatenate([spot * size + low, spot * size + low + 1])
         weight = jnp.concatenate([weight * (1 - upper), weight * upper])
-    # Row by row, so that a row stays in the cache while all views read it.
+    # Row by row, so that a row stays in the cache while all views are looked up.
     return mapped(
         lambda one: sum(one.at[s].get(mode="promise_in_bounds") * w for s, w in zip(spot, weight, strict=True)),
         row.reshape(len(row), -1),

@@ -1,9 +1,9 @@
-"""BRDFs tabulated from measurements: MERL files, and the factors and coefficients that others fitted.
+"""Measured BRDFs: MERL files, and published fits to measurements.
 
-Loaders run on the host and check what they read. What they return is a BRDF like any other, differentiable in its
-directions and its table. ``HalfDifferenceTable`` and ``MicrofacetTable`` are tabulated over angles of the half
-vector: theta_h from the normal, theta_d from the directions, and the turn phi_d of the directions about the half
-vector (Rusinkiewicz 1998). Values and gradients are finite where these angles are undefined.
+Loaders run on the host and check the data. They return a BRDF like any other, differentiable in its directions and its
+table. ``HalfDifferenceTable`` and ``MicrofacetTable`` are tabulated over the half-difference angles of Rusinkiewicz
+1998: theta_h between normal and half vector, theta_d between half vector and either direction, and the rotation phi_d
+of the directions about the half vector. Values and gradients are finite where these angles are undefined.
 """
 
 import difflib
@@ -20,34 +20,34 @@ from jaxprt.brdf import models
 
 _MERL_SHAPE = (90, 90, 180)
 _MERL_SCALE = np.array([1.0, 1.15, 1.66]) / 1500
-_BINS = 90  # Of each factor of the microfacet table.
+_BINS = 90  # bins of each factor of the microfacet table
 _ROWS, _COLUMNS = 256, 512
 _TINY = 1e-12
 
 
 def _norm(vector: Array) -> Array:
-    """Length, whose gradient at zero is zero."""
+    """Length of vectors. Its gradient at zero is defined as zero."""
     square = jnp.sum(vector**2, -1)
     return jnp.where(square < _TINY, 0, jnp.sqrt(jnp.where(square < _TINY, 1, square)))
 
 
 def _lit(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Whether both directions are above the horizon, and directions that are, in place of those that are not."""
+    """Whether both directions are above the horizon, and the directions, with valid ones in place of those below."""
     lit = (wi[..., 2:] > 0) & (wo[..., 2:] > 0)
     normal = jnp.array([0, 0, 1], jnp.result_type(wi, wo))
     return lit, jnp.where(lit, wi, normal), jnp.where(lit, wo, normal)
 
 
 def _polar_angles(wi: Array, wo: Array) -> tuple[Array, Array]:
-    """theta_h and theta_d; |wi + wo| = 2 cos(theta_d) and |wi - wo| = 2 sin(theta_d), so both are exact near zero."""
+    """theta_h and theta_d. |wi + wo| = 2 cos(theta_d) and |wi - wo| = 2 sin(theta_d) keep both accurate near zero."""
     total = wi + wo
     return jnp.arctan2(_norm(total[..., :2]), total[..., 2]), jnp.arctan2(_norm(wi - wo), _norm(total))
 
 
 def _turn(wi: Array, wo: Array) -> Array:
-    """phi_d; exchanging the directions adds pi. Zero, with zero gradient, where the half vector is at either end.
+    """phi_d. Exchanging the directions adds pi. It is zero, with zero gradient, where it is undefined.
 
-    In the frame that is turned with the half vector, wi - wo is along
+    In the frame that is rotated with the half vector, wi - wo is along
     (-(wi - wo).n, n.(wi x wo) (-2) / |wi + wo|) up to a positive factor.
     """
     x = wo[..., 2] - wi[..., 2]
@@ -57,13 +57,13 @@ def _turn(wi: Array, wo: Array) -> Array:
 
 
 def _root_place(theta: Array, count: int) -> Array:
-    """Place of theta_h among the centers of ``count`` cells that are uniform in its square root."""
+    """Fractional index of theta_h among the centers of ``count`` cells that are uniform in its square root."""
     first = np.pi / 2 * (0.5 / count) ** 2
     return count * jnp.sqrt(jnp.maximum(theta, first) * (2 / jnp.pi)) - 0.5
 
 
 def _neighbors(place: Array, count: int) -> tuple[Array, Array, Array]:
-    """The two cells whose centers enclose a place, and the weight of the second; constant beyond the outer ones."""
+    """The two cells whose centers enclose a fractional index, and the weight of the second; clamped at the ends."""
     place = jnp.clip(place, 0, count - 1)
     low = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
     index = low.astype(jnp.int32)
@@ -71,19 +71,20 @@ def _neighbors(place: Array, count: int) -> tuple[Array, Array, Array]:
 
 
 class HalfDifferenceTable(eqx.Module):
-    """An isotropic BRDF tabulated over half-vector angles: the cube of values linear between the centers of cells.
+    """An isotropic BRDF tabulated over half-difference angles. Cube roots of its values are interpolated linearly.
 
-    Cells are uniform in sqrt(theta_h), theta_d (to a quarter turn each) and phi_d (to half a turn, where it repeats
-    by reciprocity); beyond the outermost centers the value stays. Never negative for a root that is not, and
-    reciprocal. Cube roots are what is interpolated since highlights fall over decades from cell to cell: on the
-    MERL grid a Cook-Torrance lobe of roughness 0.1 then comes out three times as precise.
+    Cells are uniform in sqrt(theta_h), in theta_d (both up to a quarter turn) and in phi_d (up to half a turn, after
+    which it repeats by reciprocity). Beyond the outermost centers the value is constant. The BRDF is reciprocal, and
+    not negative if no root is negative. Cube roots are interpolated because highlights fall by orders of magnitude from
+    cell to cell: on the MERL grid they make a Cook-Torrance lobe of roughness 0.1 three times as accurate.
 
-    Gradients are those of the interpolant, and zero across the angles that are undefined (theta_h or theta_d zero),
-    next to which ``tabulate`` makes the table the same for all phi_d.
+    Gradients are those of the interpolant. Where angles are undefined (theta_h or theta_d zero) they are zero across
+    that angle; ``tabulate`` makes the adjacent cells equal for all phi_d.
 
     Attributes:
-        root: Cube root of the BRDF at the cells' centers, ``cell_angles``; the BRDF is in 1/sr.
-        filled: Share of the cells above the horizon whose value is that of the nearest measured cell.
+        root: Cube root of the BRDF, in 1/sr, at the cell centers ``cell_angles``.
+        filled: Fraction of the cells above the horizon that were not measured and have the value of the nearest
+            measured cell.
 
     Reference: Rusinkiewicz 1998 for the angles; Matusik et al. 2003 for the spacing.
     """
@@ -117,19 +118,20 @@ def _mix(first: Array, second: Array, weight: Array) -> Array:
 
 
 class MicrofacetTable(eqx.Module):
-    """A microfacet BRDF with tabulated factors, interpolated linearly between the centers of their bins.
+    """A microfacet BRDF with tabulated factors, interpolated linearly between the centers of bins.
 
-    pi f = diffuse + specular D(theta_h) F(theta_d) G(theta_i) G(theta_o) / (cos_i cos_o), per color.
-    D is uniform in sqrt(theta_h), F and G in their angle, all to a quarter turn. Published renderings read
-    D and F without interpolation, which shows as rings. Beyond the outermost centers factors stay, and so does
-    G / cos: the value is bounded at grazing angles.
+    For each color, pi f = diffuse + specular D(theta_h) F(theta_d) G(theta_i) G(theta_o) / (cos_i cos_o).
+
+    Bins of D are uniform in sqrt(theta_h), those of F and G in their angle, all up to a quarter turn. Published
+    renderings look up D and F without interpolation, which shows as rings. Beyond the outermost centers the factors and
+    G / cos are constant, so the value is bounded at grazing angles.
 
     Attributes:
         diffuse: Reflectance of the diffuse part.
         specular: Scale of the specular part.
         distribution: D, normalized to a maximum of 1.
-        fresnel: F, likewise.
-        masking: G, likewise.
+        fresnel: F, normalized to a maximum of 1.
+        masking: G, normalized to a maximum of 1.
 
     Reference: Bagher, Snyder, Nowrouzezahrai 2016.
     """
@@ -165,7 +167,7 @@ def _between(table: Array, place: Array) -> Array:
 def cell_angles(
     resolution: tuple[int, int, int],
 ) -> tuple[Float64[np.ndarray, "h 1 1"], Float64[np.ndarray, "1 d 1"], Float64[np.ndarray, "1 1 p"]]:
-    """theta_h, theta_d and phi_d of the centers of cells of a ``HalfDifferenceTable``, along an axis each."""
+    """theta_h, theta_d and phi_d of the cell centers of a ``HalfDifferenceTable``, each along its own axis."""
     h, d, p = (
         ((np.arange(n) + 0.5) / n).reshape([-1 if i == j else 1 for j in range(3)]) for i, n in enumerate(resolution)
     )
@@ -173,7 +175,7 @@ def cell_angles(
 
 
 def lower_cosine(resolution: tuple[int, int, int]) -> Float64[np.ndarray, "h d p"]:
-    """The smaller of cos_i and cos_o at the centers of cells; negative where a direction is below the horizon."""
+    """The smaller of cos_i and cos_o at the cell centers; negative where a direction is below the horizon."""
     theta_h, theta_d, phi_d = cell_angles(resolution)
     return np.cos(theta_h) * np.cos(theta_d) - np.abs(np.sin(theta_h) * np.sin(theta_d) * np.cos(phi_d))
 
@@ -181,18 +183,18 @@ def lower_cosine(resolution: tuple[int, int, int]) -> Float64[np.ndarray, "h d p
 def tabulate(
     value: Float64[np.ndarray, "h d p c"], valid: Bool[np.ndarray, "h d p"] | np.ndarray
 ) -> HalfDifferenceTable:
-    """Makes a BRDF of its values at the centers of cells, some of which may be missing.
+    """Makes a BRDF from its values at cell centers, some of which may be missing.
 
-    Each missing cell takes the value of the nearest valid one, in cells. Those below the horizon are filled too,
-    since directions just above it are interpolated with them. The first cells in theta_h and in theta_d take their
+    Each missing cell gets the value of the nearest valid cell, by distance in cells. Cells below the horizon are filled
+    too, because interpolation just above the horizon uses them. The first cells in theta_h and in theta_d get their
     mean over phi_d, which is undefined there.
 
     Args:
         value: The BRDF in 1/sr at ``cell_angles``; not negative where valid.
-        valid: Which cells hold a value.
+        valid: Mask of the cells that have a value.
 
     Returns:
-        The BRDF; its ``filled`` is the share of missing cells among those above the horizon.
+        The BRDF. Its ``filled`` is the fraction of missing cells among those above the horizon.
 
     Raises:
         ValueError: No cell is valid.
@@ -200,7 +202,7 @@ def tabulate(
     if not valid.any():
         raise ValueError(f"there must be a valid cell, got none of {valid.size}")
     half = value.shape[2] // 2
-    around = np.pad(valid, ((0, 0), (0, 0), (half, half)), mode="wrap")  # Half a turn on, the table repeats.
+    around = np.pad(valid, ((0, 0), (0, 0), (half, half)), mode="wrap")  # The table repeats after half a turn.
     nearest = np.asarray(scipy.ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True))
     row, column, turn = nearest[..., half : half + value.shape[2]]
     value = value[row, column, (turn - half) % value.shape[2]]
@@ -213,15 +215,15 @@ def tabulate(
 def load_merl(path: str | pathlib.Path) -> HalfDifferenceTable:
     """Loads a BRDF in the binary format of the MERL database.
 
-    Three int32, (90, 90, 180), then that many float64 for red, green, and blue, to be multiplied by
-    (1, 1.15, 1.66) / 1500. Cells with a negative value in any color are invalid, most of them because a direction
-    would be below the horizon; see ``tabulate``.
+    The file has three int32, (90, 90, 180), followed by 90 x 90 x 180 float64 each for red, green and blue, which must
+    be multiplied by (1, 1.15, 1.66) / 1500. Cells with a negative value in any color are invalid, mostly because a
+    direction would be below the horizon. ``tabulate`` fills them.
 
     Args:
         path: The file.
 
     Returns:
-        The BRDF in linear RGB; its ``filled`` counts invalid cells above the horizon.
+        The BRDF in linear RGB. Its ``filled`` is the fraction of invalid cells above the horizon.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -247,16 +249,16 @@ def load_merl(path: str | pathlib.Path) -> HalfDifferenceTable:
 
 
 def load_npf(path: str | pathlib.Path, material: str, *, names: str | pathlib.Path | None = None) -> MicrofacetTable:
-    """Loads one material from the table of non-parametric factors of the 100 MERL materials.
+    """Loads one material from the table of non-parametric microfacet factors of the 100 MERL materials.
 
-    The file is 256 rows of 512 columns of three little-endian float32; a row holds the diffuse and specular
-    reflectance, D, G and F of one material, with 90 bins each, and zeros. First bins of G and F were not fitted and
-    are zero: they take the value of the second.
+    The file has 256 rows of 512 columns of three little-endian float32. A row holds the diffuse and specular
+    reflectance of one material, then D, G and F with 90 bins each, then zeros. The first bins of G and F were not
+    fitted and are zero in the file; they get the value of the second bin.
 
     Args:
         path: The table.
         material: Name of the material, such as "gold-metallic-paint".
-        names: Text with a name per row of the table; None for ``merl_npf_materials.txt`` beside it.
+        names: Text file with the name of each row of the table; if None, ``merl_npf_materials.txt`` in the same folder.
 
     Returns:
         The BRDF in linear RGB.
@@ -288,10 +290,10 @@ def load_npf(path: str | pathlib.Path, material: str, *, names: str | pathlib.Pa
 
 
 def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
-    """Loads one material from a JSON file of coefficients of Lafortune's model.
+    """Loads one material from a JSON file with coefficients of Lafortune's model.
 
-    The file holds ``materials``, by name, each with ``diffuse`` and ``lobes`` of ``Cxy``, ``Cz`` and ``n``, all of
-    three colors. Base and lobes are as in ``jaxprt.brdf.Lafortune``.
+    The file holds ``materials`` by name, each with ``diffuse`` and a list ``lobes`` of ``Cxy``, ``Cz`` and ``n``. All
+    values have three colors. ``jaxprt.brdf.Lafortune`` explains the model.
 
     Args:
         path: The file.
@@ -302,7 +304,7 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is of another form, the material is unknown, a number is not finite, a diffuse
+        ValueError: The file has another structure, the material is unknown, a number is not finite, a diffuse
             reflectance is negative, or an exponent is not positive.
 
     Reference: Lafortune, Foo, Torrance, Greenberg 1997.
@@ -330,10 +332,10 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
 
 
 def one_of(material: str, known: list[str], path: str | pathlib.Path) -> str:
-    """The material, if a file has it.
+    """Returns the name of the material if the file has it.
 
     Raises:
-        ValueError: It does not; the message has names that are near.
+        ValueError: The file does not have the material. The message lists similar names.
     """
     if material not in known:
         near = difflib.get_close_matches(material, known, 5, 0.4) or known[:5]
@@ -347,11 +349,11 @@ def require(path: str | pathlib.Path, value: np.ndarray, good: np.ndarray, requi
     """Raises ValueError, with the count and the first offender, unless all values are good.
 
     Args:
-        path: The file that they come from.
+        path: The file that the values come from.
         value: Values of any shape.
-        good: Whether each is, of the same shape.
-        required: What they must be.
-        what: What they are, a word and the names of the axes.
+        good: Whether each value is good, of the same shape.
+        required: What the values must be, for the message.
+        what: What the values are, for the message: a word and the names of the axes.
     """
     if not good.all():
         place = np.unravel_index(np.argmin(good), good.shape)

@@ -1,6 +1,6 @@
 """Microfacet BRDFs with the GGX distribution, and the metallic-roughness material of glTF 2.0.
 
-The surface consists of small mirrors. The reflection of a pair of directions with the half vector h is
+The surface consists of small mirrors. For directions with the half vector h, the BRDF is
 
     F D V,    D = 1 / (pi a_x a_y ((h_x / a_x)^2 + (h_y / a_y)^2 + h_z^2)^2),
               V = 1 / (2 (cos_o |(a_x x_i, a_y y_i, z_i)| + cos_i |(a_x x_o, a_y y_o, z_o)|)).
@@ -8,11 +8,11 @@ The surface consists of small mirrors. The reflection of a pair of directions wi
 D is the distribution of normals of Trowbridge and Reitz, named GGX by Walter et al. V = G / (4 cos_i cos_o) contains
 the height-correlated masking and shadowing G of Smith's model. F is the Fresnel reflectance at the mirrors.
 
-`roughness` is the perceptual roughness of glTF in this whole file: alpha = roughness^2, and alpha is what Mitsuba's
-`roughconductor` calls `alpha`. An alpha below 0.001 (a roughness below 0.0316) counts as 0.001. The gradient in
+In this file `roughness` is the perceptual roughness of glTF: alpha = roughness^2, where alpha is the parameter `alpha`
+of Mitsuba's `roughconductor`. An alpha below 0.001 (a roughness below 0.0316) is replaced by 0.001; the gradient in
 roughness is zero there.
 
-Light that meets the surface twice is lost: with F = 1 and roughness 1 the surface reflects 31 % at normal incidence.
+Multiple scattering is not included: with F = 1 and roughness 1 the surface reflects only 31 % at normal incidence.
 
 References: Walter, Marschner, Li, Torrance 2007, "Microfacet models for refraction through rough surfaces", for D;
 Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BRDFs", equations 85, 86 and 99, for the
@@ -31,11 +31,11 @@ from jaxprt import require
 from jaxprt.brdf.models import Lambert, Model, both_above, color, half_vector, scalar
 from jaxprt.compile import jit
 
-_SMOOTHEST = 1e-3  # least alpha: a perfect mirror has no density
+_SMOOTHEST = 1e-3  # smallest alpha, because a perfect mirror has no density
 
 
 def _both_axes(value) -> Array:
-    """One number for both tangent axes, or two numbers, as an array [2]."""
+    """One number for both tangent axes, or two numbers, as an array of shape [2]."""
     return jnp.broadcast_to(jnp.asarray(value, jnp.result_type(float)), (2,))
 
 
@@ -44,9 +44,9 @@ def _alpha(roughness: Array) -> Array:
 
 
 def _lobe(wi: Array, wo: Array, along: Array, across: Array, rotation: Array | float) -> tuple[Array, Array]:
-    """D V for alpha along a tangent axis and across it, [*b 1], and the cosine of the directions at the mirrors.
+    """D V, [*b 1], for alpha along a tangent axis and across it, and the cosine between half vector and directions.
 
-    Component by component, as `half_vector` is.
+    It is computed component by component, for the same reason as `half_vector`.
     """
     (x, y, z), cos_d, cos_i, cos_o = half_vector(wi, wo)
     cosine, sine = jnp.cos(rotation), jnp.sin(rotation)
@@ -59,7 +59,7 @@ def _lobe(wi: Array, wo: Array, along: Array, across: Array, rotation: Array | f
         return jnp.sqrt((along * x) ** 2 + (across * y) ** 2 + cosine**2)
 
     x, y = turned(x, y)
-    # In this form alpha = 0.001 keeps the digits that 1 + (alpha^2 - 1) cos^2 would lose.
+    # This form avoids the cancellation of 1 + (alpha^2 - 1) cos^2 at small alpha such as 0.001.
     tilt = (x / along) ** 2 + (y / across) ** 2 + z**2
     distribution = 1 / (jnp.pi * along * across * tilt**2)
     visibility = 0.5 / (cos_o * stretched(wi, cos_i) + cos_i * stretched(wo, cos_o))
@@ -67,7 +67,7 @@ def _lobe(wi: Array, wo: Array, along: Array, across: Array, rotation: Array | f
 
 
 def _schlick_weight(cos_d: Array) -> Array:
-    """Schlick's (1 - v.h)^5, which no rounding makes negative."""
+    """Schlick's (1 - v.h)^5, clamped so that rounding cannot make it negative."""
     return (1 - jnp.minimum(cos_d, 1)) ** 5
 
 
@@ -75,7 +75,7 @@ def _fresnel(cos_d: Array, eta: Array, k: Array) -> Array:
     """Fresnel's reflectance of unpolarized light for the complex index of refraction eta + i k."""
     cos_d = jnp.minimum(cos_d, 1)
     cosine, sine = cos_d**2, 1 - cos_d**2
-    # a + i b is the root of (eta + i k)^2 - sine. With a^2 - b^2 negative, a = eta k / b loses no digits.
+    # a + i b is the square root of (eta + i k)^2 - sine. If a^2 - b^2 is negative, a = eta k / b avoids cancellation.
     real, cross = eta**2 - k**2 - sine, eta * k
     size = jnp.sqrt(jnp.maximum(real**2 + 4 * cross**2, 1e-24))
     larger = jnp.sqrt((size + jnp.abs(real)) / 2)
@@ -87,9 +87,9 @@ def _fresnel(cos_d: Array, eta: Array, k: Array) -> Array:
 
 
 class GGX(Model):
-    """GGX with Schlick's Fresnel term: a metal by its color f0 at normal incidence. Conserves energy for f0 <= 1.
+    """GGX with Schlick's Fresnel term, for metals with the color f0 at normal incidence. Conserves energy for f0 <= 1.
 
-    F = f0 + (1 - f0) (1 - v.h)^5. Dielectrics over a diffuse base are `MetallicRoughness` with metallic 0.
+    F = f0 + (1 - f0) (1 - v.h)^5. For a dielectric over a diffuse base use `MetallicRoughness` with metallic 0.
 
     Attributes:
         f0: Fresnel reflectance at normal incidence; gray or a color.
@@ -114,11 +114,11 @@ class GGX(Model):
 class GGXInterface(Model):
     """GGX with Fresnel's equations: the interface between air and a conductor or a dielectric. Conserves energy.
 
-    Dielectrics have k = 0. What they transmit is lost.
+    Dielectrics have k = 0. Transmitted light is lost.
 
     Attributes:
         eta: Real part of the index of refraction relative to air; gray or a color.
-        k: Imaginary part, the extinction coefficient.
+        k: Extinction coefficient, the imaginary part of the index of refraction.
         roughness: Roughness along the tangent and along the bitangent; one number stands for both.
 
     Reference: Born and Wolf, "Principles of optics", sections 1.5.2 and 14.2, for Fresnel's equations.
@@ -139,7 +139,7 @@ class SchlickDiffuse(Model):
     """Diffuse base under a layer with Schlick's Fresnel term: albedo (1 - (1 - v.h)^5) / pi. Conserves energy.
 
     Attributes:
-        albedo: Share of the light that is reflected where the layer reflects none; gray or a color.
+        albedo: Albedo of the base where the layer reflects nothing; gray or a color.
     """
 
     albedo: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
@@ -153,30 +153,31 @@ class SchlickDiffuse(Model):
 class MetallicRoughness(Model):
     """The metallic-roughness material of glTF 2.0, with its extensions for ior, specular and anisotropy.
 
-    With w = (1 - v.h)^5, F0 = min(((1 - ior) / (1 + ior))^2 specular_color, 1) and D, V as this module has them,
+    With w = (1 - v.h)^5, F0 = min(((1 - ior) / (1 + ior))^2 specular_color, 1), and D and V as defined in this module,
 
         dielectric = specular (F0 + (1 - F0) w) D V + (1 - specular max_c(F0 + (1 - F0) w)) base_color / pi,
         metal = (base_color + (1 - base_color) w) D V,
         value = (1 - metallic) dielectric + metallic metal,
 
-    where max_c is the largest of the colors. G is height-correlated. Appendix B notes that this is more accurate than
-    its own sample implementation, which multiplies the masking of one direction by that of the other.
+    where max_c is the maximum over colors. G is height-correlated. Appendix B of the specification notes that this is
+    more accurate than its sample implementation, which multiplies the masking of one direction by that of the other.
 
     The metal conserves energy for base_color <= 1. The specification's coupling of the dielectric to its diffuse base
     does not: a smooth white dielectric reflects 1.93 times the light that arrives from the horizon.
 
-    Parameters may have leading axes that broadcast against those of the directions: base_color [v 3] and roughness [v]
-    give each of v pairs of directions a material of its own. Where min and max_c have kinks, derivatives are those of
-    one side or their mean.
+    Parameters may have leading axes that broadcast against those of the directions. For example, base_color [v 3] and
+    roughness [v] give each of v pairs of directions its own material. At the kinks of min and max_c, derivatives are
+    those of one side or the mean of both.
 
     Attributes:
         base_color: Albedo of the dielectric, and reflectance of the metal at normal incidence; [c] or [*b c], linear.
-        metallic: Share of the metal, from 0 to 1; [] or [*b], as all the following but specular_color.
+        metallic: Fraction of metal, from 0 to 1; [] or [*b]. All further parameters except specular_color have this
+            shape.
         roughness: Perceptual roughness; alpha = roughness^2.
         ior: Index of refraction of the dielectric. 0 makes F0 = specular_color.
         specular: Weight of the dielectric's reflection, from 0 to 1.
         specular_color: Color of the dielectric's reflection at normal incidence; [c] or [*b c].
-        anisotropy: Strength from 0 to 1: along the axis, alpha rises to alpha + (1 - alpha) anisotropy^2.
+        anisotropy: Strength from 0 to 1. Along the axis, alpha becomes alpha + (1 - alpha) anisotropy^2.
         rotation: Angle in radians from the tangent, counterclockwise about the normal, to the axis along which
             highlights are stretched.
 
@@ -222,19 +223,20 @@ class MetallicRoughness(Model):
         return jnp.where(both_above(wi, wo), diffuse + lobe * (mirror + rim * weight), 0)
 
     def terms(self) -> tuple[Model, Model, Model, Model]:
-        """Four gray BRDFs that depend on roughness, anisotropy and rotation alone.
+        """Four gray BRDFs that depend on roughness, anisotropy and rotation only.
 
         Their sum with the weights `coefficient()` is the whole material:
 
-            K1 = (1 - w) / pi    SchlickDiffuse(1), the base under a full layer
-            K2 = D V             GGX(1), the lobe of a perfect mirror's microfacets
-            K3 = D V w           GGX(0), its part that only Fresnel's rise at grazing angles reflects
-            K4 = 1 / pi          Lambert(1), the base where `specular` < 1 uncovers it
+            K1 = (1 - w) / pi    SchlickDiffuse(1), the diffuse base under a full dielectric layer
+            K2 = D V             GGX(1), the specular lobe with a Fresnel reflectance of 1
+            K3 = D V w           GGX(0), the part of the lobe that is due to Schlick's rise at grazing angles
+            K4 = 1 / pi          Lambert(1), the diffuse base as far as `specular` < 1 removes the layer
 
-        So one table per term serves all textures of color, metallic, ior and specular. Use `needed` to leave out terms.
+        One table per term therefore serves all textures of color, metallic, ior and specular. `needed` tells which
+        terms can be left out.
 
         Raises:
-            ValueError: Roughness, anisotropy or rotation differ between vertices.
+            ValueError: Roughness, anisotropy or rotation varies between vertices.
         """
         for name in ("roughness", "anisotropy", "rotation"):
             if (shape := getattr(self, name).shape) != ():
@@ -246,13 +248,13 @@ class MetallicRoughness(Model):
         return SchlickDiffuse(1.0), GGX(1.0, axes, self.rotation), GGX(0.0, axes, self.rotation), Lambert(1.0)
 
     def coefficient(self) -> Float[Array, "*b 4 c"]:
-        """Weights of the four `terms`, none of them negative for colors up to 1."""
+        """Weights of the four `terms`. They are not negative for colors up to 1."""
         return _stacked(self)
 
     def needed(self) -> tuple[int, ...]:
-        """Indices of the `terms` whose weight is not zero everywhere. All, where values are traced by JAX.
+        """Indices of the `terms` whose weight is not zero everywhere; all four while JAX traces the values.
 
-        A metal needs no diffuse terms, a material with `specular` 1 needs no Lambert term:
+        A metal needs no diffuse terms, and a material with `specular` 1 needs no Lambert term:
 
             keep = material.needed()
             term = [material.terms()[k] for k in keep]
@@ -262,7 +264,7 @@ class MetallicRoughness(Model):
         return tuple(k for k, weight in each if isinstance(weight, Tracer) or np.any(np.asarray(weight)))
 
     def _alphas(self) -> tuple[Array, Array]:
-        """Alpha along the axis and across it."""
+        """Alpha along the axis of anisotropy and across it."""
         alpha = _alpha(self.roughness)
         return alpha + (1 - alpha) * self.anisotropy**2, alpha
 
@@ -271,7 +273,7 @@ class MetallicRoughness(Model):
         f0 = jnp.minimum(((1 - self.ior) / (1 + self.ior))[..., None] ** 2 * self.specular_color, 1)
         dielectric = 1 - metallic
         layer = dielectric * specular
-        # The largest color of F0 + (1 - F0) w is that of F0, whatever w is.
+        # For every w, the largest color of F0 + (1 - F0) w is that of F0.
         under = layer * base * (1 - jnp.max(f0, -1, keepdims=True))
         mirror = layer * f0 + metallic * base
         rim = layer * (1 - f0) + metallic * (1 - base)

@@ -1,7 +1,8 @@
-"""Navigation: moving among the BRDFs of a set, by a weight for each; the weights sum to one.
+"""Families of BRDFs with coordinates: coordinates are mapped to interpolation weights, which sum to one.
 
-A set holds purely specular gray BRDFs of unit weight; diffuse and specular weights and colors are applied elsewhere.
-They also weigh all that is linear in the BRDFs: their coefficients, and the radiance that they reflect.
+A family holds purely specular gray BRDFs of unit weight. Diffuse and specular weights and colors are applied elsewhere.
+The interpolation weights apply to everything that is linear in the BRDF, such as its coefficients and the reflected
+radiance.
 
 Reference: Sun et al. 2007, "Interactive relighting with dynamic BRDFs", section 4.2.
 """
@@ -21,12 +22,12 @@ from jaxtyping import Array, Float
 from jaxprt.brdf import models
 from jaxprt.brdf.places import Columns, Line, Plane, columns, identity, in_columns, triangulate
 
-_identity = identity  # By this name files of earlier releases have it.
-_LEAST = 1e-30  # Exponent below which logarithms are not taken.
-_SMOOTHEST = 1e-3  # Least roughness that the models tell apart.
-_SCALE = np.array([1.0, 1.15, 1.66])  # MERL's scale of colors, which the fits of Ngan et al. lack.
+_identity = identity  # Files of earlier releases use this name.
+_LEAST = 1e-30  # smallest exponent whose logarithm is taken
+_SMOOTHEST = 1e-3  # smallest roughness that the models distinguish
+_SCALE = np.array([1.0, 1.15, 1.66])  # MERL's color scale, which the fits of Ngan et al. lack
 _COLUMNS = ("kd_r", "kd_g", "kd_b", "ks_r", "ks_g", "ks_b", "m", "F0")
-_NO_MATERIAL = np.array([0.0, 1.0])[:, None, None]  # Diffuse and specular weight.
+_NO_MATERIAL = np.array([0.0, 1.0])[:, None, None]  # diffuse and specular weights
 
 
 def _log_roughness(coordinate: Array) -> Array:
@@ -40,14 +41,14 @@ def _log(coordinate: Array) -> Array:
 
 
 class Family(eqx.Module):
-    """A set of BRDFs and the way through it.
+    """A set of BRDFs and the map from coordinates to interpolation weights.
 
     Attributes:
         brdf: Purely specular gray BRDFs of unit weight. Material m is diffuse_m / pi + specular_m brdf_m.
-        navigation: Turns coordinates into a weight for each.
-        name: What each is called.
-        diffuse: Diffuse reflectance of each material in linear RGB; zero where there are no materials.
-        specular: Weight of its lobe in linear RGB; one where there are no materials.
+        navigation: Map from coordinates to a weight for each BRDF.
+        name: Name of each BRDF.
+        diffuse: Diffuse reflectance of each material in linear RGB; zero for sets without materials.
+        specular: Weight of each material's lobe in linear RGB; one for sets without materials.
     """
 
     brdf: tuple[Callable, ...]
@@ -58,20 +59,19 @@ class Family(eqx.Module):
 
 
 def blinn_phong(*, exponents: Sequence[float] = range(1, 201)) -> Family:
-    """Blinn-Phong lobes over their exponent, at the integers from 1 to 200 as published.
+    """Family of Blinn-Phong lobes with their exponent as coordinate; by default the integers 1 to 200, as published.
 
-    The lobes are normalized, see `models.BlinnPhong`: each reflects all light at normal incidence. Weights are linear
-    in the logarithm of the exponent, as the widths of lobes are between knots; with an exponent of 0 among them, in
-    the exponent.
+    The lobes are normalized like `models.BlinnPhong`: each reflects all light at normal incidence. Weights are linear
+    in the logarithm of the exponent, or in the exponent itself if one of the exponents is 0.
 
     Args:
         exponents: Exponent of each BRDF.
 
     Returns:
-        The family, whose coordinate is the exponent.
+        The family. Its coordinate is the exponent.
 
     Raises:
-        ValueError: Exponents are not at least two finite increasing numbers from 0 up.
+        ValueError: There are fewer than two exponents, or they are not finite, not increasing or negative.
     """
     knot = np.asarray(exponents, float)
     if knot.ndim != 1 or len(knot) < 2 or not (np.isfinite(knot).all() and knot[0] >= 0 and np.all(np.diff(knot) > 0)):
@@ -82,31 +82,33 @@ def blinn_phong(*, exponents: Sequence[float] = range(1, 201)) -> Family:
 
 
 def cook_torrance(*, path: str | pathlib.Path | None = None, point: Float[ArrayLike, "m 2"] | None = None) -> Family:
-    """Cook-Torrance lobes over the plane of Fresnel reflectance F0 and roughness m.
+    """Family of Cook-Torrance lobes with two coordinates: Fresnel reflectance F0 and roughness m.
 
-    Points in columns, each of one F0 and from the least m of all to the largest, are interpolated by `Columns`: along
-    each column in log m, then between two columns in F0, in which the model is linear. Scattered points, as those of a
-    file, are interpolated in triangles (`Plane`), which are straight in F0 and log m; published ones are so in m. For
-    the measured materials, each interpolated from the others, the relative rms error by cos_i cos_o is then 0.09 in the
-    mean and 0.03 in the median, instead of 0.4 and 0.07. A roughness below 0.001 counts as that.
+    Points may lie in columns, each with one value of F0 and a range of m that is the same for all columns. Then
+    `Columns` interpolates linearly in log m along each column, and between two columns in F0, in which the model is
+    linear. Scattered points, such as those of a file, are interpolated in triangles (`Plane`) in the plane of F0 and
+    log m; the paper uses m instead of log m. Predicting each measured material from the others, log m reduces the
+    relative rms error, weighted by cos_i cos_o, from a mean of 0.4 to 0.09 and a median of 0.07 to 0.03. A roughness
+    below 0.001 is replaced by 0.001.
 
-    Without a file or points, the set has 49 BRDFs in three columns: 16 values of m, geometric from 0.02, where lobes
-    are few texels of 6 x 64 x 64 wide, to 1, for F0 of 0 and 1, and those between them for F0 of 0.3.
+    Without a file or points, the family has 49 BRDFs in three columns. For F0 of 0 and 1 they have 16 values of m in
+    geometric progression, from 0.02, where lobes are few texels of 6 x 64 x 64 wide, to 1. For F0 of 0.3 m lies between
+    those values.
 
     Args:
-        path: A CSV file whose first row names the columns material, kd_r, kd_g, kd_b, ks_r, ks_g, ks_b, m and F0, as
-            fitted by Ngan et al. to data without MERL's scale of colors, (1, 1.15, 1.66), by which kd and ks are
-            multiplied here. Only m and F0 place a material in the plane.
-        point: Instead, F0 and m of each BRDF.
+        path: A CSV file of fits by Ngan et al. Its first row names the columns material, kd_r, kd_g, kd_b, ks_r, ks_g,
+            ks_b, m and F0. The fitted data lacked MERL's color scale (1, 1.15, 1.66), so kd and ks are multiplied by it
+            here. The coordinates of a material are its F0 and m.
+        point: F0 and m of each BRDF, instead of a file.
 
     Returns:
-        The family, whose coordinate is (F0, m).
+        The family. Its coordinates are (F0, m).
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: There are both a file and points; points are out of range; the file is empty or no text, lacks
-            columns, has cells that are no numbers or out of range, or names a material twice; or there are fewer than
-            three, two coincide, or all lie on one line.
+        FileNotFoundError: The file does not exist.
+        ValueError: Both a file and points are given; points are out of range; the file is empty or not text, lacks
+            columns, has cells that are not numbers or out of range, or names a material twice; or there are fewer than
+            three points, two coincide, or all lie on one line.
 
     Reference: Ngan, Durand, Matusik 2005, "Experimental analysis of BRDF models", for the fits.
     """
@@ -134,7 +136,7 @@ def _family(brdf: tuple, navigation: Line | Plane | Columns, name: tuple[str, ..
 
 
 def _grid() -> np.ndarray:
-    """F0 and m of the set without a file."""
+    """F0 and m of the default family."""
     knot = np.geomspace(0.02, 1, 16)
     between = np.concatenate([knot[:1], np.sqrt(knot[1:] * knot[:-1]), knot[-1:]])
     return np.array([(f0, m) for f0, column in ((0, knot), (0.3, between), (1, knot)) for m in column])
@@ -168,7 +170,7 @@ def _read(path: pathlib.Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
 
 
 def _number(row: dict, column: str, line: int) -> float:
-    """One cell of a row, checked."""
+    """One cell of a row as a number, checked."""
     if None in row:
         raise ValueError(f"line {line}: must have as many cells as the first row, got {len(row[None])} more")
     try:

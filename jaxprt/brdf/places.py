@@ -1,6 +1,6 @@
-"""Places among BRDFs: a weight for each of a set from one coordinate or two, on lines, in triangles and in columns.
+"""Interpolation weights for a set of BRDFs from one or two coordinates: on lines, in triangles and in columns.
 
-Weights are not negative and sum to one. `jaxprt.brdf.navigation` makes sets of BRDFs with the way through them.
+Weights are not negative and sum to one. `jaxprt.brdf.navigation` uses them to make families of BRDFs.
 """
 
 import functools
@@ -17,33 +17,34 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.compile import jit
 
-_ROUNDING = 16  # Units of rounding up to which points coincide, and triangles are lines.
+_ROUNDING = 16  # units of rounding within which points coincide and triangles are degenerate
 _FAR = 1e30
 
 
 def identity(coordinate: Array) -> Array:
-    """The coordinates as they are."""
+    """The coordinates, unchanged."""
     return coordinate
 
 
 class Line(eqx.Module):
-    """A set with one coordinate: linear between neighbors in the chart, the nearest end outside.
+    """Linear interpolation in one coordinate, constant beyond the ends.
 
     Attributes:
-        knot: Coordinate of each BRDF, at least two, increasing.
-        chart: Increasing map of the coordinate.
+        knot: Coordinate of each BRDF; at least two, increasing.
+        chart: Increasing function of the coordinate, such as a logarithm, in which interpolation is linear.
     """
 
     knot: Float[Array, " m"]
     chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
 
     def weight(self, coordinate: Float[ArrayLike, ""]) -> Float[Array, " m"]:
-        """Weight of each BRDF; not negative, their sum is one.
+        """Weight of each BRDF. Weights are not negative and sum to one.
 
-        Differentiable in the coordinate and the knots: at a knot from above, at the last one from below.
+        They are differentiable in the coordinate and the knots. At a knot the derivative is that from above, at the
+        last knot that from below.
 
         Raises:
-            ValueError: The coordinate is no single number.
+            ValueError: The coordinate is not a single number.
         """
         knot = self.chart(self.knot)
         low, upper = _neighbors(knot, self.chart(_checked(coordinate, ())), len(knot))
@@ -55,21 +56,21 @@ class Line(eqx.Module):
         return np.stack([np.arange(len(self.knot) - 1), np.arange(1, len(self.knot))], -1)
 
     def inside(self, coordinate: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether the coordinate is between the ends, or at one."""
+        """Whether the coordinate is between the first and the last knot, inclusive."""
         return (self.knot[0] <= coordinate) & (coordinate <= self.knot[-1])
 
 
 class Plane(eqx.Module):
-    """A set with two coordinates: barycentric in a triangle inside, at the nearest point of the boundary outside.
+    """Barycentric interpolation in a triangulation of two coordinates. Points outside are moved to the boundary.
 
-    Triangles are straight, and distances are measured, in the chart: the coordinates, each mapped and then divided by
-    the extent of the points, since they are of different units. Made by `triangulate`.
+    Triangles and distances are defined in the chart: each coordinate is mapped and then divided by the extent of the
+    points, because the coordinates have different units. `triangulate` makes it.
 
     Attributes:
         point: Coordinates of each BRDF.
-        triangle: Points of each triangle, counter-clockwise.
-        edge: Points of each edge of the boundary, the convex hull in the chart; the inside is on the left.
-        chart: Increasing map of each coordinate, as a function of both.
+        triangle: Point indices of each triangle, counterclockwise.
+        edge: Point indices of each edge of the boundary (the convex hull in the chart); the interior is on the left.
+        chart: Function that maps an array of both coordinates to the chart; increasing in each coordinate.
     """
 
     point: Float[Array, "m 2"]
@@ -78,11 +79,11 @@ class Plane(eqx.Module):
     chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
 
     def weight(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
-        """Weight of each BRDF; not negative, their sum is one, and three at most are not zero.
+        """Weight of each BRDF. Weights are not negative and sum to one; at most three are nonzero.
 
-        Continuous. Differentiable in the coordinate and the points, with the triangulation fixed: the derivative is
-        that of the triangle or edge which was picked, one-sided where several meet, and zero where the nearest point
-        of the boundary stays at one vertex.
+        They are continuous, and differentiable in the coordinate and the points for a fixed triangulation. The
+        derivative is that of the selected triangle or edge. It is one-sided where several meet, and zero where the
+        nearest point of the boundary remains a vertex.
 
         Raises:
             ValueError: There are not two coordinates.
@@ -95,24 +96,25 @@ class Plane(eqx.Module):
         return _pairs(np.asarray(self.triangle))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
-        """Whether the coordinate is inside the boundary or on it, up to rounding."""
+        """Whether the coordinate is inside of the boundary or on it, up to rounding."""
         point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, coordinate))
         return _within(point[self.edge], spot)
 
 
 class Columns(eqx.Module):
-    """A set with two coordinates whose points are in columns: linear along each column, then between two columns.
+    """Interpolation of two coordinates for points in columns: linear along each column, then between two columns.
 
-    Each column has one value of the first coordinate and at least two of the second, of which the least and the largest
-    are those of all columns. A place between two columns gets weight from its neighbors in these alone, so that one
-    coordinate is never traded for the other, and a place in the row of points that both columns have gets weight from
-    these two points alone. Outside, the nearest place inside counts. Made by `columns`.
+    Each column has one value of the first coordinate and at least two values of the second. The smallest and largest
+    values of the second coordinate are the same in all columns. A place between two columns gets weights only from its
+    neighbors in these columns; if both have a point with its second coordinate, only these two points count. Places
+    outside are moved to the nearest place inside. `columns` makes it.
 
     Attributes:
         point: Coordinates of each BRDF.
-        order: Points of each column by their second coordinate. Shorter columns repeat their last point.
+        order: Point indices of each column, sorted by the second coordinate. Shorter columns repeat their last point.
         count: Number of points in each column.
-        chart: Increasing map of each coordinate for itself, as a function of both; weights are linear in it.
+        chart: Function that maps an array of both coordinates to the chart, each coordinate on its own and increasing.
+            Weights are linear in the chart.
     """
 
     point: Float[Array, "m 2"]
@@ -121,10 +123,11 @@ class Columns(eqx.Module):
     chart: Callable[[Array], Array] = eqx.field(static=True, default=identity)
 
     def weight(self, coordinate: Float[ArrayLike, "2"]) -> Float[Array, " m"]:
-        """Weight of each BRDF; not negative, their sum is one, and four at most are not zero.
+        """Weight of each BRDF. Weights are not negative and sum to one; at most four are nonzero.
 
-        Continuous. Differentiable in the coordinate and the points, with the columns fixed; at a point from above, at
-        the last one from below. Outside, the derivative across the border is zero.
+        They are continuous, and differentiable in the coordinate and the points for fixed columns. At a point the
+        derivative is that from above, at the last point that from below. Outside, the derivative across the border is
+        zero.
 
         Raises:
             ValueError: There are not two coordinates.
@@ -145,7 +148,7 @@ class Columns(eqx.Module):
         return _pairs(np.concatenate(found))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
-        """Whether the coordinate is between the ends of both coordinates, or at one."""
+        """Whether both coordinates are between their ends, inclusive."""
         point = self.point[self.order]
         low, high = jnp.min(point, (0, 1)), jnp.max(point, (0, 1))
         return jnp.all((low <= coordinate) & (coordinate <= high))
@@ -154,15 +157,15 @@ class Columns(eqx.Module):
 def triangulate(
     point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity, name: Sequence[str] = ()
 ) -> Plane:
-    """Triangulates points by Delaunay's criterion in their chart; see `Plane`. Runs on the host.
+    """Makes a `Plane` by Delaunay triangulation of points in their chart. Runs on the host.
 
     Args:
         point: Coordinates of each BRDF.
-        chart: Increasing map of each coordinate, as a function of both.
-        name: What to call the points in messages, instead of their numbers.
+        chart: Function that maps an array of both coordinates to the chart; increasing in each coordinate.
+        name: Names of the points in error messages, instead of their indices.
 
     Returns:
-        The plane.
+        The triangulation.
 
     Raises:
         ValueError: There are fewer than three points, a point is not finite, two coincide, or all lie on one line;
@@ -173,7 +176,7 @@ def triangulate(
         triangle = scipy.spatial.Delaunay(scaled).simplices  # Counter-clockwise.
     except scipy.spatial.QhullError:
         triangle = np.zeros((0, 3), int)
-    # Slivers occur along the hull alone.
+    # Slivers occur only along the hull.
     area, size = _area(scaled[triangle])
     triangle = triangle[area > rounding * size]
     if not len(triangle):
@@ -185,11 +188,11 @@ def triangulate(
 
 
 def in_columns(point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity) -> bool:
-    """Whether points are in at least two columns as `Columns` has them, up to rounding. Runs on the host.
+    """Whether points lie in at least two columns as `Columns` requires, up to rounding. Runs on the host.
 
     Args:
         point: Coordinates of each BRDF.
-        chart: Increasing map of each coordinate for itself, as a function of both.
+        chart: Function that maps an array of both coordinates to the chart, each coordinate on its own and increasing.
     """
     point = np.asarray(point).astype(jnp.result_type(float))
     if point.ndim != 2 or point.shape[1] != 2 or len(point) < 4 or not np.isfinite(point).all():
@@ -204,12 +207,12 @@ def in_columns(point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array
 def columns(
     point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array] = identity, name: Sequence[str] = ()
 ) -> Columns:
-    """Sorts points into columns; see `Columns`. Runs on the host.
+    """Makes a `Columns` by sorting points into columns. Runs on the host.
 
     Args:
         point: Coordinates of each BRDF.
-        chart: Increasing map of each coordinate for itself, as a function of both.
-        name: What to call the points in messages, instead of their numbers.
+        chart: Function that maps an array of both coordinates to the chart, each coordinate on its own and increasing.
+        name: Names of the points in error messages, instead of their indices.
 
     Returns:
         The columns.
@@ -233,14 +236,14 @@ def columns(
 
 
 def _pairs(group: Int[np.ndarray, "g n"]) -> Int[np.ndarray, "p 2"]:
-    """All pairs within groups of numbers, each once."""
+    """All pairs of indices within groups, each once."""
     first, second = np.triu_indices(group.shape[1], 1)
     each = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
     return np.unique(each, axis=0)
 
 
 def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:
-    """Points of each column, by their second coordinate."""
+    """Point indices of each column, sorted by the second coordinate."""
     along = np.argsort(scaled[:, 0], kind="stable")
     parts = np.split(along, np.flatnonzero(np.diff(scaled[along, 0]) > rounding) + 1)
     return [each[np.argsort(scaled[each, 1], kind="stable")] for each in parts]
@@ -249,7 +252,7 @@ def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:
 def _apart(
     point: ArrayLike, chart: Callable[[Array], Array], name: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points that are finite and do not coincide, the same in the scaled chart, and what rounding is there."""
+    """The points, the points in the scaled chart, and the rounding error there. Refuses equal or non-finite points."""
     point = np.asarray(point).astype(jnp.result_type(float))
     if point.ndim != 2 or point.shape[1] != 2 or len(point) < 3:
         raise ValueError(f"points must be at least three pairs of coordinates, got an array of shape {point.shape}")
@@ -258,7 +261,7 @@ def _apart(
     if broken.size:
         first = f"the first is {name[broken[0]]} at {_text(point[broken[0]])}"
         raise ValueError(f"points must be finite, got {broken.size} that are not, {first}")
-    # As the plane itself computes them, in its precision.
+    # Computed in the same precision as `Plane` does.
     scaled = np.asarray(_scaled(chart, point, point), np.float64)
     rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
     distance, pair = scipy.spatial.KDTree(scaled).query(scaled, k=2)
@@ -276,7 +279,7 @@ def _text(point: np.ndarray) -> str:
 
 @jit
 def _column_weight(columns: Columns, coordinate: Array) -> Array:
-    """`Columns.weight` of two numbers that are finite."""
+    """`Columns.weight` for two finite numbers."""
     point, spot = (columns.chart(each) for each in (columns.point, coordinate))
     place = point[columns.order]
     left, across = _neighbors(place[:, 0, 0], spot[0], len(place))
@@ -289,7 +292,7 @@ def _column_weight(columns: Columns, coordinate: Array) -> Array:
 
 
 def _neighbors(knot: Array, spot: Array, count: ArrayLike) -> tuple[Array, Array]:
-    """The lower neighbor of a spot among increasing knots, the first `count`, and the weight of the upper one."""
+    """Index of the lower neighbor of a spot among the first `count` of increasing knots, and the upper one's weight."""
     spot = _clip(spot, knot[0], knot[-1])
     low = jnp.clip(jnp.searchsorted(knot, spot, side="right") - 1, 0, count - 2)
     return low, (spot - knot[low]) / (knot[low + 1] - knot[low])
@@ -297,18 +300,18 @@ def _neighbors(knot: Array, spot: Array, count: ArrayLike) -> tuple[Array, Array
 
 @jit
 def _weight(plane: Plane, coordinate: Array) -> Array:
-    """`Plane.weight` of two numbers that are finite: some sixty operations, as one program."""
+    """`Plane.weight` for two finite numbers: some sixty operations, compiled as one program."""
     point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
-    # What is picked is not differentiated.
+    # The selection of a triangle or edge is not differentiated.
     still, fixed = jax.lax.stop_gradient((point, spot))
     weight, flat = _barycentric(still[plane.triangle], fixed)
     triangle = plane.triangle[jnp.argmax(jnp.where(flat, -jnp.inf, jnp.min(weight, -1)))]
     _, nearest = _project(still[plane.edge], fixed)
-    # The squared distance less the square of the spot: far away that has no digits left for the difference.
+    # The squared distance without the square of the spot, which far away would round away the differences.
     edge = plane.edge[jnp.argmin(jnp.sum(nearest * (nearest - 2 * fixed), -1))]
     along, _ = _project(point[edge], spot)
     weight, _ = _barycentric(point[triangle], spot)
-    # Rounding puts spots on edges just outside all triangles: their values are clipped, their derivatives are not.
+    # Rounding may put spots on edges just outside of all triangles. Their values are clipped, their derivatives not.
     valid = jnp.maximum(weight, 0)
     weight = weight + jax.lax.stop_gradient(valid / jnp.sum(valid) - weight)
     within = _within(still[plane.edge], fixed)
@@ -318,7 +321,7 @@ def _weight(plane: Plane, coordinate: Array) -> Array:
 
 
 def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Coordinates as floating-point numbers; infinite ones are far away."""
+    """Coordinates as floating-point numbers. Infinite ones become large finite ones."""
     value = jnp.asarray(coordinate, jnp.result_type(float))
     if value.shape != shape:
         kind = "two coordinates" if shape else "one coordinate, a number,"
@@ -327,13 +330,13 @@ def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _clip(value: Array, low: ArrayLike, high: ArrayLike) -> Array:
-    """As jnp.clip, but at the ends with the derivative of the inside."""
+    """Like jnp.clip, but the derivative at the ends is that of the inside."""
     return jnp.where(value < low, low, jnp.where(value > high, high, value))
 
 
 @functools.partial(jit, static_argnums=0)
 def _scaled(chart: Callable[[Array], Array], point: Array, coordinate: Array) -> Array:
-    """Coordinates in the chart, those of the points from 0 to 1."""
+    """Coordinates in the chart, scaled so that those of the points range from 0 to 1."""
     low, high = jnp.min(chart(point), 0), jnp.max(chart(point), 0)
     return (chart(coordinate) - low) / jnp.where(high > low, high - low, 1)
 
@@ -343,13 +346,13 @@ def _cross(first, second):
 
 
 def _area(corner):
-    """Twice the area of triangles, positive for counter-clockwise ones, and the sum of two sides squared."""
+    """Twice the signed area of triangles, positive if counterclockwise, and the sum of two squared sides."""
     u, v = corner[..., 1, :] - corner[..., 0, :], corner[..., 2, :] - corner[..., 0, :]
     return _cross(u, v), (u**2 + v**2).sum(-1)
 
 
 def _barycentric(corner: Array, spot: Array) -> tuple[Array, Array]:
-    """Barycentric coordinates in triangles, and whether these are too thin to have any; linear in the spot."""
+    """Barycentric coordinates in triangles, linear in the spot, and whether the triangles are degenerate."""
     area, size = _area(corner)
     flat = area <= _ROUNDING / 4 * jnp.finfo(area.dtype).eps * size
     start = corner[..., 0, :]
@@ -359,7 +362,7 @@ def _barycentric(corner: Array, spot: Array) -> tuple[Array, Array]:
 
 
 def _project(segment: Array, spot: Array) -> tuple[Array, Array]:
-    """The nearest points of segments: how far along they lie, from 0 to 1, and where they are."""
+    """The nearest points on segments: their parameter from 0 to 1, and their position."""
     start, way = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
     square = jnp.sum(way**2, -1)
     along = _clip(jnp.sum((spot - start) * way, -1) / jnp.where(square > 0, square, 1), 0, 1)
@@ -367,7 +370,7 @@ def _project(segment: Array, spot: Array) -> tuple[Array, Array]:
 
 
 def _within(edge: Array, spot: Array) -> Array:
-    """Whether a spot is on the left of all edges: rounding leaves cracks between triangles, not in the hull."""
+    """Whether a spot is on the left of all edges. Rounding may leave gaps between triangles, but not in the hull."""
     start, way = edge[:, 0], edge[:, 1] - edge[:, 0]
     slack = 8 * jnp.finfo(spot.dtype).eps * jnp.sqrt(jnp.sum(way**2, -1))
     return jnp.all(_cross(way, spot - start) >= -slack)

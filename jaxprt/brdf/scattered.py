@@ -1,6 +1,6 @@
-"""Scattered spectral measurements of isotropic materials, made smooth BRDFs by radial basis functions.
+"""Smooth BRDFs from scattered spectral measurements of isotropic materials, by radial basis functions.
 
-Runs on the host, once, where data enters; the result is a ``jaxprt.brdf.measured.HalfDifferenceTable``.
+This runs on the host when data is loaded. The result is a ``jaxprt.brdf.measured.HalfDifferenceTable``.
 """
 
 import pathlib
@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from jaxprt.brdf import measured
 from jaxprt.brdf.measured import HalfDifferenceTable
 
-_GLOSS = 0.01  # Sine of theta_h at which the coordinates of the radial basis functions turn logarithmic.
-_HIGHLIGHT = 2.0  # First coordinate up to which samples make the highlight: theta_h of 1.5 degrees.
-_FEWEST = 10  # Samples; a plane in three coordinates needs four, that do not lie on it.
+_GLOSS = 0.01  # sine of theta_h beyond which the first coordinate of the radial basis functions is logarithmic
+_HIGHLIGHT = 2.0  # first coordinate up to which samples belong to the highlight: theta_h of 1.5 degrees
+_FEWEST = 10  # smallest number of samples
 _RESOLUTION = (90, 48, 24)
 # Wyman, Sloan, Shirley 2013: channel, height, center in nm, inverse widths below and above it.
 _LOBES = (
@@ -42,13 +42,13 @@ _XYZ_TO_RGB = np.linalg.inv(_PRIMARY * np.linalg.solve(_PRIMARY, _WHITE))
 def load_scattered(
     path: str | pathlib.Path, *, smoothing: float = 1.0, resolution: tuple[int, int, int] = _RESOLUTION
 ) -> HalfDifferenceTable:
-    """Loads scattered measurements of an isotropic material and makes them a smooth BRDF.
+    """Loads scattered measurements of an isotropic material as a smooth BRDF.
 
-    See ``read_scattered`` for the file and the colors, and ``interpolate_scattered`` for the rest.
+    ``read_scattered`` explains the file and the colors, ``interpolate_scattered`` the method and the other arguments.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: As the two functions raise it.
+        FileNotFoundError: The file does not exist.
+        ValueError: One of the two functions refuses the file or an argument.
     """
     wi, wo, color = read_scattered(path)
     try:
@@ -62,18 +62,19 @@ def read_scattered(
 ) -> tuple[Float64[np.ndarray, "b 3"], Float64[np.ndarray, "b 3"], Float64[np.ndarray, "b 3"]]:
     """Reads scattered spectral measurements of an isotropic material.
 
-    The text holds the number of wavelengths, the wavelengths in nm, and samples: theta_i, phi_i, theta_o, phi_o in
-    radians and the BRDF at each wavelength in 1/sr. What follows a # in a line is a comment.
+    The text file holds the number of wavelengths, the wavelengths in nm, and the samples. A sample is theta_i, phi_i,
+    theta_o and phi_o in radians and the BRDF at each wavelength in 1/sr. A # starts a comment.
 
     Args:
         path: The file.
 
     Returns:
-        Directions to the light, to the viewer, and the BRDF in linear RGB, of each sample; see ``spectrum_to_rgb``.
+        For each sample the direction to the light, the direction to the viewer, and the BRDF in linear RGB, converted
+        by ``spectrum_to_rgb``.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is not of this form, or holds no samples, values that are negative or not finite, or
+        FileNotFoundError: The file does not exist.
+        ValueError: The file does not have this form, or holds no samples, values that are negative or not finite, or
             directions below the horizon.
     """
     number = _numbers(path)
@@ -124,35 +125,36 @@ def interpolate_scattered(
     smoothing: float = 1.0,
     resolution: tuple[int, int, int] = _RESOLUTION,
 ) -> HalfDifferenceTable:
-    """Makes a smooth isotropic BRDF of scattered samples by radial basis functions, and tabulates it.
+    """Interpolates scattered samples to a smooth isotropic BRDF by radial basis functions, and tabulates it.
 
-    The coordinates are log(1 + sin(theta_h)^2 / 0.01^2), 4 sin(theta_d)^2 and 4 (cos_i - cos_o)^2: analytic in the
-    directions, so there is no seam where the angles are undefined; the same for exchanged and for mirrored
-    directions; and fine enough at the half vector's pole for gloss. Thin-plate splines of log(1 + f / s), with s a
-    tenth of the median, are never negative when turned back, which is made sure of where they are below zero.
+    The coordinates are log(1 + sin(theta_h)^2 / 0.01^2), 4 sin(theta_d)^2 and 4 (cos_i - cos_o)^2. They are analytic in
+    the directions, so there is no seam where the angles are undefined. They are the same for exchanged and for mirrored
+    directions, and they resolve glossy highlights around theta_h = 0. Thin-plate splines interpolate log(1 + f / s),
+    where s is a tenth of the median; negative values are clamped to zero.
 
-    Cells with a direction further from the normal than any measured one take the value of the nearest other cell;
-    elsewhere the value is held below the largest sample, and coordinates at the outermost ones. So the BRDF stays
-    bounded at grazing angles, where extrapolated splines would not.
+    Cells with a direction farther from the normal than any measured one get the value of the nearest other cell. In the
+    other cells, the value is limited to the largest sample and coordinates to their measured range. The BRDF therefore
+    stays bounded at grazing angles, where extrapolated splines would not.
 
     Args:
         wi: Unit directions to the light above the horizon.
         wo: Unit directions to the viewer above the horizon.
         value: The BRDF in 1/sr; negative values count as zero.
-        smoothing: How far the surface may miss samples for smoothness, see ``scipy.interpolate.RBFInterpolator``.
-            With 0.01, surfaces of measured lacquers swing between the angles of incidence to 16 to 24 times the largest
-            sample around; with 1, to less than twice, and samples left out are predicted as well. In the highlight
-            (theta_h below 1.5 degrees) a thousandth of it is used: its few samples would be smoothed away.
-        resolution: Cells in theta_h, theta_d and, an even number, phi_d.
+        smoothing: Smoothing parameter of ``scipy.interpolate.RBFInterpolator``; larger values fit the samples less
+            closely. For measured lacquers, 0.01 lets the BRDF overshoot between the measured angles of incidence to 16
+            to 24 times the largest nearby sample. With 1 it stays below twice that sample and predicts left-out samples
+            equally well. In the highlight (theta_h below 1.5 degrees) a thousandth of it is used, because the few
+            samples there would be smoothed away.
+        resolution: Number of cells in theta_h, theta_d and phi_d; the last must be even.
 
     Returns:
-        The BRDF; see ``jaxprt.brdf.measured.tabulate`` for what its ``filled`` counts.
+        The BRDF. ``jaxprt.brdf.measured.tabulate`` explains its ``filled``.
 
     Raises:
-        ValueError: There are fewer than ten different samples, all on one plane, or an option is out of range.
+        ValueError: There are fewer than ten different samples, all lie on one plane, or an option is out of range.
 
-    Reference: Kautz, Sloan, Snyder 2002, "Calculating BRDF Coefficients", for radial basis functions; the
-    coordinates are ours.
+    Reference: Kautz, Sloan, Snyder 2002, "Calculating BRDF Coefficients", for radial basis functions. The choice of
+    coordinates is new.
     """
     if len(resolution) != 3 or min(resolution) < 2 or resolution[2] % 2:
         raise ValueError(f"resolution must be three numbers of at least 2, the last even, got {resolution}")
@@ -160,7 +162,7 @@ def interpolate_scattered(
         raise ValueError(f"smoothing must be at least 0, got {smoothing}")
     half = np.sum((wi + wo)[:, :2] ** 2, 1) / np.sum((wi + wo) ** 2, 1)
     place = _spline_coordinates(half, np.sum((wi - wo) ** 2, 1) / 4, (wi - wo)[:, 2] ** 2)
-    # Exchanged and mirrored samples share a place, and smoothing may be zero: take their mean.
+    # Exchanged and mirrored samples have equal coordinates. Their mean is used, because smoothing may be zero.
     place, inverse, count = np.unique(place.round(9), axis=0, return_inverse=True, return_counts=True)
     if len(place) < _FEWEST:
         raise ValueError(f"there must be at least {_FEWEST} different samples, got {len(place)}")
@@ -185,33 +187,33 @@ def interpolate_scattered(
         table[mine] = spline(np.clip(query[mine], place.min(0), place.max(0)))
     table += table[:, :, ::-1]
     result = measured.tabulate(scale * np.expm1(np.clip(table, 0, height.max(0))), known)
-    # Where two measured cells are equally near, filling chose one: mirror images agree again in their mean.
+    # Where two measured cells are equally near, filling chose one. The mean restores the mirror symmetry.
     return HalfDifferenceTable((result.root + result.root[:, :, ::-1]) / 2, result.filled)
 
 
 def _spline_coordinates(half: np.ndarray, difference: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-    """From sin(theta_h)^2, sin(theta_d)^2 and (cos_i - cos_o)^2; scaled for small errors at left-out samples."""
+    """Coordinates from sin(theta_h)^2, sin(theta_d)^2 and (cos_i - cos_o)^2, scaled by cross-validation."""
     return np.stack([np.log1p(half / _GLOSS**2), 4 * difference, 4 * tilt], -1)
 
 
 def spectrum_to_rgb(
     reflectance: Float64[np.ndarray, "*b w"], wavelength: Float64[np.ndarray, " w"]
 ) -> Float64[np.ndarray, "*b 3"]:
-    """Color of a spectral reflectance, or BRDF, in linear Rec. 709, as seen under daylight D65.
+    """Converts a spectral reflectance or BRDF to linear Rec. 709 RGB under the illuminant D65.
 
-    D65 is the white of Rec. 709, and what reflects all wavelengths alike is (1, 1, 1) times that: each channel is
-    divided by that of a reflectance of 1, which corrects a percent or so for the ends of the spectrum and the
-    approximated matching functions. Colors more saturated than Rec. 709 are clipped at zero.
+    A constant spectrum of value 1 becomes (1, 1, 1): each channel is divided by that of a reflectance of 1. This
+    corrects about one percent for the ends of the spectrum and for the approximated matching functions. Colors outside
+    of the gamut of Rec. 709 are clipped at zero.
 
     Args:
         reflectance: Values at the wavelengths.
-        wavelength: Increasing wavelengths in nm; the integral over them is by trapezoids, and ends with them.
+        wavelength: Increasing wavelengths in nm. Integration uses the trapezoidal rule over their range.
 
     Returns:
         Color in the units of the values.
 
     Raises:
-        ValueError: The wavelengths do not reach from 430 to 650 nm, or lie over 40 nm apart.
+        ValueError: The wavelengths do not cover 430 to 650 nm, or are more than 40 nm apart.
 
     Reference: Wyman, Sloan, Shirley 2013, "Simple Analytic Approximations to the CIE XYZ Color Matching Functions",
     the multi-lobe fit of the 2-degree observer of 1931; CIE 15 for D65; ITU-R BT.709 for the primaries.

@@ -1,4 +1,4 @@
-"""BRDFs that vary over a surface: one for each vertex, and several gray ones side by side."""
+"""BRDFs that vary over a surface: one model per vertex, and several gray BRDFs as channels."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from jaxprt.compile import jit
 
 
 class PerVertex(eqx.Module):
-    """A BRDF for each vertex: a model whose parameters have a leading axis of vertices, every one of them.
+    """A BRDF for each vertex: a model in which every parameter has a leading axis of vertices.
 
     Attributes:
         model: The model, such as `MetallicRoughness` with textured parameters.
@@ -22,7 +22,7 @@ class PerVertex(eqx.Module):
     model: Callable
 
     def __check_init__(self):
-        """Refuses parameters of unlike numbers of vertices."""
+        """Refuses parameters with different numbers of vertices."""
         leaves = jax.tree.leaves(self.model)
         if not leaves or any(not each.ndim for each in leaves):
             raise ValueError("every parameter of the model must have a leading axis of vertices, got one without")
@@ -35,11 +35,11 @@ class PerVertex(eqx.Module):
         return len(jax.tree.leaves(self.model)[0])
 
     def of(self, vertex: Int[Array, "*b"]) -> Callable:
-        """The model of some vertices; of one vertex it has no leading axis."""
+        """The model at some vertices. For a single vertex index its parameters have no leading axis."""
         return _rows(self.model, vertex)
 
     def __call__(self, wi: Float[Array, "v *b 3"], wo: Float[Array, "v *b 3"]) -> Float[Array, "v *b c"]:
-        """Value in 1/sr, of each vertex for its own directions."""
+        """Value in 1/sr at each vertex, for that vertex's directions."""
         return jax.vmap(lambda model, wi, wo: model(wi, wo))(self.model, wi, wo)
 
 
@@ -49,12 +49,12 @@ def _rows(model: Callable, vertex: Array) -> Callable:
 
 
 class Channels(eqx.Module):
-    """Several gray BRDFs as the channels of one, so that one table or factorization holds them all.
+    """Several gray BRDFs as the channels of one BRDF, so that one table or factorization holds them all.
 
     Attributes:
-        model: The BRDFs.
-        scale: Factor of each. What is fitted to all channels together sees their sum, so that typical weights belong
-            here; weights of a `Blend` are then relative to them.
+        model: The gray BRDFs.
+        scale: Factor of each BRDF. Fits to all channels minimize their summed error, so the factors should be typical
+            weights; weights of a `Blend` are then relative to them.
     """
 
     model: tuple[Any, ...]

@@ -1,4 +1,4 @@
-"""Factorizations; they know no BRDF and no mesh."""
+"""Matrix, tensor and density factorizations. They depend on neither BRDFs nor meshes."""
 
 from jaxprt.decompose import eigen, mixture, tucker
 

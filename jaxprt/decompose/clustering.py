@@ -1,27 +1,27 @@
-"""Groups of points that lie together."""
+"""Clustering of points into groups of equal size."""
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxprt.decompose import eigen
 
-_TIE = 1e-5  # of the width, below which neighbors are side by side
+_TIE = 1e-5  # coordinates that differ by less than this share of the width count as equal
 
 
 def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray, "p m"]:
-    """Cuts points into clusters of equal size, halving across the widest direction until there are enough.
+    """Divides points into clusters of equal size, by repeatedly halving across the direction of largest variance.
 
-    Equal sizes make the products over a cluster's members one dense batch. No cluster can be empty.
+    With equal sizes, products over the members of all clusters form one dense batch. No cluster is empty.
 
     Args:
         point: Points, with coordinates in comparable units.
-        clusters: How many clusters.
+        clusters: Number of clusters.
 
     Returns:
-        Numbers of each cluster's m = ceil(v / clusters) points; where a cluster has one fewer, its last is repeated.
+        Indices of the m = ceil(v / clusters) points of each cluster. A cluster with one point fewer repeats its last.
 
     Raises:
-        ValueError: Fewer points than clusters, or points that are not finite.
+        ValueError: `clusters` is below 1 or above the number of points, or a point is not finite.
     """
     if not 1 <= clusters <= len(point):
         raise ValueError(f"clusters must be between 1 and the {len(point)} points, got {clusters}")
@@ -38,7 +38,7 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
         value, axis = np.linalg.eigh(offset.T @ offset)
         axis = axis[:, ::-1] @ eigen.orientation(value[::-1], axis[:, ::-1])
         order = member[_ordered(offset @ axis[:, 0])]
-        # Whole clusters' worth of points on either side, so that in the end all sizes differ by at most one.
+        # Each side gets points for a whole number of clusters, so that final sizes differ by at most one.
         first = parts // 2
         cut = len(member) // parts * first + min(len(member) % parts, first)
         todo += [(order[cut:], parts - first), (order[:cut], first)]
@@ -46,9 +46,10 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
 
 
 def _ordered(along: Float[np.ndarray, " v"]) -> Int[np.ndarray, " v"]:
-    """Points in rising order, those that are side by side by their numbers.
+    """Indices of points in ascending order. Points with equal coordinates are ordered by index.
 
-    Symmetric meshes have many of these, and rounding, which is another on other processors, must not order them.
+    Symmetric meshes have many equal coordinates. Their order must not depend on rounding, which differs between
+    processors.
     """
     order = np.argsort(along, kind="stable")
     rises = np.diff(along[order], prepend=along[order[0]]) > _TIE * np.ptp(along)

@@ -1,9 +1,9 @@
-"""Leading eigenvectors and singular vectors by block Krylov iteration, and one by one by power iteration.
+"""Leading eigenvectors and singular vectors, by block Krylov iteration or by power iteration with deflation.
 
-A block of `terms` + 8 vectors is multiplied a few times; the span of all the products is searched for the block that
-is best in it (Rayleigh-Ritz), and the search starts again from there. One vector at a time with deflation, as Wang et
-al. print it, does not converge where eigenvalues of opposite sign are nearly equal, as they are in BRDF matrices; the
-block does.
+A block of `terms` + 8 vectors is multiplied by the matrix a few times. Rayleigh-Ritz finds the best block in the span
+of all products, and the iteration restarts from that block. Power iteration on one vector at a time with deflation, as
+in Wang et al. 2004, does not converge where eigenvalues of opposite sign have nearly the same magnitude. BRDF matrices
+have such eigenvalues; the block iteration converges for them.
 """
 
 from collections.abc import Callable
@@ -17,23 +17,23 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit
 
 _OVERSAMPLE = 8
-_DEPTH = 5  # Blocks in the span, at most; one block alone needs five times as many products on BRDF matrices.
-_EQUAL = 1e-3  # difference of neighboring eigenvalues, as a share of the larger, below which they count as equal
-_WIDTH = 512  # Vectors in the span, about at most: its own eigenvectors must not cost more than the products.
+_DEPTH = 5  # most blocks in the span; a single block needs five times as many products on BRDF matrices
+_EQUAL = 1e-3  # neighboring eigenvalues with a smaller relative difference count as equal
+_WIDTH = 512  # approximate limit of vectors in the span: its eigenproblem must not cost more than the products
 
 
 def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple[Array, Array, Array]:
-    """Block Krylov iteration for a symmetric operator; eigenpairs by falling magnitude and residuals per step."""
+    """Block Krylov iteration for a symmetric operator: eigenpairs by descending magnitude, and a residual per step."""
     block = min(terms + _OVERSAMPLE, size)
     depth = max(2, min(_DEPTH, _WIDTH // block))
     draw = jax.random.normal(jax.random.key(0), (depth, size, block), dtype)
-    if depth * block >= size:  # The whole space, in any basis.
+    if depth * block >= size:  # the span is the whole space
         block, depth, draw = size, 1, jnp.eye(size, dtype=dtype)[None]
 
     def grow(carry, item):
         basis, image, fresh = carry
         place, noise = item
-        # Random vectors stand in where a product adds nothing to the span. Projecting twice is then enough.
+        # Random vectors replace products that add nothing to the span. Projecting twice is then enough.
         fresh = _normalized(fresh) + 10 * jnp.finfo(dtype).eps * _normalized(noise)
         for _ in range(2):
             fresh = _orthonormal(fresh - basis @ (basis.T @ fresh))
@@ -47,7 +47,7 @@ def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple
         fresh = _orthonormal(carry[0])
         product = apply(fresh)
         basis, image = (jnp.pad(each, ((0, 0), (0, (depth - 1) * block))) for each in (fresh, product))
-        # Others in each sweep, which keeps the random vectors of the last one in its own.
+        # Other random vectors in each sweep, because the span already contains those of the last sweep.
         items = block * jnp.arange(1, depth), jnp.roll(draw[1:], sweep, 1)
         (basis, image, _), _ = jax.lax.scan(grow, (basis, image, product), items)
         ritz = basis.T @ image
@@ -65,7 +65,7 @@ def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple
 
 
 def _orthonormal(vector: Array) -> Array:
-    """Householder's QR: orthonormal columns whatever the rank."""
+    """Orthonormal columns by Householder QR, for matrices of any rank."""
     return jnp.linalg.qr(vector)[0]
 
 
@@ -83,20 +83,20 @@ def _check(terms: int, size: int) -> None:
 def symmetric(
     matrix: Float[Array, "n n"], *, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, " s"]]:
-    """Eigenpairs of largest magnitude of a symmetric matrix, either sign.
+    """Eigenpairs of a symmetric matrix with the eigenvalues of largest magnitude, of either sign.
 
     Args:
         matrix: A symmetric matrix.
-        terms: How many pairs.
-        steps: Number of sweeps. A sweep is five products of the matrix with a block of `terms` + 8 vectors, fewer for
-            more than 94 terms.
+        terms: Number of eigenpairs.
+        steps: Number of sweeps. A sweep multiplies the matrix five times by a block of `terms` + 8 vectors, fewer times
+            for more than 94 terms.
 
     Returns:
-        Eigenvalues by falling magnitude, unit eigenvectors as columns, and after each sweep the relative residual
-        |A V - V D| / |D| of the pairs asked for.
+        Eigenvalues by descending magnitude; unit eigenvectors as columns; and, after each sweep, the relative residual
+        |A V - V D| / |D| of the returned pairs.
 
     Raises:
-        ValueError: More terms than rows.
+        ValueError: `terms` is below 1 or above the number of rows.
 
     Reference: Musco and Musco 2015, algorithm 2; for the use, Wang, Tran, Luebke 2004, appendix.
     """
@@ -108,22 +108,24 @@ def symmetric(
 def left_singular(
     matrix: Float[Array, "m n"], *, metric: Float[Array, "n n"] | None = None, terms: int, steps: int = 2
 ) -> tuple[Float[Array, " r"], Float[Array, "m r"], Float[Array, " s"]]:
-    """Leading left singular vectors of M C^(1/2), for a metric C that need not be factored.
+    """Leading left singular vectors of M C^(1/2). The metric C need not be factored.
 
-    They span the best subspace for the images M x of random x with covariance C, since these are the eigenvectors
-    of M C M^T.
+    The vectors are the eigenvectors of M C M^T. They span the subspace that best represents M x for random x with
+    covariance C.
 
     Args:
-        matrix: M.
-        metric: C, symmetric and positive semidefinite; the identity if None.
-        terms: How many vectors.
-        steps: Number of sweeps, as in `symmetric`.
+        matrix: The matrix M.
+        metric: The metric C, symmetric and positive semidefinite; the identity if None.
+        terms: Number of singular vectors.
+        steps: Number of sweeps. A sweep multiplies M C M^T five times by a block of `terms` + 8 vectors, fewer times
+            for more than 94 terms.
 
     Returns:
-        Squared singular values, falling; orthonormal vectors as columns; residuals as in `symmetric`.
+        Squared singular values in descending order; orthonormal vectors as columns; and, after each sweep, the
+        relative residual of these eigenpairs of M C M^T.
 
     Raises:
-        ValueError: More terms than rows or columns.
+        ValueError: `terms` is below 1 or above the number of rows or columns.
     """
     _check(terms, min(matrix.shape))
 
@@ -139,26 +141,26 @@ def left_singular(
 def power(
     matrix: Float[Array, "n n"], *, terms: int, steps: int = 100
 ) -> tuple[Float[Array, " r"], Float[Array, "n r"], Float[Array, "r s"]]:
-    """Eigenpairs of a symmetric matrix one after the other, by power iteration with deflation, as published.
+    """Eigenpairs of a symmetric matrix one after another, by power iteration with deflation, as published.
 
-    For each term a random vector is multiplied by what the terms before it leave of the matrix, and normalized, a fixed
-    number of times. Where two eigenvalues of largest magnitude are nearly equal and of opposite sign the vector stays a
-    mixture of both eigenvectors, whose Rayleigh quotient lies between the two and hardly moves: the published
-    criterion, that it converges, is met by a wrong term. The residual stays large, and so tells it. `symmetric` has no
-    such case.
+    Each term starts from a random vector. A fixed number of times the vector is multiplied by the deflated matrix and
+    normalized. Where the two largest eigenvalues have nearly the same magnitude and opposite sign, the vector remains a
+    mixture of both eigenvectors. Its Rayleigh quotient lies between the two eigenvalues and hardly changes, so the
+    published convergence criterion accepts a wrong term. The residual stays large in that case and reveals it. The
+    method of `symmetric` does not have this problem.
 
     Args:
         matrix: A symmetric matrix.
-        terms: How many pairs.
-        steps: Sweeps of each term; a sweep is one product with the matrix.
+        terms: Number of eigenpairs.
+        steps: Number of sweeps for each term. A sweep is one product with the matrix.
 
     Returns:
-        Eigenvalues in the order found, which is by falling magnitude where they have converged; unit vectors as
-        columns, orthogonal as far as they have converged; and after each sweep of each term the relative residual
+        Eigenvalues in the order found (descending magnitude if they have converged); unit vectors as columns
+        (orthogonal if they have converged); and, after each sweep of each term, the relative residual
         |A v - value v| / |value|.
 
     Raises:
-        ValueError: More terms than rows.
+        ValueError: `terms` is below 1 or above the number of rows.
 
     Reference: Wang, Tran, Luebke 2004, appendix.
     """
@@ -191,18 +193,20 @@ def power(
 
 
 def orientation(value: Float[np.ndarray, " r"], vector: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "r r"]:
-    """The rotation after which eigenvectors are the same on every kind of processor, up to rounding.
+    """Orthogonal matrix that makes eigenvectors the same on every processor, up to rounding.
 
-    Rounding decides the signs of eigenvectors, and which basis stands for equal eigenvalues. Here each vector, and each
-    set of vectors whose eigenvalues are nearly equal, is turned so that its products with fixed random vectors are
-    triangular with a positive diagonal. Values on both sides of a cut may be equal too: then only more vectors help.
+    Rounding determines the signs of eigenvectors and the basis that represents equal eigenvalues. This function turns
+    each vector, and each set of vectors with nearly equal eigenvalues, so that its products with fixed random vectors
+    form a triangular matrix with a positive diagonal. If eigenvalues on both sides of a truncation are equal, this does
+    not help; only more vectors do.
 
     Args:
-        value: Eigenvalues, falling.
+        value: Eigenvalues in descending order of magnitude.
         vector: Orthonormal eigenvectors as columns.
 
     Returns:
-        An orthogonal matrix that mixes only vectors of nearly equal eigenvalues: multiply the columns by it.
+        An orthogonal matrix that mixes only vectors of nearly equal eigenvalues. Multiply `vector` by it from the
+        right.
     """
     value, vector = np.abs(np.asarray(value, np.float64)), np.asarray(vector, np.float64)
     probe = np.random.default_rng(0).normal(size=vector.shape)

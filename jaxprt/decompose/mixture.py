@@ -1,7 +1,7 @@
-"""Mixtures of densities, fitted by Expectation-Maximization to samples that carry mass.
+"""Mixtures of densities on the sphere, fitted to weighted samples by expectation-maximization.
 
-Components are von Mises-Fisher lobes on the sphere, whose weights, means and concentrations are free, beside fixed
-densities of which only the weights are. Everything is in logarithms; the log-likelihood never falls.
+Components are von Mises-Fisher lobes, whose weights, means and concentrations are fitted, and fixed densities, of which
+only the weights are fitted. Densities are computed as logarithms. The log-likelihood never decreases.
 """
 
 from functools import partial
@@ -14,18 +14,19 @@ from jaxtyping import Array, Float
 
 from jaxprt.compile import jit
 
-_NEWTON = 4  # steps from an approximation that is right to a percent
-_SHARP = 5.0  # concentration from which a recurrence of Bessel functions is stable, and
-_BESSEL = 16  # orders above those asked for where a continued fraction begins
+_NEWTON = 4  # steps, starting from an approximation with an error of about 1 %
+_SHARP = 5.0  # smallest concentration at which the recurrence of Bessel functions is stable
+_BESSEL = 16  # orders above the largest wanted one at which the continued fraction starts
 
 
 class Mixture(eqx.Module):
-    """Von Mises-Fisher lobes, weight k exp(k (mean . x - 1)) / (2 pi (1 - exp(-2 k))) for concentration k.
+    """A mixture of von Mises-Fisher lobes: weight k exp(k (mean . x - 1)) / (2 pi (1 - exp(-2 k))), concentration k.
 
     Attributes:
-        weight: Mass of each lobe.
-        mean: Unit vectors.
-        concentration: Of each lobe, above 0; for a sharp lobe the inverse square of its width in radians.
+        weight: Mass of each lobe: its integral over the sphere.
+        mean: Mean direction of each lobe, a unit vector.
+        concentration: Concentration of each lobe, above 0. For a sharp lobe it is the inverse square of the lobe's
+            width in radians.
     """
 
     weight: Float[Array, "*v l"]
@@ -33,18 +34,19 @@ class Mixture(eqx.Module):
     concentration: Float[Array, "*v l"]
 
     def __call__(self, direction: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
-        """Mass per steradian at some directions."""
+        """Density of the mixture at some directions, in mass per steradian."""
         return jnp.sum(self.weight * jnp.exp(log_density(direction, self.mean, self.concentration)), -1)
 
 
 class Fit(eqx.Module):
-    """What a fit returns.
+    """The result of `fit`.
 
     Attributes:
-        lobe: The free components.
-        fixed: Weights of the fixed components.
-        likelihood: Mean log-likelihood of the samples by mass, before the first step and after each; without mass 0.
-        residual: Mass that changed its component in each step, as a share of the whole.
+        lobe: The fitted lobes.
+        fixed: Weights of the fixed densities.
+        likelihood: Log-likelihood of the samples, averaged by mass, before the first step and after each step; 0 if
+            the samples have no mass.
+        residual: Share of the total mass that moved to another component in each step.
     """
 
     lobe: Mixture
@@ -59,7 +61,7 @@ def log_density(
 ) -> Float[Array, "*b l"]:
     """Logarithm of von Mises-Fisher densities, in 1/sr.
 
-    The angle enters as the squared distance of the unit vectors, which keeps its digits in sharp lobes.
+    The angle is computed from the squared distance of the unit vectors, which stays accurate in sharp lobes.
     """
     x, y, z = (direction[..., i, None] - mean[:, i] for i in range(3))
     return log_peak(concentration) - concentration * (x**2 + y**2 + z**2) / 2
@@ -73,8 +75,8 @@ def log_peak(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 @jit
 def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """1 - cos of the angle to the mean, averaged over a lobe: 1 - coth k + 1/k. For a sharp lobe its variance 1/k."""
-    small = concentration < 1e-2  # There the two terms of coth k - 1/k cancel.
+    """Mean of 1 - cos(angle to the mean) over a lobe, 1 - coth k + 1/k. For a sharp lobe it is the variance 1/k."""
+    small = concentration < 1e-2  # Here the two terms of coth k - 1/k cancel.
     safe = jnp.where(small, 1, concentration)
     far = 1 / safe - 2 * jnp.exp(-2 * safe) / -jnp.expm1(-2 * safe)
     return jnp.where(small, 1 - concentration / 3 + concentration**3 / 45, far)
@@ -82,12 +84,12 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 @partial(jit, static_argnames=("degree",))
 def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l *b"]:
-    """What a von Mises-Fisher lobe leaves of each band of the harmonics that it is averaged over.
+    """Factors by which convolution with a von Mises-Fisher lobe scales each band of spherical harmonics.
 
         A_l = i_l(k) / i_0(k),    A_0 = 1,    A_1 = coth k - 1 / k,    A_(l+1) = A_(l-1) - (2 l + 1) / k A_l
 
-    with modified spherical Bessel functions i_l: by their recurrence for sharp lobes, where it is stable, and for wide
-    ones by the continued fraction of their ratios.
+    with modified spherical Bessel functions i_l. Sharp lobes use the recurrence, which is stable for them; wide lobes
+    use the continued fraction of the ratios.
     """
     sharp = concentration > _SHARP
     safe = jnp.where(sharp, concentration, _SHARP)
@@ -105,9 +107,9 @@ def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l 
 
 @jit
 def concentration_of(drop: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Concentration whose mean 1 - cos is given, between 0 and 1; the inverse of `drop`.
+    """Concentration of the lobe with a given mean of 1 - cos(angle), between 0 and 1. It is the inverse of `drop`.
 
-    Reference: Banerjee, Dhillon, Ghosh, Sra 2005, for the first approximation; then Newton's method.
+    Reference: Banerjee, Dhillon, Ghosh, Sra 2005, for the first approximation, which Newton's method then refines.
     """
     tiny = jnp.finfo(drop.dtype).tiny ** 0.5
     wanted = jnp.clip(drop, tiny, 1 - 1e-6)
@@ -138,28 +140,28 @@ def fit(
     most: Float[Array, ""] | float = 1e6,
     steps: int = 50,
 ) -> Fit:
-    """Fits lobes, and the weights of fixed densities beside them, to samples with mass.
+    """Fits von Mises-Fisher lobes and the weights of fixed densities to weighted samples.
 
-    The mass of all components is that of all samples. A component that no sample chooses keeps its shape and weighs
-    nothing; components that coincide stay so. To fit many mixtures at once, use `jax.vmap`.
+    The components together have the total mass of the samples. A component to which no sample belongs keeps its shape
+    and gets weight zero. Components that coincide remain equal. To fit many mixtures at once, use `jax.vmap`.
 
     Args:
-        sample: Unit vectors.
-        mass: Mass of each, not negative.
-        start: The lobes to begin with. A weight of zero stays zero.
-        extent: Mean of 1 - cos of the angle to a sample over what it stands for, in place of a point: no lobe becomes
-            finer than that.
-        fixed: Logarithm of each fixed density at each sample; minus infinity where there is none.
-        weight: Weights of the fixed densities to begin with.
-        least: Smallest concentration of a lobe, or of each.
-        most: Largest concentration of a lobe: a sample alone would have an infinite one.
-        steps: Number of steps.
+        sample: Directions of the samples, unit vectors.
+        mass: Mass of each sample, not negative.
+        start: The initial lobes. A weight of zero stays zero.
+        extent: Mean of 1 - cos(angle) over the region that a sample represents, such as a texel; 0 for a point. No
+            lobe becomes narrower than that.
+        fixed: Logarithm of each fixed density at each sample; minus infinity where the density is zero.
+        weight: Initial weights of the fixed densities.
+        least: Smallest concentration, one for all lobes or one for each.
+        most: Largest concentration. Without it, a lobe of a single sample would have an infinite one.
+        steps: Number of steps of expectation-maximization.
 
     Returns:
-        The mixture, the weights, and how the fit went.
+        The lobes, the weights of the fixed densities, and the convergence history.
 
     Raises:
-        ValueError: Fixed densities without weights, or weights without them.
+        ValueError: Only one of `fixed` and `weight` is given.
 
     Reference: Dempster, Laird, Rubin 1977; for the lobes Banerjee, Dhillon, Ghosh, Sra 2005.
     """
@@ -204,17 +206,17 @@ def fit(
 def weigh(
     density: Float[Array, "s m"], mass: Float[Array, " s"], weight: Float[Array, " m"], *, steps: int = 50
 ) -> tuple[Float[Array, " m"], Float[Array, " _"]]:
-    """Weights of fixed densities, fitted to samples with mass.
+    """Fits the weights of fixed densities to weighted samples.
 
     Args:
-        density: Logarithm of each density at each sample; minus infinity where there is none.
+        density: Logarithm of each density at each sample; minus infinity where the density is zero.
         mass: Mass of each sample, not negative.
-        weight: The weights to begin with. One of zero stays zero.
-        steps: Number of steps.
+        weight: Initial weights. A weight of zero stays zero.
+        steps: Number of steps of expectation-maximization.
 
     Returns:
-        Weights, whose sum is the mass of the samples that any density explains; and the mean log-likelihood before
-        the first step and after each.
+        Weights, which sum to the mass of the samples at which any density is positive; and the mean log-likelihood
+        before the first step and after each step.
 
     Reference: Dempster, Laird, Rubin 1977.
     """
@@ -231,11 +233,11 @@ def weigh(
     return weight * total, jnp.concatenate([likelihood, last[None]])
 
 
-_drop = drop  # The argument of `concentration_of` hides the function.
+_drop = drop  # `concentration_of` has an argument of the same name.
 
 
 def _expect(density: Array, mass: Array, weight: Array) -> tuple[Array, Array]:
-    """Mass that each component takes of each sample, and the log-likelihood."""
+    """Mass of each sample that belongs to each component, and the log-likelihood."""
     alive = (weight > 0) & (density > -jnp.inf)
     each = jnp.where(alive, jnp.where(alive, density, 0) + jnp.log(jnp.where(weight > 0, weight, 1)), -jnp.inf)
     best = jnp.max(each, 1, initial=-jnp.inf)
@@ -250,7 +252,7 @@ def _expect(density: Array, mass: Array, weight: Array) -> tuple[Array, Array]:
 
 
 def _mean(taken: Array, sample: Array, before: Array) -> Array:
-    """Mean directions; where samples cancel, or there are none, the one before."""
+    """Mean directions; the previous one where samples cancel or there are none."""
     vector = taken.T @ sample
     length = jnp.linalg.norm(vector, axis=1, keepdims=True)
     known = length > 1e-12

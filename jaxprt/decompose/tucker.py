@@ -1,11 +1,11 @@
-"""Tucker decomposition: a tensor as a small core times a matrix with orthonormal columns along each mode.
+"""Tucker decomposition: a tensor as a small core, multiplied along each mode by a matrix with orthonormal columns.
 
     X ~ G x_1 U_1 x_2 U_2 ... x_d U_d
 
-Vectors come from the Gram matrix of each mode, n by n, never from the unfolding, whose other edge has the product of
-all other modes. Gram matrices are summed over slices, so that the tensor is neither transposed nor copied. That squares
-the condition: what is below the square root of the precision (3e-4 in float32) of the largest singular value is
-rounding, and errors smaller than that want float64.
+The columns are eigenvectors of each mode's n by n Gram matrix, not singular vectors of the unfolding, whose other
+dimension is the product of all other modes. Gram matrices are summed over slices, so that the tensor is neither
+transposed nor copied. Forming them squares the condition number: in float32, singular values below 3e-4 (the square
+root of the precision) of the largest are lost to rounding. Smaller errors require float64.
 """
 
 import math
@@ -21,15 +21,15 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit
 from jaxprt.decompose import eigen
 
-_BLOCK = 4096  # columns
+_BLOCK = 4096  # columns per product
 
 
 class Tucker(eqx.Module):
-    """A core, and a matrix with orthonormal columns for each of its modes.
+    """A tensor as a core and, for each mode, a matrix with orthonormal columns.
 
     Attributes:
-        core: As many numbers along each mode as its rank.
-        factor: Of each mode, its size times its rank.
+        core: The core tensor. The size of each mode is its rank.
+        factor: A matrix for each mode, of the mode's size by its rank.
     """
 
     core: Float[Array, "*r"]
@@ -42,13 +42,13 @@ class Tucker(eqx.Module):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the core and of all factors."""
+        """Size of the core and all factors in bytes."""
         return self.core.nbytes + sum(each.nbytes for each in self.factor)
 
     def full(self) -> Float[Array, "*n"]:
-        """The tensor that this stands for."""
+        """The tensor that this decomposition represents."""
         result = self.core
-        # From the last mode on, whose product is the cheapest while the others are small.
+        # The last mode comes first: its product is the cheapest while the other modes are small.
         for mode in range(self.core.ndim)[::-1]:
             result = multiply(result, self.factor[mode].T, mode=mode)
         return result
@@ -56,7 +56,7 @@ class Tucker(eqx.Module):
 
 @partial(jit, static_argnames=("mode",))
 def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: int) -> Float[Array, "*k"]:
-    """The product along a mode: the sum over it of the tensor times each column of the matrix.
+    """Mode product: the sum over one mode of the tensor times each column of the matrix.
 
     Reference: Kolda and Bader 2009, section 2.5, with the matrix transposed.
     """
@@ -71,7 +71,7 @@ def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: i
 
 @partial(jit, static_argnames=("mode",))
 def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
-    """Inner products of the tensor's slices across a mode: the unfolding times its transpose."""
+    """Gram matrix of a mode: the unfolding along it times its transpose."""
     slices = _slices(tensor, mode)
     if slices.shape[2] == 1:
         return slices[..., 0].T @ slices[..., 0]
@@ -86,17 +86,18 @@ def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     """Truncated higher-order singular value decomposition.
 
     Args:
-        tensor: With at least two modes.
-        ranks: Of each mode.
+        tensor: A tensor with at least two modes.
+        ranks: Rank of each mode.
 
     Returns:
-        The decomposition, whose squared error is at most the sum over modes of the squared singular values left out,
-        and so at most sqrt(d) times the least. Its reconstruction is differentiable in the tensor. Single factors are
-        so only up to rotations among their columns, which no function of them may depend on; and where singular values
-        on both sides of the cut are equal, the subspace has no derivative, and zero stands for it.
+        The decomposition. Its squared error is at most the sum over modes of the squared singular values that are left
+        out, so its error is at most sqrt(d) times that of the best approximation. The reconstruction is differentiable
+        in the tensor. Derivatives of a single factor hold only up to rotations among its columns, so functions of it
+        must not depend on such rotations. Where singular values on both sides of the truncation are equal, the subspace
+        has no derivative and the result is zero.
 
     Raises:
-        ValueError: As many ranks as modes were not given, or one is not between 1 and its mode's size.
+        ValueError: The number of ranks is not the number of modes, or a rank is not between 1 and its mode's size.
 
     Reference: De Lathauwer, De Moor, Vandewalle 2000.
     """
@@ -107,11 +108,19 @@ def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
 
 @partial(jit, static_argnames=("ranks",))
 def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
-    """Sequentially truncated HOSVD: each mode is cut before the next one is looked at, the smallest first.
+    """Sequentially truncated HOSVD: truncates the modes one after another, the smallest first.
 
-    The bounds on the error are those of `hosvd`, and the cost is that of the first mode.
+    The error has the same bound as that of `hosvd`. Most of the cost is that of the first mode.
 
-    Arguments, result and errors as of `hosvd`.
+    Args:
+        tensor: A tensor with at least two modes.
+        ranks: Rank of each mode.
+
+    Returns:
+        The decomposition, differentiable in the same sense as that of `hosvd`.
+
+    Raises:
+        ValueError: The number of ranks is not the number of modes, or a rank is not between 1 and its mode's size.
 
     Reference: Vannieuwenhoven, Vandebril, Meerbergen 2012.
     """
@@ -125,19 +134,21 @@ def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
 
 @partial(jit, static_argnames=("ranks", "sweeps"))
 def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2) -> tuple[Tucker, Float[Array, " s"]]:
-    """Higher-order orthogonal iteration: the best factor of each mode, given the others, in turn.
+    """Higher-order orthogonal iteration: finds the best factor of each mode in turn, given the other factors.
 
     Args:
-        tensor: With at least two modes.
-        ranks: Of each mode.
-        sweeps: How often all modes are improved, from `truncated`.
+        tensor: A tensor with at least two modes.
+        ranks: Rank of each mode.
+        sweeps: Number of sweeps over all modes. The iteration starts from the result of `truncated`.
 
     Returns:
-        The decomposition, differentiable as in `hosvd`; and the relative error of the start and after each sweep,
-        which never grows but for rounding. It is the difference of two squares: see the module on its least value.
+        The decomposition, differentiable in the same sense as that of `hosvd`; and the relative L2 error at the start
+        and after each sweep. The error never grows, apart from rounding. It is computed from a difference of squares,
+        so in float32 it is inaccurate below about 3e-4.
 
     Raises:
-        ValueError: As of `hosvd`, or negative sweeps.
+        ValueError: `sweeps` is negative, the number of ranks is not the number of modes, or a rank is not between 1 and
+            its mode's size.
 
     Reference: De Lathauwer, De Moor, Vandewalle 2000, "On the best rank-1 and rank-(R1, ..., RN) approximation".
     """
@@ -162,16 +173,16 @@ def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2)
 
 
 def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
-    """The least ranks by which `hosvd` and `truncated` are sure to have a relative L2 error; chosen on the host.
+    """Ranks for which `hosvd` and `truncated` are certain to stay within a relative L2 error. Runs on the host.
 
-    Every mode may leave out an equal share of the squared error.
+    Each mode may contribute an equal share of the squared error, and gets the smallest rank for that share.
 
     Args:
-        tensor: With at least two modes.
-        error: Between 0 and 1; see the module on the least that float32 can tell.
+        tensor: A tensor with at least two modes.
+        error: Largest relative L2 error, between 0 and 1. In float32, errors below about 3e-4 cannot be resolved.
 
     Raises:
-        ValueError: An error out of range, or values that are not finite.
+        ValueError: `error` is out of range, or the tensor is not finite.
     """
     if not 0 < error < 1:
         raise ValueError(f"error must be between 0 and 1, got {error}")
@@ -180,14 +191,14 @@ def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
         square = np.asarray(jnp.linalg.eigvalsh(gram(tensor, mode=mode)), np.float64)
         if not np.isfinite(square).all():
             raise ValueError("the tensor must be finite, and is not")
-        left = np.cumsum(np.maximum(square, 0))  # from the smallest on
+        left = np.cumsum(np.maximum(square, 0))  # starting with the smallest
         result.append(max(1, len(square) - int(np.searchsorted(left, error**2 / tensor.ndim * left[-1], "right"))))
     return tuple(result)
 
 
 @jax.custom_jvp
 def _square(matrix: Array) -> Array:
-    """A wide matrix times its transpose, by blocks: one product would pack much of the matrix anew."""
+    """A wide matrix times its transpose, in blocks of columns: a single product would copy much of the matrix."""
     count = matrix.shape[1] // _BLOCK
     rest = matrix[:, count * _BLOCK :]
 
@@ -201,19 +212,19 @@ def _square(matrix: Array) -> Array:
 @_square.defjvp
 @jit
 def _square_jvp(primal, tangent):
-    # Transposed, the scan would add a whole matrix at each step.
+    # The transpose of the scan would add a whole matrix at each step.
     product = tangent[0] @ primal[0].T
     return _square(*primal), product + product.T
 
 
 def _slices(tensor: Array, mode: int) -> Array:
-    """The tensor with all modes before one joined, and all after it."""
+    """The tensor reshaped to three axes: all modes before the given one, that mode, and all modes after it."""
     shape = tensor.shape
     return tensor.reshape(math.prod(shape[:mode]), shape[mode], math.prod(shape[mode + 1 :]))
 
 
 def _core(tensor: Array, factor: Sequence[Array], but: int | None = None) -> Array:
-    """The tensor times all factors, or all but one's; those first that leave the least."""
+    """The tensor times all factors, or all but one. Factors that shrink the tensor most come first."""
     kept = {mode: each.shape[1] / each.shape[0] for mode, each in enumerate(factor) if mode != but}
     for mode in sorted(kept, key=lambda mode: kept[mode]):
         tensor = multiply(tensor, factor[mode], mode=mode)
@@ -232,7 +243,7 @@ def _dominant_jvp(rank, primal, tangent):
     (matrix,), (moved,) = primal, tangent
     vector = _dominant(matrix, rank)
     every, basis = jnp.linalg.eigh(matrix)
-    # What turns the vectors among themselves is left out; what turns them out of their space is a sum over the others.
+    # Rotations within the subspace are left out. The change of the subspace is a sum over the other eigenvectors.
     other, low = basis[:, : len(every) - rank], every[: len(every) - rank]
     gap = jnp.einsum("ir,ij,jr->r", vector, matrix, vector) - low[:, None]
     least = len(every) * jnp.finfo(matrix.dtype).eps * jnp.abs(every[-1])
@@ -247,10 +258,10 @@ def _check(tensor: Array, ranks: tuple[int, ...]) -> None:
 
 
 def oriented(decomposition: Tucker) -> Tucker:
-    """The same decomposition with factors that are the same on every kind of processor, up to rounding.
+    """An equal decomposition whose factors are the same on every processor, up to rounding.
 
-    Each mode is turned by `jaxprt.decompose.eigen.orientation`, and the core against it. What the decomposition stands
-    for does not change.
+    Each factor is multiplied by the orthogonal matrix of `jaxprt.decompose.eigen.orientation`, and the core by its
+    inverse, so the represented tensor does not change.
     """
     core, factor = np.asarray(decomposition.core), []
     for mode, each in enumerate(map(np.asarray, decomposition.factor)):

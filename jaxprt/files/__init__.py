@@ -1,4 +1,4 @@
-"""Reading and writing files: images, and objects of this package."""
+"""Reading and writing of image files, of arrays in blocks, and of this package's objects."""
 
 from jaxprt.files.images import decode_image, read_image, write_exr, write_png
 from jaxprt.files.objects import load, save

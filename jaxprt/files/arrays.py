@@ -1,10 +1,10 @@
-"""Named arrays on disk, written block by block along one axis by any number of processes.
+"""Stores: named arrays on disk, written in blocks along one axis by any number of processes.
 
-A store is a folder: a header in JSON, and one file in NumPy's own format for each array and for the checksums of all
-blocks. Every block has a place of its own in each file, so processes on one machine or on several write theirs without
-knowing of each other, and any program that reads NumPy's format can map the arrays. A block counts only if its
-checksum is there and right, so a process may be killed at any moment, files may be lost or cut off, and what is read
-back is either what was written or reported missing.
+A store is a folder with a JSON header, one NumPy file for each array, and one NumPy file for the checksums of all
+blocks. Every block has its own place in each file, so processes on one machine or several can write without
+coordination. Any program that reads NumPy's format can map the arrays. A block counts only if its checksum is present
+and correct. A process may therefore be killed at any moment, and files may be lost or truncated: every block that is
+read is either as written or reported missing.
 """
 
 import errno
@@ -28,11 +28,11 @@ VERSION = 4
 _FORMAT = "jaxprt blocks"
 _HEADER = "store.json"
 _CHECKSUM = "checksum"
-_PATIENCE = 2.0  # seconds
+_PATIENCE = 2.0  # seconds to wait for another writer's check
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SUMS = 32
-_PART = 1 << 20  # values that are summed at a time
-_STRIDE = 7919  # by which signs move from one part to the next
+_PART = 1 << 20  # values per partial sum
+_STRIDE = 7919  # shift of the random signs from one part to the next
 
 
 class Layout(NamedTuple):
@@ -44,22 +44,23 @@ class Layout(NamedTuple):
 
 
 class BlockStore:
-    """Arrays on disk in blocks. Travels by pickle as the path and the layout.
+    """Arrays on disk in blocks. It can be pickled; the pickle holds the path and the layout, not the arrays.
 
     Args:
-        path: Folder of the store; made when it is not there.
-        header: What the arrays were made from, JSON values; must equal what an existing store says.
-        layout: Per array, its blocks.
+        path: Folder of the store. It is created if it does not exist.
+        header: Description of the inputs from which the arrays are computed, as JSON values. It must equal the header
+            of an existing store.
+        layout: Block shape, block axis and element type of each array.
         blocks: Number of blocks.
-        near: Sketches, by `sketch`, of computed arrays that the store's were made from. They must equal those of an
-            existing store up to rounding, which differs between kinds of processors.
+        near: Sketches, by `sketch`, of input arrays that were themselves computed. They must equal those of an existing
+            store up to rounding, which differs between kinds of processors.
 
     Attributes:
         path: Folder of the store.
 
     Raises:
-        ValueError: The path holds something else, another version of the format or of the algorithm, or arrays made
-            from something else.
+        ValueError: The path is not a store, has another version of the format or algorithm, or holds arrays that were
+            computed from other inputs.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class BlockStore:
 
     @property
     def here(self) -> bool:
-        """Whether the folder is the same store where this is asked: a worker may not share the file system."""
+        """Whether the path is the same store on this machine: a worker may not share the file system."""
         try:
             return json.loads((self.path / _HEADER).read_text()).get("key") == self._key
         except (OSError, ValueError):
@@ -93,7 +94,7 @@ class BlockStore:
 
     @contextmanager
     def writing(self, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
-        """Holds a part of the store for writing, the k-th of n; the lock goes with the process, however it ends.
+        """Locks the k-th of n parts of the store for writing. The lock is released however the process ends.
 
         Raises:
             BlockingIOError: Another process is writing the same part, or the store is being written in other parts.
@@ -102,10 +103,10 @@ class BlockStore:
         lock = self.path / f".lock.{number}-of-{count}"
         try:
             with filelock.FileLock(lock, timeout=0):
-                # Writers of other parts of the same number have other blocks; all others may have the same ones.
+                # Writers that divide the store into the same number of parts have other blocks. Others may overlap.
                 for other in self.path.glob(".lock.*-of-*"):
                     if not other.name.endswith(f"-of-{count}"):
-                        # Another writer may be looking at it in the same way, for an instant.
+                        # Another writer may hold this lock for an instant, for the same check.
                         with filelock.FileLock(other, timeout=_PATIENCE):
                             pass
                 yield
@@ -116,10 +117,10 @@ class BlockStore:
             ) from None
 
     def write(self, block: int, array: Mapping[str, np.ndarray]) -> None:
-        """Writes one block of every array, in the layout's types, then its checksum.
+        """Writes one block of every array, converted to the layout's types, and then its checksum.
 
         Raises:
-            OSError: The disk is full, or the file system fails in another way. Other blocks stay as they are.
+            OSError: The disk is full, or the file system fails in another way. Other blocks are not affected.
         """
         value = {name: np.ascontiguousarray(array[name], at.dtype) for name, at in self._layout.items()}
         for name, at in self._layout.items():
@@ -138,7 +139,7 @@ class BlockStore:
             ) from error
 
     def read(self, block: int) -> dict[str, np.ndarray] | None:
-        """One block of every array, or None where it was not written or is not what was written."""
+        """Reads one block of every array. Returns None if it was not written or its checksum is wrong."""
         try:
             expected = int(self._get(_CHECKSUM, block, (), "uint32"))
             if not expected:
@@ -149,7 +150,7 @@ class BlockStore:
         return array if self._checksum(block, array) == expected else None
 
     def written(self) -> np.ndarray:
-        """Which blocks have a checksum, as a mask; whether it is right only `read` knows."""
+        """Mask of the blocks that have a checksum. Only `read` verifies it."""
         found = np.zeros(self._blocks, np.uint32)
         try:
             with (self.path / f"{_CHECKSUM}.npy").open("rb") as file:
@@ -162,10 +163,10 @@ class BlockStore:
         return found > 0
 
     def whole(self, name: str, count: int) -> np.ndarray:
-        """An array of all blocks, cut to a number of entries along its axis. All blocks must have been found by `read`.
+        """A whole array, cut to `count` entries along its block axis. All blocks must have been found by `read`.
 
-        Arrays whose blocks follow each other along the first axis are maps of their file, which take no memory of
-        their own: pages are read when they are first used. Others are gathered into memory.
+        If the blocks follow each other along the first axis, the array is memory-mapped: pages are read when they are
+        first used. Other arrays are copied into memory.
         """
         at = self._layout[name]
         if not at.axis:
@@ -180,14 +181,14 @@ class BlockStore:
         return result
 
     def _checksum(self, block: int, array: Mapping[str, np.ndarray]) -> int:
-        """CRC-32 of a block in its place in this store; never 0, which stands for not written."""
+        """CRC-32 of a block, its index and the store's key; never 0, which stands for a missing block."""
         value = zlib.crc32(f"{self._key} {block}".encode())
         for name in sorted(array):
             value = zlib.crc32(array[name].reshape(-1).view(np.uint8).data, value)
         return value or 1
 
     def _put(self, name: str, block: int, value: np.ndarray) -> None:
-        """Writes a block of one array; the file is closed, so that other machines see it."""
+        """Writes a block of one array and closes the file, so that other machines see it."""
         left = value.reshape(-1).view(np.uint8).data
         with (self.path / f"{name}.npy").open("r+b", buffering=0) as file:
             file.seek(self._offset[name] + block * value.nbytes)
@@ -203,17 +204,17 @@ class BlockStore:
 
 
 def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
-    """What tells an array from others of its shape: its norm, and sums of its values with random signs.
+    """A short fingerprint of an array that tolerates rounding: its norm, and sums of its values with random signs.
 
-    The distance between the sums of two arrays is about that between the arrays.
+    The distance between the sums of two arrays approximates the distance between the arrays.
 
     Args:
-        array: Numbers.
-        tolerance: Distance, as a share of the norm, up to which arrays count as the same: more than rounding changes
-            on another kind of processor, and less than would be seen.
+        array: An array of numbers.
+        tolerance: Largest distance, relative to the norm, at which two arrays count as equal. It should be larger than
+            the rounding differences between processors and smaller than visible differences.
 
     Returns:
-        The tolerance, the norm and the sums.
+        A list of the tolerance, the norm and the sums.
     """
     flat = np.asarray(array).reshape(-1)
     sign = _signs(2 * _PART)
@@ -229,13 +230,13 @@ def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
 
 @functools.cache
 def _signs(count: int) -> np.ndarray:
-    """The signs of all sketches; making them takes longer than most sums."""
+    """The random signs of all sketches, cached because making them takes longer than most sums."""
     return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), count)
 
 
 def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
-    """Makes an empty store aside and moves it into place, so that a half-made one is never met."""
-    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.new")  # processes on several machines may have one number
+    """Creates an empty store beside its path and renames it, so that no process sees an incomplete store."""
+    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.new")  # process ids are not unique across machines
     try:
         aside.mkdir(parents=True)
         for name, (shape, dtype) in files.items():
@@ -244,7 +245,7 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
         (aside / _HEADER).write_text(json.dumps({**header, "key": uuid.uuid4().hex}))
         try:
             aside.rename(path)
-        except OSError:  # another process was faster; what it made is checked like any other
+        except OSError:  # another process was faster; its store is checked like any other
             if not path.exists():
                 raise
     finally:
@@ -252,7 +253,7 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
 
 
 def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
-    """Refuses stores of something else; returns the store's own key."""
+    """Refuses a store of other inputs. Returns the key of the store."""
     try:
         found = _found(path)
     except Exception as error:
@@ -276,7 +277,7 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
 
 
 def _found(path: Path) -> dict[str, Any]:
-    """The header of a store, of this version or of those up to 3, which zarr wrote."""
+    """The header of a store of the current version, or of a version up to 3, which zarr wrote."""
     old = path / "zarr.json"
     if old.exists() and not (path / _HEADER).exists():
         return dict(json.loads(old.read_text()).get("attributes", {}))
@@ -284,7 +285,7 @@ def _found(path: Path) -> dict[str, Any]:
 
 
 def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
-    """Where the values of an array begin in its file."""
+    """Byte offset of the values of an array in its file."""
     file = path / f"{name}.npy"
     try:
         return mapped.read_header(file, shape, dtype)
@@ -295,7 +296,7 @@ def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
 
 
 def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
-    """Refuses a store whose arrays were made from others than these by more than rounding."""
+    """Refuses a store whose input arrays differ from these by more than rounding."""
     if not isinstance(found, Mapping) or sorted(found) != sorted(near):
         told = sorted(found) if isinstance(found, Mapping) else found
         raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {told}; delete it")
@@ -315,5 +316,5 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
 
 
 def _stored(at: Layout, blocks: int) -> tuple[int, ...]:
-    """Shape of an array's file: of the array itself where blocks follow each other in memory too."""
+    """Shape of an array's file: that of the whole array if blocks are contiguous, else with a leading block axis."""
     return (blocks, *at.shape) if at.axis else (blocks * at.shape[0], *at.shape[1:])

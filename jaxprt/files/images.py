@@ -1,4 +1,4 @@
-"""Image files: EXR by OpenEXR, everything else by OpenImageIO."""
+"""Image files. OpenEXR reads and writes EXR; OpenImageIO handles all other formats."""
 
 import pathlib
 import tempfile
@@ -20,32 +20,32 @@ _MAGIC = (
     (b"Pf", "pnm"),
     (b"BM", "bmp"),
 )
-# Channel sets read from EXR files, first match wins; alpha comes along where there is one.
+# Sets of channels that are read from EXR files; the first that matches is used. Alpha is read too if there is one.
 _CHANNELS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
-# More is taken for a broken header: 16384 x 32768 pixels are 6 GB as float32 RGB.
+# A larger size is taken for a broken header: 16384 x 32768 pixels are 6 GB as float32 RGB.
 _MAX_PIXELS = 2**29
 
 
 def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     """Reads an image file as linear values.
 
-    The format is told from the file's first bytes, not from its name: EXR, Radiance HDR, PNG, JPEG, TIFF,
-    PFM or BMP. Files of whole numbers (PNG, JPEG, ...) are decoded from sRGB unless they say that they are
-    linear; those of floats are taken as they are. Primaries and the exposure of HDR headers are not applied;
-    they are among the attributes. Of an EXR the first part is read, at the finest level; a data window
-    smaller than the display window is placed in it on black, and what lies outside the display is cut off.
-    Alpha is returned unapplied, as the last of two or four channels.
+    The format (EXR, Radiance HDR, PNG, JPEG, TIFF, PFM or BMP) is recognized from the first bytes of the file, not from
+    its name. Integer formats (PNG, JPEG, ...) are decoded from sRGB unless the file states that it is linear. Files of
+    floating-point numbers are used as they are. Primaries and the exposure in HDR headers are not applied; they are
+    among the returned attributes. Of an EXR file only the first part is read, at the finest level. If its data window
+    is smaller than the display window, the rest is black; data outside of the display window is cut off. Alpha is not
+    applied; it is the last of two or four channels.
 
     Args:
         path: The file.
 
     Returns:
-        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels, and the header's attributes;
-        for EXR environment maps ``envmap`` is "latlong" or "cube".
+        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels, and the attributes of the header. For
+        EXR environment maps the attribute ``envmap`` is "latlong" or "cube".
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is a directory, empty, of an unknown format, damaged, or of channels other than these.
+        FileNotFoundError: The file does not exist.
+        ValueError: The path is a directory, or the file is empty, damaged, of an unknown format, or has other channels.
     """
     path = pathlib.Path(path).absolute()
     if not path.exists():
@@ -56,21 +56,23 @@ def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], 
 
 
 def decode_image(content: bytes, *, name: str, decoded: bool = True) -> Float32[np.ndarray, "h w c"]:
-    """Reads an image whose file is in memory, such as one inside a GLB file, as `read_image` reads one on disk.
+    """Reads an image file whose content is in memory, such as one inside of a GLB file.
+
+    Formats and channels are those of `read_image`.
 
     Args:
         content: The bytes of the file.
-        name: What to call the image in messages.
-        decoded: Decode whole numbers from sRGB, as colors are stored, whatever the file says of itself. False returns
-            them over the largest of their type, as roughness or normals are stored.
+        name: Name of the image in error messages.
+        decoded: True decodes integers from sRGB, whatever the file states, as for colors. False divides them by the
+            largest value of their type, as for roughness or normals.
 
     Returns:
         The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels.
 
     Raises:
-        ValueError: The bytes are empty, of an unknown format, damaged, or of channels other than these.
+        ValueError: The content is empty, damaged, of an unknown format, or has other channels.
     """
-    # OpenImageIO reads from memory in C++ only.
+    # OpenImageIO can read from memory only in C++, so a temporary file is used.
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "image"
         path.write_bytes(content)
@@ -95,19 +97,19 @@ def _read(path: pathlib.Path, *, decoded: bool | None) -> tuple[Float32[np.ndarr
 
 
 def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
-    """Writes linear values to an EXR file of 32-bit floats, losslessly compressed.
+    """Writes linear values to an EXR file of 32-bit floats with lossless compression.
 
     Args:
-        path: The file; one that exists is replaced.
-        image: 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
+        path: The file. An existing file is replaced.
+        image: Linear values with 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
 
     Raises:
-        ValueError: The image is empty, not of floating point, or has another number of channels.
+        ValueError: The image is empty, not of a floating-point type, or has another number of channels.
         OSError: The file cannot be written.
     """
     names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
     _check_folder(path)
-    # OpenEXR writes arrays that are not contiguous wrongly, without saying so.
+    # OpenEXR silently writes wrong values for arrays that are not contiguous.
     values = np.asarray(image, np.float32)
     channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -116,14 +118,14 @@ def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
 
 
 def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
-    """Writes an image that is already encoded for display to a PNG file of 8 bits.
+    """Writes an image that is already encoded for display to an 8-bit PNG file.
 
     Args:
-        path: The file; one that exists is replaced.
-        image: Display values; 0 is black and 1 white, what lies outside is clamped. 1, 3 or 4 channels.
+        path: The file. An existing file is replaced.
+        image: Display values with 1, 3 or 4 channels. 0 is black and 1 is white; other values are clamped.
 
     Raises:
-        ValueError: The image is empty, not of floating point, has another number of channels, or holds NaN.
+        ValueError: The image is empty, not of a floating-point type, has another number of channels, or holds NaN.
         OSError: The file cannot be written.
     """
     _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
@@ -138,7 +140,7 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
     spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     output = OpenImageIO.ImageOutput.create("png")
-    assert output is not None  # PNG is compiled into OpenImageIO's wheels.
+    assert output is not None  # OpenImageIO's wheels include PNG.
     if not (output.open(str(path), spec) and output.write_image(values) and output.close()):
         raise OSError(f"{path}: {output.geterror() or 'cannot be written'}")
 
@@ -185,7 +187,7 @@ def _read_exr(path: pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[st
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            if not file.parts:  # OpenEXR has printed why.
+            if not file.parts:  # OpenEXR has already printed the reason.
                 raise ValueError("pixels that cannot be read")
             channels = file.parts[0].channels
             data = np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)
@@ -210,7 +212,7 @@ def _read_other(
     path: pathlib.Path, form: str, *, decoded: bool | None
 ) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     config = OpenImageIO.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # Else colors come multiplied by alpha.
+    config.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise colors come premultiplied by alpha.
     reader = OpenImageIO.ImageInput.open(str(path), config)
     if reader is None:
         raise ValueError(f"{path} must be an undamaged {form} file, got: {OpenImageIO.geterror()}")
@@ -220,7 +222,7 @@ def _read_other(
         if spec.nchannels > 4 or spec.depth > 1:
             raise ValueError(f"{path} must have 1 to 4 channels and be flat, got {spec.nchannels}, depth {spec.depth}")
         image = reader.read_image("float")
-        # Some readers return what they have and only say that the rest is missing.
+        # Some readers return incomplete data and only report an error.
         error = reader.geterror()
         if image is None or error:
             raise ValueError(f"{path} must be an undamaged {form} file, got: {error or 'no pixels'}")
@@ -239,5 +241,5 @@ def _read_other(
 
 
 def _decode_srgb(value: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Decodes sRGB values to linear ones (IEC 61966-2-1)."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

@@ -1,8 +1,8 @@
-"""Arrays in files of NumPy's own format, mapped into memory instead of read.
+"""Memory-mapped arrays in files of NumPy's format.
 
-A mapped array takes no memory of its own: the system reads its pages when they are first used, and drops them when
-memory is short. `jax.device_put` on CPUs takes such an array as it is, without a copy, because its values begin at a
-multiple of 64 bytes; on other devices it copies.
+A mapped array takes no memory of its own: the operating system reads its pages when they are first used, and drops
+them when memory is short. On CPUs, `jax.device_put` uses such an array without a copy, because its values begin at a
+multiple of 64 bytes. On other devices it copies.
 """
 
 import mmap
@@ -13,21 +13,21 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-ALIGN = 64  # bytes at a multiple of which JAX takes an array without a copy, and NumPy's format begins its values
+ALIGN = 64  # alignment in bytes at which JAX needs no copy; values in NumPy's format have it too
 _VERSION = (1, 0)
 
 
 def write_header(file: BinaryIO, shape: tuple[int, ...], dtype: str) -> None:
-    """Writes what precedes the values of an array in NumPy's format."""
+    """Writes the header of an array in NumPy's format, which precedes its values."""
     descr = np.lib.format.dtype_to_descr(np.dtype(dtype))
     np.lib.format.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})
 
 
 def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
-    """Where the values of an array begin in its file.
+    """Byte offset of the values of an array in its file.
 
     Raises:
-        ValueError: It is no file of NumPy's format, or of another shape or type.
+        ValueError: The file is not in NumPy's format, or has another shape or type.
     """
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)
@@ -40,7 +40,7 @@ def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
 
 
 def open_array(path: Path, offset: int, shape: tuple[int, ...], dtype: str) -> np.ndarray:
-    """An array in a file, as a map that nothing can be assigned to.
+    """A read-only memory map of an array in a file.
 
     Raises:
         ValueError: The file is too short.
@@ -61,13 +61,13 @@ def open_array(path: Path, offset: int, shape: tuple[int, ...], dtype: str) -> n
 
 
 class Reference(NamedTuple):
-    """Where the values of an array lie in a file: what travels to other processes in place of a map.
+    """Location of an array's values in a file. It is sent to other processes in place of the memory map.
 
     Attributes:
-        path: The file, by its whole path.
-        offset: First byte.
+        path: Absolute path of the file.
+        offset: Offset of the first value in bytes.
         shape: Shape of the array.
-        dtype: Element type of the array, as NumPy names it.
+        dtype: Element type of the array, in NumPy's notation.
     """
 
     path: str
@@ -76,10 +76,10 @@ class Reference(NamedTuple):
     dtype: str
 
     def open(self) -> np.ndarray:
-        """The array, mapped here.
+        """Maps the array in this process.
 
         Raises:
-            FileNotFoundError: This machine does not see the file.
+            FileNotFoundError: This machine has no access to the file.
         """
         try:
             return open_array(Path(self.path), *self[1:])
@@ -88,9 +88,9 @@ class Reference(NamedTuple):
 
 
 def reference(array: np.ndarray) -> np.ndarray | Reference:
-    """A reference to the file of which an array is a map from its first value on.
+    """Returns the file reference of a memory-mapped array.
 
-    The array itself if it is no map, or if the file is not there any more or was replaced by another.
+    Returns the array itself if it is not a memory map, or if its file has been deleted or replaced.
     """
     found = _maps.get(array.ctypes.data) if array.size and array.flags.c_contiguous else None
     if found is None:
@@ -104,12 +104,12 @@ def reference(array: np.ndarray) -> np.ndarray | Reference:
     return Reference(path, offset, array.shape, array.dtype.str) if same else array
 
 
-# Files, first bytes, and devices and numbers of these files, of living maps, by their addresses.
+# For each live map, by address: its file, its offset, and the device and inode of the file.
 _maps: dict[int, tuple[str, int, tuple[int, int]]] = {}
 
 
 def empty(shape: tuple[int, ...], dtype: str) -> np.ndarray:
-    """An array in memory, without values, that JAX takes without a copy."""
+    """An uninitialized array in memory, aligned so that JAX uses it without a copy."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     flat = np.empty(size + ALIGN, np.uint8)
     first = -flat.ctypes.data % ALIGN
@@ -117,10 +117,10 @@ def empty(shape: tuple[int, ...], dtype: str) -> np.ndarray:
 
 
 def read_into(file: Any, value: np.ndarray) -> None:
-    """Fills an array with the bytes that follow in an unbuffered file.
+    """Fills an array with the next bytes of an unbuffered file.
 
     Raises:
-        EOFError: The file ends before.
+        EOFError: The file ends too early.
     """
     left = value.reshape(-1).view(np.uint8).data
     while left:

@@ -1,8 +1,8 @@
-"""Objects of the package on disk and between processes: transports, BRDFs, plans, lights, meshes.
+"""Saving, loading and pickling of the package's objects: transports, BRDFs, plans, lights, meshes.
 
-A saved object is a folder: one file in NumPy's format for each array of the object, and a description in JSON of the
-classes and fields that these belong to. There is no pickle in it. Loading creates objects of this package's own
-classes and fills their fields; it calls nothing that a file names.
+A saved object is a folder with a NumPy file for each array and a JSON description of the object's classes and fields.
+It contains no pickle. Loading creates only objects of this package's classes and fills their fields; it never calls a
+function that a file names.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from jaxprt.files import mapped
 VERSION = 2
 _FORMAT = "jaxprt object"
 _HEADER = "object.json"
-# Functions that fields may hold. Files and pickles have their names.
+# Functions that fields may hold. Files and pickles store their names.
 _FUNCTIONS = {
     "jaxprt.sphere.hemisphere:disk_coordinates",
     "jaxprt.sphere.hemisphere:parabolic_coordinates",
@@ -39,20 +39,20 @@ _FUNCTIONS = {
 
 
 def save(path: str | os.PathLike, object: Any) -> None:
-    """Saves an object of this package, or tuples, lists and dictionaries of them, without loss.
+    """Saves an object of this package, or tuples, lists and dictionaries of such objects, without loss.
 
-    The folder is written aside and renamed when it is complete, so a process that is killed leaves no half of it. A
-    folder or file that exists is never replaced.
+    The folder is written under a temporary name and renamed when it is complete, so a killed process never leaves an
+    incomplete object. An existing folder or file is never replaced.
 
     Args:
-        path: The folder to make. Parents that are missing are made too.
-        object: What to save: a mesh, a light, a camera, a BRDF in any form, transport, a plan, a material, an array or
-            a plain value.
+        path: The folder to create, including missing parent folders.
+        object: The object to save: a mesh, a light, a camera, a BRDF in any form, a transport, a plan, a material, an
+            array or a plain value.
 
     Raises:
-        FileExistsError: There is something at `path`.
-        TypeError: The object holds something else: a function such as a BRDF that is no model of this package, an
-            object of another package, or values that are being traced by JAX.
+        FileExistsError: `path` already exists.
+        TypeError: The object holds something that cannot be saved: a function, such as a BRDF that is not a model of
+            this package, an object of another package, or values that JAX is tracing.
     """
     path = Path(path)
     if path.exists():
@@ -81,21 +81,21 @@ def save(path: str | os.PathLike, object: Any) -> None:
 
 
 def load(path: str | os.PathLike) -> Any:
-    """Loads what `save` saved: the same classes, structure, types and bits.
+    """Loads an object that `save` has written, with the same classes, structure, types and bits.
 
     Args:
         path: The folder.
 
     Returns:
-        The object. Arrays that were on a device are on the default device, and NumPy arrays are NumPy arrays. On CPUs
-        the former are maps of their files, which take memory only where they are used: an object larger than the memory
-        can be loaded, and `jaxprt.systems.ranges.take` takes a range of its vertices. The files may be deleted
-        meanwhile, but must not be changed.
+        The object. JAX arrays are placed on the default device, and NumPy arrays remain NumPy arrays. On CPUs the JAX
+        arrays are memory-mapped: only used parts take memory. An object larger than the memory can therefore be loaded,
+        and `jaxprt.systems.ranges.take` extracts a range of its vertices. The files may be deleted while they are in
+        use, but must not be changed.
 
     Raises:
-        FileNotFoundError: There is nothing at `path`.
+        FileNotFoundError: `path` does not exist.
         ValueError: The folder was not written by `save`, is damaged, was saved by a newer version of this package or by
-            one whose algorithms give other results, or holds 64-bit numbers while JAX is set to 32 bits.
+            a version whose algorithms give other results, or holds 64-bit numbers while JAX is set to 32 bits.
     """
     path = Path(path)
     if not path.exists():
@@ -129,11 +129,12 @@ def load(path: str | os.PathLike) -> Any:
 
 
 def reduced(object: Any) -> tuple:
-    """What `__reduce__` of a class returns whose fields hold jitted functions: pickle gets these by their names.
+    """The value that `__reduce__` must return for an object whose fields hold jitted functions.
+
+    Pickle then stores the package's own functions by name, and other functions as usual.
 
     Args:
-        object: A dataclass or Module of this package. Functions that are not the package's own go to pickle as they
-            are.
+        object: A dataclass or Module of this package.
     """
     field = {each.name: getattr(object, each.name) for each in dataclasses.fields(object)}
     name = {key: found for key, value in field.items() if (found := _function_name(value)) is not None}
@@ -145,7 +146,7 @@ def _restored(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
 
 
 def _filled(kind: type, field: dict[str, Any]) -> Any:
-    """An object with these fields. As when JAX unflattens one, nothing is converted, checked or called."""
+    """An object with these fields. Nothing is converted, checked or called, as when JAX unflattens a pytree."""
     if not dataclasses.is_dataclass(kind):
         return tuple.__new__(kind, field.values())
     result = object.__new__(kind)
@@ -155,7 +156,7 @@ def _filled(kind: type, field: dict[str, Any]) -> Any:
 
 
 def _describe(value: Any, place: str, arrays: list, modules: set[str]) -> dict[str, Any]:
-    """A value as JSON; its arrays are appended to the list, and the modules of its classes added to the set."""
+    """Describes a value as JSON. Appends its arrays to the list, and adds the modules of its classes to the set."""
     if value is None or type(value) in (bool, int, float, str):
         return {"value": value}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
@@ -194,7 +195,7 @@ def _describe_array(value: Any, place: str, arrays: list) -> dict[str, Any]:
 
 
 def _make(path: Path, node: dict[str, Any], arrays: list[Any]) -> Any:
-    """The value that a node of the description stands for."""
+    """The value that a node of the description represents."""
     if "value" in node:
         return node["value"]
     if "array" in node:
@@ -218,7 +219,7 @@ def _make(path: Path, node: dict[str, Any], arrays: list[Any]) -> Any:
 
 
 def _array(path: Path, arrays: list[Any], number: int, kind: str) -> Any:
-    """An array in the form it had, made once for all places that share it."""
+    """An array of its original kind. Fields that share an array share the loaded one."""
     value = arrays[number]
     if kind == "scalar":
         return value[()]
@@ -234,7 +235,7 @@ def _array(path: Path, arrays: list[Any], number: int, kind: str) -> Any:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """The header of a saved object, of this version or of the first, which zarr wrote."""
+    """The header of a saved object, of the current version or of version 1, which zarr wrote."""
     if (path / _HEADER).exists():
         return dict(json.loads((path / _HEADER).read_text()))
     if (path / "zarr.json").exists():
@@ -243,7 +244,7 @@ def _header(path: Path) -> dict[str, Any]:
 
 
 def _read(path: Path, number: int, entry: dict[str, Any]) -> np.ndarray:
-    """An array as a map, compared with its checksum."""
+    """Maps an array and verifies its checksum."""
     dtype, shape = jnp.dtype(entry["dtype"]), tuple(entry["shape"])
     kind = _storable(np.empty(0, dtype)).dtype.str
     file = path / f"{number}.npy"
@@ -257,7 +258,7 @@ def _read(path: Path, number: int, entry: dict[str, Any]) -> np.ndarray:
 
 
 def _class(path: Path, name: str) -> type:
-    """A class of this package that holds data; nothing else is ever looked up."""
+    """A data class of this package, by name. Nothing else is ever looked up."""
     module, _, kind = name.partition(":")
     _check_module(path, module)
     found = getattr(sys.modules[module], kind, None)
@@ -267,7 +268,7 @@ def _class(path: Path, name: str) -> type:
 
 
 def _check_module(path: Path, name: str) -> None:
-    """Imports a module of this package and refuses all others."""
+    """Imports a module of this package. Refuses all other modules."""
     try:
         if not re.fullmatch(r"jaxprt(\.[a-z][a-z_]*)+", name):
             raise ImportError(name)
@@ -286,7 +287,7 @@ def _fields(kind: Any) -> list[str]:
 
 
 def _algorithm(module: str) -> Any:
-    """Versions of what computes the objects of a module."""
+    """Versions of the algorithms that compute the objects of a module."""
     return getattr(sys.modules[module], "ALGORITHM", 1)
 
 
@@ -301,12 +302,12 @@ def _function(name: str) -> Any:
 
 
 def _is_extended(dtype: np.dtype) -> bool:
-    """Whether a type is one of JAX's own, as bfloat16."""
+    """Whether a type is one that JAX adds to NumPy's, such as bfloat16."""
     return dtype.type.__module__ == "ml_dtypes"
 
 
 def _storable(value: np.ndarray) -> np.ndarray:
-    """The array in a type that NumPy has: the bits of those that it has not."""
+    """The array in a type of NumPy's own. Arrays of other types are reinterpreted as integers of equal size."""
     return value.view(f"uint{8 * value.dtype.itemsize}") if _is_extended(value.dtype) else value
 
 

@@ -1,4 +1,4 @@
-"""Images: drawing a mesh, showing radiance, comparing pictures."""
+"""Images: rasterization of meshes, tone mapping, and image metrics."""
 
 from jaxprt.image.metrics import flip, psnr, relative_l2
 from jaxprt.image.pixels import Pixels, interpolate, render, resolve, shading_points

@@ -1,4 +1,4 @@
-"""Depth and number of the triangle that is nearest so far at every sample, in a form for CPUs and one for others."""
+"""Depth buffers with triangle indices, in one form for CPUs and one for other devices."""
 
 from collections.abc import Callable
 
@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
-CHUNK = 1 << 13  # Patches drawn at once on CPUs.
-WIDE = 1 << 18  # The same on GPUs, where few steps with much to do in each take least.
+CHUNK = 1 << 13  # patches per step on CPUs
+WIDE = 1 << 18  # patches per step on GPUs, where few large steps are fastest
 
 
 class Narrow(eqx.Module):
-    """As CPUs draw: one pixel of all patches after another, in the cache.
+    """Depth buffer for CPUs. It draws one pixel of all patches after another, so that data stays in the cache.
 
-    Numbers are complex, depth + i number. Their minimum goes by the real part, then by the imaginary one, so that one
-    scatter finds both.
+    Entries are complex numbers, depth + i * triangle index. Their minimum compares real parts first and imaginary
+    parts second, so that one scatter finds both depth and index.
     """
 
     nearest: Complex[Array, " p"]
@@ -39,12 +39,13 @@ class Narrow(eqx.Module):
         return self.nearest.imag.astype(jnp.int32)
 
     def drawn(self, pixel: Callable, count: int, number: Int[Array, " n"]) -> "Narrow":
-        """The same with patches of some triangles drawn over it.
+        """A buffer in which patches of some triangles have been drawn.
 
         Args:
-            pixel: From the number of a pixel of a patch to its sample in each patch, and the depth there.
+            pixel: Function from the index of a pixel within a patch to the sample of this pixel in each patch, and its
+                depth.
             count: Number of pixels of a patch.
-            number: The number of the triangle that each patch belongs to.
+            number: Index of the triangle that each patch belongs to.
         """
 
         def one(nearest, k):
@@ -52,14 +53,14 @@ class Narrow(eqx.Module):
             each = jax.lax.complex(depth, number.astype(depth.dtype))
             return nearest.at[place].min(each, mode="promise_in_bounds"), None
 
-        # A scan, since XLA would else compute what belongs to a patch anew for each of its pixels.
+        # A scan, because XLA would otherwise recompute the values of a patch for each of its pixels.
         return Narrow(jax.lax.scan(one, self.nearest, jnp.arange(count, dtype=jnp.int32))[0])
 
 
 class Wide(eqx.Module):
-    """As GPUs draw: all pixels of many patches at once, first the depths, then the numbers.
+    """Depth buffer for GPUs. It draws all pixels of many patches at once, first depths, then triangle indices.
 
-    Depths are positive, so that their bits as whole numbers have the same order; GPUs have the minimum of those in
+    Depths are positive, so their bits as integers have the same order, and GPUs compute the minimum of integers in
     hardware. The methods are those of `Narrow`.
     """
 
@@ -85,11 +86,11 @@ class Wide(eqx.Module):
         return self.number
 
     def drawn(self, pixel: Callable, count: int, number: Int[Array, " n"]) -> "Wide":
-        """The same with patches of some triangles drawn over it."""
+        """A buffer in which patches of some triangles have been drawn."""
         place, depth = jax.vmap(pixel)(jnp.arange(count, dtype=jnp.int32))
         bits = self.bits.at[place].min(_bits(depth), mode="promise_in_bounds")
         most = jnp.iinfo(jnp.int32).max
-        kept = jnp.where(bits < self.bits, most, self.number)  # What was the nearest there is no more.
+        kept = jnp.where(bits < self.bits, most, self.number)  # the previous nearest triangle is hidden
         wins = jnp.isfinite(depth) & (_bits(depth) == bits[place])
         return Wide(bits, kept.at[place].min(jnp.where(wins, number, most), mode="promise_in_bounds"))
 

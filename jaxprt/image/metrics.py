@@ -1,4 +1,4 @@
-"""How far an image is from its reference: relative L2, PSNR and FLIP."""
+"""Errors of an image against a reference: relative L2, PSNR and FLIP."""
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,10 @@ from jaxprt.compile import jit
 
 @jit
 def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Float[Array, ""]:
-    """Norm of the difference over the norm of the reference.
+    """L2 norm of the difference divided by the L2 norm of the reference.
 
-    0 for two images without light, infinite if only the reference has none. Differentiable except where the
-    difference is zero; there the derivative is zero.
+    The result is 0 if both images are black, and infinite if only the reference is. It is differentiable except where
+    the difference is zero; the derivative there is defined as zero.
 
     Raises:
         ValueError: The images differ in shape.
@@ -35,9 +35,9 @@ def psnr(
     """Peak signal-to-noise ratio in decibels; infinite for equal images.
 
     Args:
-        image: Values to judge.
-        reference: What they should be.
-        peak: The largest value that the medium holds; 1 for display values.
+        image: The image to evaluate.
+        reference: The reference image.
+        peak: Largest possible value; 1 for display values.
 
     Raises:
         ValueError: The images differ in shape.
@@ -47,11 +47,11 @@ def psnr(
 
 
 def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> float:
-    """Mean FLIP error of linear radiance, 0 to 1: how much a viewer who flips between the two images sees change.
+    """Mean FLIP error of linear radiance, 0 to 1: the difference that a viewer sees when flipping between the images.
 
-    This is HDR-FLIP, deliberately: images here are linear radiance without an exposure of their own, and the metric
-    takes its range of exposures from the reference. Its viewing conditions are the package's defaults. It runs on the
-    CPU by NumPy arrays and has no derivative. Negative radiance, which an approximation may hold, is seen as black.
+    This is HDR-FLIP, because the images are linear radiance without an exposure; the metric takes its range of
+    exposures from the reference. The viewing conditions are the defaults of flip-evaluator. It runs on the CPU in NumPy
+    and has no derivative. Negative radiance, which an approximation may contain, counts as black.
 
     Raises:
         ImportError: The package flip-evaluator is missing.
@@ -65,13 +65,13 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
         raise ImportError("flip needs the package flip-evaluator: pip install 'jaxprt[bench]'") from error
     image, reference = _pair(image, reference)
     true, seen = (np.maximum(np.ascontiguousarray(x, np.float32), 0) for x in (reference, image))
-    # A fresh dict: the package keeps what it adds to the default one, hence the first reference's exposures, for later.
+    # A new dict: the package modifies its default argument, so exposures of the first reference would be used again.
     _, mean, _ = flip_evaluator.evaluate(true, seen, "HDR", inputsRGB=False, applyMagma=False, parameters={})
     return float(mean)
 
 
 def _pair(image: Array, reference: Array) -> tuple[Array, Array]:
-    """Two images of one shape, integers as floating-point numbers."""
+    """Two images of equal shape, with integers converted to floating point."""
     if image.shape != reference.shape:
         raise ValueError(f"images must have one shape, got {list(image.shape)} and {list(reference.shape)}")
     image, reference = (

@@ -1,6 +1,7 @@
-"""Pictures of meshes: the points that a picture shades, and how their colors make its pixels.
+"""Anti-aliased pictures of meshes: shading points, interpolation, and resolving to pixels.
 
-Coverage is measured at all samples of a pixel, radiance at one point for each surface that the pixel shows.
+As in multisample anti-aliasing, coverage is measured at all samples of a pixel, but radiance at only one point for each
+surface that the pixel shows.
 """
 
 import functools
@@ -19,25 +20,25 @@ from jaxprt.image.raster import SAMPLES, Fragments
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 
-SMOOTH = math.cos(math.radians(10))  # Cosine between mean normals of triangles that may share a point.
-BLOCK = 1 << 15  # Points and pixels that are worked on at once, so that programs fit any number of them.
-SAME_DEPTH = 1e-4  # Relative difference in depth that rounding may make.
-STEEPEST = 1e6  # Slopes are clamped to it: those of a triangle a millionth of a pixel wide.
+SMOOTH = math.cos(math.radians(10))  # smallest cosine between mean normals of triangles that may share a point
+BLOCK = 1 << 15  # points and pixels per step, so that compiled programs fit any number of them
+SAME_DEPTH = 1e-4  # relative difference in depth that rounding may cause
+STEEPEST = 1e6  # slopes are clamped to that of a triangle a millionth of a pixel wide
 
 
 class Pixels(eqx.Module):
-    """The points that a picture shades.
+    """The shading points of a picture.
 
-    Points are in the order of their pixels. Padding follows them.
+    Points are ordered by pixel, followed by padding.
 
     Attributes:
-        triangle: Number of the triangle that each point lies on, -1 in padding.
-        barycentric: Perspective-correct weights of its three vertices, not negative; they sum to 1, to 0 in padding.
-        slope: Change of the weights per pixel to the right, and per pixel down.
-        pixel: Number of the point's pixel, row * width + column.
-        coverage: Share of the pixel's samples that see the surface of the point, 0 in padding.
-        background: Share of each pixel's samples that see no triangle. What coverage and background leave of a pixel
-            are backs of surfaces, which are black.
+        triangle: Index of the triangle that each point lies on; -1 in padding.
+        barycentric: Perspective-correct barycentric coordinates, not negative. They sum to 1, or to 0 in padding.
+        slope: Change of the barycentric coordinates per pixel to the right, and per pixel down.
+        pixel: Index of each point's pixel, row * width + column.
+        coverage: Fraction of the pixel's samples that see the surface of the point; 0 in padding.
+        background: Fraction of each pixel's samples that see no triangle. The remaining samples see backs of surfaces,
+            which are black.
     """
 
     triangle: Int[Array, " p"]
@@ -51,26 +52,27 @@ class Pixels(eqx.Module):
 def shading_points(
     fragments: Fragments, mesh: Mesh, camera: Camera, *, uneven: Bool[Array, " f"] | None = None
 ) -> Pixels:
-    """One point for each pixel and each surface that it shows.
+    """Finds one shading point for each pixel and each surface that the pixel shows.
 
-    Samples of one triangle share a point. So do samples of different triangles that are plainly one smooth surface:
-    of one region, with mean shading normals within ten degrees, and no further apart in depth than their slopes
-    explain. Hence a mesh finer than the pixels has one point in a pixel, not four. The point is at the mean position
-    of its samples, or as near to it as the triangle of the first sample reaches. What is seen from behind, see
-    `raster.front`, has no point. The result is constant for derivatives.
+    Samples of one triangle share a point. Samples of different triangles share a point if the triangles clearly form
+    one smooth surface: they have the same region, mean shading normals within ten degrees, and depths that differ by no
+    more than their slopes explain. A mesh finer than the pixels therefore has one point per pixel, not four. The point
+    lies at the mean position of its samples, or as close to it as the triangle of the first sample reaches. Surfaces
+    seen from behind (see `raster.front`) have no points. The result has zero derivatives.
 
-    Outside of `jax.jit` and `jax.vmap` there are as many points as needed and at most an eighth more of padding, so
-    that programs compiled for one view mostly fit the next. Inside, where the number is unknown, there are as many
-    as samples.
+    Outside of `jax.jit` and `jax.vmap` at most an eighth of the points is added as padding, so that programs compiled
+    for one view usually fit the next. Inside of them the number of points is not known, so there are as many points as
+    samples.
 
     Args:
-        fragments: What `rasterize` found.
-        mesh: The mesh that it was given.
-        camera: The camera that it was given.
-        uneven: Triangles whose radiance varies so much within a pixel that each sample is a point; none if None.
+        fragments: The result of `rasterize`.
+        mesh: The rasterized mesh.
+        camera: The camera of the rasterization.
+        uneven: Mask of triangles whose radiance varies so much within a pixel that each sample becomes a point; none if
+            None.
 
     Raises:
-        ValueError: The fragments are of a picture of another size, or of triangles that the mesh does not have.
+        ValueError: The fragments are of a picture of another size, or refer to triangles that the mesh does not have.
     """
     shape = fragments.triangle.shape
     if shape[:2] != (camera.height, camera.width) or shape[2:] not in ((), (4,)) or 0 in shape:
@@ -104,13 +106,13 @@ def shading_points(
 def interpolate(
     fragments: Fragments | Pixels, face: Int[Array, "f 3"], attribute: Float[Array, "v *c"]
 ) -> Float[Array, "..."]:
-    """Carries an attribute of the vertices to the pixels, or to the points that are shaded.
+    """Interpolates a vertex attribute to pixels or to shading points.
 
-    Zero where nothing is seen. Linear, hence differentiable, in the attribute; the derivative with respect to a
-    vertex is the weight that the pixels give it.
+    The result is zero where nothing is seen. It is linear in the attribute and therefore differentiable in it; the
+    derivatives are the barycentric coordinates.
 
     Raises:
-        ValueError: The fragments have several samples in a pixel, hence no weights.
+        ValueError: The fragments have several samples per pixel and therefore no barycentric coordinates.
     """
     if fragments.barycentric is None:
         raise ValueError("fragments must have one sample per pixel; for several, interpolate at their shading_points")
@@ -127,18 +129,18 @@ def interpolate(
 def resolve(
     pixels: Pixels, color: Float[Array, "p c"], *, background: Float[Array, "h w c"] | None = None
 ) -> Float[Array, "h w c"]:
-    """Puts a picture together: the sum of the points' colors times their coverage, and the background past them.
+    """Resolves a picture: sums the points' colors times their coverage, and adds the background where it is visible.
 
-    This is the box filter of the samples, in linear radiance: tone mapping comes after it. Linear, hence
-    differentiable, in the colors and the background.
+    This is a box filter over the samples, in linear radiance, so tone mapping comes after it. The result is linear in
+    the colors and the background and therefore differentiable in them.
 
     Args:
-        pixels: The points.
-        color: Linear radiance of each point towards the camera; that of padding does not count.
-        background: What is seen past the mesh; black if not given.
+        pixels: The shading points.
+        color: Linear radiance of each point towards the camera. Values in padding are ignored.
+        background: Linear radiance behind the mesh; black if None.
 
     Raises:
-        ValueError: There is not one color per point.
+        ValueError: The number of colors is not the number of points.
     """
     if color.shape[:1] != pixels.triangle.shape or color.ndim != 2:
         raise ValueError(f"color must be [{len(pixels.triangle)}, c], one per point, got {list(color.shape)}")
@@ -165,20 +167,21 @@ def render(
     background: Float[Array, "h w c"] | None = None,
     samples: int = 4,
 ) -> Float[Array, "h w c"]:
-    """Draws a mesh whose vertices have colors.
+    """Renders a mesh with a color at each vertex.
 
-    Differentiable in the colors and the background, constant in the geometry and the camera. Callers that draw one
-    view many times keep the result of `shading_points` and call `interpolate` and `resolve`.
+    The picture is differentiable in the colors and the background; its derivatives in the geometry and the camera are
+    zero. To render one view many times, keep the result of `shading_points` and call `interpolate` and `resolve`.
 
     Args:
-        mesh: What is drawn. Its back, see `front`, is black.
+        mesh: The mesh to render. Its back (see `front`) is black.
         color: Linear radiance of each vertex towards the camera.
-        camera: From where.
-        background: What is seen past the mesh; black if not given.
-        samples: 4 for edges without steps, 1 for what the pixels' centers show.
+        camera: The camera.
+        background: Linear radiance behind the mesh; black if None.
+        samples: Samples per pixel: 4 for anti-aliased edges, 1 for pixel centers only.
 
     Raises:
-        ValueError: There is not one color per vertex, or as in `rasterize`.
+        ValueError: The number of colors is not the number of vertices, the mesh has no triangle or more than 2^24 - 1,
+            or `samples` is neither 1 nor 4.
     """
     if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
         raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
@@ -187,7 +190,7 @@ def render(
 
 
 def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[Int[Array, " m"]]:
-    """Numbers of the flags that are set, in order, then -1: in blocks, or in one of n inside of jax.jit."""
+    """Indices of the set flags in order, then -1: in blocks, or inside of jax.jit in one block of n."""
     if isinstance(flag, Tracer):
         place = jnp.where(flag > 0, jnp.cumsum(flag > 0, dtype=jnp.int32) - 1, flag.size)
         every = jnp.arange(flag.size, dtype=jnp.int32)
@@ -199,7 +202,7 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
 
 
 def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
-    """Fields of all parts; outside of jax.jit without most of their padding."""
+    """Concatenated fields of all parts; outside of jax.jit without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
     count = sum(int(np.count_nonzero(part[0] >= 0)) for part in parts)
@@ -209,16 +212,16 @@ def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
     return [jax.device_put(each[:room]) for each in field]
 
 
-# What follows is cut into several programs, for XLA fuses all that one program computes into each of its results, and
-# repeats it for each.
+# The following is split into several programs, because XLA would fuse all computations of one program into each of its
+# results and repeat them for each.
 
 
 @jit
 def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array, " f"]):
-    """Pixels that show one triangle, pixels that need several points, and the share of each pixel that shows none.
+    """Masks of pixels with one triangle and of pixels with several points, and each pixel's background fraction.
 
-    Of the samples that see one surface, the first stands for it: its member has a bit for each of them, and theirs
-    have none. Only the pixels that show one triangle have members yet.
+    The first sample that sees a surface represents it: its member mask has a bit for each sample of that surface, and
+    the masks of the other samples are empty. So far only the pixels that show one triangle have masks.
     """
     height, width, *_ = fragments.triangle.shape
     triangle = fragments.triangle.reshape(height * width, -1).T
@@ -234,7 +237,7 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array
 
 @jit
 def _projected(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
-    """Vertices as of `raster.project`."""
+    """Vertices projected by `raster.project`, as one array."""
     return jnp.stack(raster.project(*jax.lax.stop_gradient((mesh.position, camera))))
 
 
@@ -242,7 +245,7 @@ def _projected(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
 def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
     """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down.
 
-    1 / depth is linear in the picture of a triangle. Normals are sums of those of the vertices.
+    1 / depth is linear in the image plane of a triangle. The normal is the sum of the vertex normals.
     """
     face = mesh.face.T
     normal = jax.lax.map(lambda axis: axis[face], jax.lax.stop_gradient(mesh.normal.T))
@@ -257,7 +260,7 @@ def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
 
 @jit
 def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...]):
-    """What the samples of some pixels see, as arrays [s, m]: whether it is a front, and what `_same` takes."""
+    """Whether samples of some pixels see a front, and the values that `_same` compares, as arrays [s, m]."""
     shape = (fragments.depth.shape[0] * fragments.depth.shape[1], -1)
     triangle, depth = (each.reshape(shape)[row].T for each in (fragments.triangle, fragments.depth))
     facing, *rest = (each[triangle] for each in face)
@@ -266,9 +269,9 @@ def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...
 
 @jit
 def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]]:
-    """Whether two samples are of one surface, for each pair (i, j) of the samples of a pixel with i < j.
+    """Whether two samples see the same surface, for each pair (i, j) of the samples of a pixel with i < j.
 
-    Where two triangles meet between the samples, the inverse depth changes by a mean of what each explains.
+    Where two triangles meet between the samples, the inverse depth changes by a mean of the two triangles' slopes.
     """
     triangle, inverse, region, x, y, z, right, down, uneven = samples
     offset = SAMPLES[len(triangle)]
@@ -287,7 +290,7 @@ def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]
 
 @jit
 def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> UInt8[Array, "n s"]:
-    """Members with those of the pixels `row`: samples of one surface join the first of them."""
+    """Member masks in which, at the pixels `row`, samples of one surface have been merged into the first of them."""
     first = []
     for j in range(len(shown)):
         leader = jnp.full(row.shape, j)
@@ -307,11 +310,11 @@ def _points(
     face: Int[Array, "f 3"],
     projected: Float[Array, "3 v"],
 ):
-    """Points of the surfaces that some samples stand for.
+    """Shading points of the surfaces that some samples represent.
 
     Returns:
-        Triangles, pixels and coverage; the projected vertices as seen from the sample, and the step from there to the
-        mean position of the surface's samples.
+        Triangles, pixels and coverage; the projected vertices relative to the sample, and the offset from the sample to
+        the mean position of the surface's samples.
     """
     height, width, *_ = fragments.depth.shape
     samples, dtype = members.shape[1], projected.dtype
@@ -330,7 +333,7 @@ def _points(
 
 
 def _affine(x, y, q):
-    """The determinants of `raster.rasterize` where x = y = 0, and their change per pixel to the right and down."""
+    """The determinants of `raster.rasterize` at x = y = 0, and their change per pixel to the right and down."""
     s, pairs = jnp.sign(q), ((1, 2), (2, 0), (0, 1))
     value = [x[i] * y[j] - x[j] * y[i] for i, j in pairs]
     return value, [s[j] * y[i] - s[i] * y[j] for i, j in pairs], [s[i] * x[j] - s[j] * x[i] for i, j in pairs]
@@ -338,7 +341,7 @@ def _affine(x, y, q):
 
 @jit
 def _linear(x, y, q):
-    """Weights of the vertices up to a common factor, which are linear in the picture, and their changes."""
+    """Barycentric coordinates up to a common factor, which makes them linear in the image plane, and their changes."""
     value, right, down = _affine(x, y, q)
     side = jnp.sign(sum(value[i] * jnp.sign(q[i]) for i in range(3)))
     return [[side * jnp.abs(q[i]) * part[i] for i in range(3)] for part in (value, right, down)]
@@ -346,7 +349,7 @@ def _linear(x, y, q):
 
 @jit
 def _weights(value, right, down, across, along):
-    """Perspective-correct weights after a step, which ends where it would leave the triangle, and 1 / their sum."""
+    """Perspective-correct barycentric coordinates after a step that stays in the triangle, and 1 / their raw sum."""
     change = [across * right[i] + along * down[i] for i in range(3)]
     leaves = [value[i] + change[i] < 0 for i in range(3)]
     reach = [jnp.where(leaves[i], -value[i] / jnp.where(leaves[i], change[i], 1), 1) for i in range(3)]
@@ -359,7 +362,7 @@ def _weights(value, right, down, across, along):
 
 @jit
 def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
-    """Weights and their slopes, zero in padding."""
+    """Barycentric coordinates and their slopes; zero in padding."""
     slope = [[(part[i] - weight[i] * sum(part)) * rate for i in range(3)] for part in change]
     slope = jnp.stack([jnp.stack(each, -1) for each in slope], 1)
     used = (triangle >= 0)[:, None]
@@ -369,7 +372,7 @@ def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Ar
 
 @functools.cache
 def _subsets(samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean position of each subset of the samples, and its share of them. Bit i of a subset's number is sample i."""
+    """Mean position and fraction of the samples for each subset of them. Bit i of a subset's index is sample i."""
     member = (np.arange(1 << samples)[:, None] >> np.arange(samples)) & 1
     count = member.sum(1)
     return member @ SAMPLES[samples] / np.maximum(count, 1)[:, None], count / samples

@@ -1,4 +1,4 @@
-"""What is looked at: meshes, environments, cameras, embedded scenes."""
+"""Scenes: meshes, materials, environments, cameras, file formats, and embedded examples."""
 
 from jaxprt.scene import (
     builtin,

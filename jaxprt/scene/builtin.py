@@ -1,8 +1,8 @@
-"""Scenes and lights made by formula: chess pieces on a board, a sphere, a plane, a clear day, a studio.
+"""Procedural scenes and lights: chess pieces on a board, a sphere, a plane, a clear day, a studio.
 
-A turned piece is a list of runs, each a curve (radius, height) through control points. A run is smooth; where
-one run ends and the next begins is an edge. Where it stands out it is sharp: its vertices are doubled, each with its
-own normal. In a groove they are not, so that each sees out between both sides.
+A turned piece (surface of revolution) is a list of runs. Each run is a smooth curve (radius, height) through control
+points. Two successive runs meet in an edge. At a convex edge vertices are doubled, each with its own normal, so that
+it is sharp. In a groove they are not doubled, so that each vertex sees out between both sides.
 """
 
 import itertools
@@ -16,8 +16,8 @@ from jaxprt.scene.shapes import Part, assemble, curve, patch, sweep
 from jaxprt.sphere import cubemap
 
 _SECTORS = 40
-_FINE = {"step": 0.085, "turn": 0.7}  # Of curves, in squares of the board and radians.
-# Curves of (radius over that of the base, height), from the board up.
+_FINE = {"step": 0.085, "turn": 0.7}  # resolution of curves, in squares of the board and radians
+# Curves of (radius relative to that of the base, height), from the board up.
 _BASE = [[(0.87, 0), (0.9, 0.03), (0.87, 0.075)], [(0.87, 0.075), (0.78, 0.085)]]
 _PAWN = [
     *_BASE,
@@ -73,7 +73,7 @@ _KING = [
     [(0.13, 1.59), (0.115, 1.625)],
     [(0.115, 1.625), (0, 1.625)],
 ]
-# Radius of the base, curves, and place on the board in squares from its center.
+# Radius of the base, curves, and position on the board in squares from its center.
 _PIECES = [
     (0.39, _KING, (0.5, -0.5)),
     (0.37, _QUEEN, (-0.5, -1.5)),
@@ -82,12 +82,12 @@ _PIECES = [
     (0.3, _PAWN, (-0.5, 0.5)),
     (0.3, _PAWN, (0.5, 1.5)),
 ]
-_CORONET = range(7, 10), 1.3, 1.38, 0.035  # The queen's curves with teeth, their lowest and highest points, depth.
-_MERLON, _NOTCH, _TOP = 5, 3, 0.99  # Widths of the rook's in sectors, and height.
+_CORONET = range(7, 10), 1.3, 1.38, 0.035  # the queen's: curves with teeth, lowest and highest point, depth
+_MERLON, _NOTCH, _TOP = 5, 3, 0.99  # widths of the rook's merlons and notches in sectors, and height of its top
 _SQUARES = 6
-_CELLS = 12  # Along a square of the board.
+_CELLS = 12  # cells along the edge of a square of the board
 _THICKNESS = 0.25
-_GAP = 0.004  # Between pieces and board, and between the king and his cross: more than rays start off a surface.
+_GAP = 0.004  # gap below pieces and below the king's cross; larger than the offset of ray origins
 
 _SUN = (-0.62, 0.62, 0.48)
 _SUN_RADIUS = np.radians(2.0)
@@ -101,13 +101,14 @@ _LAMPS = [
 
 
 def chess() -> Mesh:
-    """King, queen, bishop, rook and two pawns on a corner of a chessboard, all turned and set up by formula.
+    """Procedural chess pieces: king, queen, bishop, rook and two pawns on a corner of a chessboard.
 
-    A square's edge is the unit; the board's top is at y = 0 and its center in the origin. Each piece is closed
-    and stands 0.004 above the board. Vertices are doubled at sharp edges and between squares.
+    The unit is the edge of a square. The top of the board is at y = 0 and its center at the origin. Each piece is a
+    closed surface that stands 0.004 above the board. Vertices are doubled at sharp edges and between squares.
 
     Returns:
-        16,778 vertices in three regions: 0 the pieces, 1 the board's light squares, 2 the dark ones and its side.
+        A mesh of 16,778 vertices in three regions: 0 the pieces, 1 the light squares, 2 the dark squares and the side
+        of the board.
     """
     pieces = []
     for radius, curves, (x, z) in _PIECES:
@@ -117,11 +118,11 @@ def chess() -> Mesh:
 
 
 def sphere(*, rings: int = 32, sectors: int = 64) -> Mesh:
-    """The unit sphere around the origin, in latitude and longitude; each pole is one vertex.
+    """A unit sphere at the origin, divided by latitude and longitude. Each pole is one vertex.
 
     Args:
-        rings: Bands of latitude.
-        sectors: Parts of the full turn.
+        rings: Number of bands of latitude.
+        sectors: Number of sectors of longitude.
 
     Returns:
         A closed mesh of (rings - 1) sectors + 2 vertices with exact normals.
@@ -138,10 +139,10 @@ def sphere(*, rings: int = 32, sectors: int = 64) -> Mesh:
 
 
 def plane(*, cells: int = 16) -> Mesh:
-    """The square from -1 to 1 in x and z at y = 0, facing up.
+    """A square from -1 to 1 in x and z at y = 0, facing up.
 
     Args:
-        cells: Parts of each edge.
+        cells: Number of cells along each edge.
 
     Returns:
         A mesh of (cells + 1)^2 vertices.
@@ -155,9 +156,9 @@ def plane(*, cells: int = 16) -> Mesh:
 
 
 def daylight(*, size: int = 64) -> Environment:
-    """A clear sky with a warm sun of 2 degrees radius, 38 degrees high on the left of someone who looks along -z.
+    """A clear sky with a warm sun of 2 degrees radius at 38 degrees elevation, on the left of a viewer facing -z.
 
-    A white diffuse plane that faces up has radiance 1, the mean of the colors; half of it is from the sun.
+    A white diffuse plane that faces up has a radiance of 1, averaged over the colors; half of it comes from the sun.
 
     Args:
         size: Texels along the edge of a cube face.
@@ -185,7 +186,7 @@ def daylight(*, size: int = 64) -> Environment:
 def studio(*, size: int = 64) -> Environment:
     """A dark room with four soft boxes: a warm key light, a cold rim light behind, a white strip, a weak fill above.
 
-    A white diffuse plane that faces up has radiance 1, the mean of the colors.
+    A white diffuse plane that faces up has a radiance of 1, averaged over the colors.
 
     Args:
         size: Texels along the edge of a cube face.
@@ -205,7 +206,7 @@ def studio(*, size: int = 64) -> Environment:
         depth = direction @ center
         inside = (depth > 0).astype(float)
         for axis, limit in zip((right, np.cross(center, right)), np.tan(np.radians(half)), strict=True):
-            # A box with its corners in the direction's plane, its edge soft over some three degrees.
+            # A rectangle in the plane across the direction, with an edge that fades over about three degrees.
             place = np.abs(direction @ axis) / np.maximum(depth, 1e-9)
             edge = np.clip((limit - place) / 0.05 + 0.5, 0, 1)
             inside = inside * edge**2 * (3 - 2 * edge)
@@ -221,7 +222,7 @@ def _fine_direction(size: int) -> np.ndarray:
 
 
 def _exposed(radiance: np.ndarray, size: int) -> np.ndarray:
-    """Means over texels, scaled so that the irradiance from above is pi in the mean of the colors."""
+    """Means over texels, scaled so that the irradiance on a plane that faces up is pi, averaged over the colors."""
     part = radiance.shape[1] // size
     shape = (6, size, part, size, part, -1)
     weight = np.asarray(cubemap.solid_angle(size=size * part), np.float64).reshape(shape)
@@ -231,7 +232,7 @@ def _exposed(radiance: np.ndarray, size: int) -> np.ndarray:
 
 
 def _piece(radius: float, curves: list) -> list[Part]:
-    """The parts of a turned piece that stands in the origin."""
+    """The parts of a turned piece at the origin."""
     bottom = np.array([[0, 0], [radius * curves[0][0][0], 0]])
     parts = [sweep(bottom, np.array([[1.0, 0], [1, 0]]), sectors=_SECTORS)]
     chains = []
@@ -256,7 +257,7 @@ def _piece(radius: float, curves: list) -> list[Part]:
 
 
 def _lift(point: np.ndarray, slope: np.ndarray, teeth: np.ndarray) -> np.ndarray:
-    """How far the crests of the coronet's teeth rise, and how fast along the curve; zero where there are none."""
+    """Height of the crests of the coronet's teeth, and its derivative along the curve; zero elsewhere."""
     _, low, high, depth = _CORONET
     above = teeth * np.maximum(point[:, 1] - low, 0) / (high - low)
     return depth * np.stack([above**2, 2 * above / (high - low) * slope[:, 1]], -1)
@@ -287,7 +288,7 @@ def _cross(height: float) -> list[Part]:
     result = []
     for turn in range(4):
         c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][turn]
-        rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # About z, by quarter turns.
+        rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # about z, by quarter turns
 
         def add(corner, rotation=rotation):
             position, face, normal = patch(corner, rows=parts, columns=parts)
@@ -307,7 +308,7 @@ def _cross(height: float) -> list[Part]:
 
 
 def _board() -> tuple[list[Part], list[Part]]:
-    """Parts of the light squares, and of the dark squares and the board's side."""
+    """Parts of the light squares, and parts of the dark squares and the side of the board."""
     light, dark = color = [], []
     line = np.arange(_SQUARES + 1) - _SQUARES / 2
     for i in range(_SQUARES):

@@ -1,4 +1,4 @@
-"""The camera: where the picture is taken from."""
+"""The pinhole camera."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,21 +11,21 @@ from jaxprt.scene.mesh import Mesh, bounds
 
 
 def _floating(value) -> Array:
-    """A list, an array of integers and the like as a floating-point array."""
+    """Numbers converted to a floating-point array."""
     value = jnp.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
 
 
 class Camera(eqx.Module):
-    """A pinhole camera. Lists and NumPy arrays become arrays.
+    """A pinhole camera. Lists and NumPy arrays are converted to JAX arrays.
 
-    Values that are not finite, angles out of their range, an eye that is the target, and pictures without pixels raise
-    ValueError; inside `jax.jit` values are not known.
+    Values that are not finite, angles out of range, an eye equal to the target, and pictures without pixels raise
+    ValueError. Inside `jax.jit` values are not known and therefore not checked.
 
     Attributes:
         eye: Position in world units.
-        target: The point that falls on the picture's center.
-        up: Direction that points up in the picture; not parallel to the view.
+        target: Point at the center of the picture, in world units.
+        up: Direction that points up in the picture; not parallel to the view direction.
         field_of_view: Full vertical angle of view in radians, between 0 and pi.
         width: Picture width in pixels.
         height: Picture height in pixels.
@@ -63,17 +63,17 @@ def orbit(
     width: int = 512,
     height: int = 512,
 ) -> Camera:
-    """A camera around a mesh that sees all of it: its bounding sphere touches the picture's nearer edges.
+    """A camera that sees the whole mesh from a given angle: the bounding sphere touches the picture's nearer edges.
 
-    The camera looks at the center of the bounding box, around which the sphere is; vertices without
-    faces do not count. From straight above or below, the picture's up direction is the one that
-    it approaches with the elevation.
+    The camera looks at the center of the bounding box, which is also that of the bounding sphere. Vertices without
+    faces are ignored. Straight above or below, the up direction of the picture is the limit for elevations approaching
+    that angle.
 
     Args:
-        mesh: What to look at.
-        azimuth: Turn around +y; 0 is on the +z side, positive towards +x.
-        elevation: Angle above the horizon, -pi/2 to pi/2.
-        field_of_view: Full vertical angle of view.
+        mesh: The mesh to look at.
+        azimuth: Angle about +y in radians; 0 is on the +z side, positive angles are towards +x.
+        elevation: Angle above the horizon in radians, from -pi/2 to pi/2.
+        field_of_view: Full vertical angle of view in radians.
         width: Picture width in pixels.
         height: Picture height in pixels.
 

@@ -1,4 +1,4 @@
-"""Environment maps: distant light on a cubemap, from image files and arrays, turned and looked up."""
+"""Environment maps: distant light on a cubemap. Loading, resampling, rotation and lookup."""
 
 import functools
 import pathlib
@@ -15,8 +15,8 @@ from jaxprt.compile import jit
 from jaxprt.files import images
 from jaxprt.sphere import cubemap
 
-# How each layout holds the six faces: its height and width in faces; the row and column of face +x, -x, +y,
-# -y, +z, -z; and the steps in row and column by which a face's pixels are read to be as OpenGL has them.
+# Arrangement of the six faces in each layout: its height and width in faces; the row and column of each face (+x, -x,
+# +y, -y, +z, -z); and the steps in row and column that bring a face's pixels into OpenGL's order.
 _PLAIN = ((1, 1),) * 6
 _CROSS_STEP = ((1, -1), (1, -1), (-1, 1), (-1, 1), (-1, 1), (1, -1))
 _OPENEXR_STEP = ((1, -1), (1, -1), (-1, 1), (-1, 1), (1, -1), (1, -1))
@@ -26,14 +26,14 @@ _CUBES = {
     "horizontal-strip": ((1, 6), tuple((0, i) for i in range(6)), _PLAIN),
     "openexr-cube": ((6, 1), tuple((i, 0) for i in range(6)), _OPENEXR_STEP),
 }
-_AROUND = 4096  # least number of parts around the horizon
-_PARTS = 8  # A pixel is dealt out in at most as many parts in each direction; larger pixels are first divided.
-_CHUNK = 2**20  # Parts of pixels that are dealt out at a time.
+_AROUND = 4096  # smallest number of parts around the horizon
+_PARTS = 8  # A pixel is divided into at most this many parts per direction; larger pixels are subdivided first.
+_CHUNK = 2**20  # parts of pixels per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
 def _floating(radiance):
-    """Lists and whole numbers as floating-point arrays; the rest as it is."""
+    """Lists and integers converted to floating-point arrays; other values unchanged."""
     dtype = getattr(radiance, "dtype", None)
     if dtype is None or jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_):
         return jnp.asarray(radiance, jnp.result_type(float))
@@ -41,13 +41,13 @@ def _floating(radiance):
 
 
 class Environment(eqx.Module):
-    """Distant light: mean linear radiance of each cubemap texel.
+    """Distant light: the mean linear radiance of each cubemap texel.
 
-    Radiance must be finite, on six square faces; another light raises ValueError. Inside `jax.jit` values are not
-    known: there a NaN reaches every vertex that the texel lights.
+    The radiance must be finite and have six square faces, otherwise ValueError is raised. Inside `jax.jit` values are
+    not known and not checked: a NaN then reaches every vertex that the texel lights.
 
     Attributes:
-        radiance: Mean radiance over each texel, linear Rec. 709; leading axes, if any, are a batch of lights.
+        radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
     """
 
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=_floating)
@@ -63,21 +63,21 @@ class Environment(eqx.Module):
 def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | None = None) -> Environment:
     """Loads distant light from an image file.
 
-    The layout is told from the EXR attribute ``envmap`` or else from the shape: twice as wide as high is
-    "latlong", 3 : 4 "vertical-cross", 1 : 6 "vertical-strip" and 6 : 1 "horizontal-strip"; a single pixel is
-    light of one color. See ``resample`` for what each means.
+    The layout is determined from the EXR attribute ``envmap``, or else from the ratio of width to height: 2 : 1 is
+    "latlong", 3 : 4 "vertical-cross", 1 : 6 "vertical-strip" and 6 : 1 "horizontal-strip". A single pixel is constant
+    light. ``resample`` explains the layouts.
 
     Args:
-        path: The file, see ``jaxprt.files.read_image``.
+        path: The file, in a format that ``jaxprt.files.read_image`` reads.
         size: Texels along the edge of a cube face.
-        layout: One of ``LAYOUTS``; needed only where it cannot be told.
+        layout: One of ``LAYOUTS``; needed only if it cannot be determined.
 
     Returns:
-        Light in three colors. Negative values, which lossy files hold, are set to zero with a warning.
+        Light in three colors. Negative values, which lossy files may contain, are set to zero with a warning.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is not an undamaged image of a known layout, or holds NaN or infinity.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is damaged, not an image, of an unknown layout, or holds NaN or infinity.
     """
     image, attributes = images.read_image(path)
     if layout is None and "envmap" in attributes:
@@ -92,19 +92,19 @@ def environment_from_image(
     layout: str | None = None,
     name: str = "image",
 ) -> Environment:
-    """Makes distant light of an image in memory, with the checks of ``load_environment``.
+    """Makes distant light from an image in memory, with the checks of ``load_environment``.
 
     Args:
         image: Linear radiance with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels; alpha is ignored.
         size: Texels along the edge of a cube face.
-        layout: One of ``LAYOUTS``; None tells it from the shape.
-        name: What to call the image in messages.
+        layout: One of ``LAYOUTS``; None determines it from the shape.
+        name: Name of the image in error messages.
 
     Returns:
         Light in three colors.
 
     Raises:
-        ValueError: The image is of no known layout or number of channels, or holds NaN or infinity.
+        ValueError: The image has an unknown layout or number of channels, or holds NaN or infinity.
     """
     image = np.asarray(image)
     layout = layout or _layout_of(image, name)
@@ -115,22 +115,22 @@ def environment_from_image(
 def resample(
     image: Float[np.ndarray, "h w c"], *, layout: str = "latlong", size: int = 64
 ) -> Float64[np.ndarray, "6 n n c"]:
-    """Means of a picture of the whole sphere over cubemap texels, each pixel a box of constant radiance.
+    """Resamples a picture of the whole sphere to a cubemap: texels are area means over pixels of constant radiance.
 
-    The integral over the sphere is conserved per channel and constants are reproduced, both to rounding,
-    whether the pixels are larger or smaller than the texels. Cubes are resampled exactly. Layouts:
+    The integral over the sphere is conserved for each channel, and constants are reproduced, both up to rounding,
+    whether pixels are larger or smaller than texels. Cube layouts are resampled exactly. Layouts:
 
     * "latlong": the top row is +y, the center column +z, and +x a quarter of the width from the left;
       direction (sin lon cos lat, sin lat, cos lon cos lat), lon from pi on the left to -pi.
-    * "openexr-latlong": the same, but the pixels are samples that include both poles and both ends of the
-      longitude, so that the boxes on the border are half as large.
+    * "openexr-latlong": the same, but pixels are point samples that include both poles and both ends of the
+      longitude, so boxes on the border are half as large.
     * "vertical-cross": 3 x 4 faces seen from inside: +y on top; -x, -z and +x in the second row; then -y; and
       +z at the bottom, upside down.
-    * "vertical-strip", "horizontal-strip": faces +x, -x, +y, -y, +z, -z as OpenGL has them.
-    * "openexr-cube": OpenEXR's faces, from top to bottom, whose pixels are samples that include the edges.
+    * "vertical-strip", "horizontal-strip": faces +x, -x, +y, -y, +z, -z in OpenGL's orientation.
+    * "openexr-cube": OpenEXR's faces, from top to bottom, whose pixels are point samples that include the edges.
 
     Args:
-        image: Radiance, any number of channels.
+        image: Radiance with any number of channels.
         layout: One of ``LAYOUTS``.
         size: Texels along the edge of a cube face.
 
@@ -153,25 +153,26 @@ def resample(
 
 @functools.partial(jit, static_argnames="samples")
 def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
-    """Turns distant light: what came from s comes from R s.
+    """Rotates distant light: radiance from direction s arrives from direction R s afterwards.
 
-    Each texel is the mean of ``samples`` x ``samples`` parts. The value of a part is bilinear, with a
-    transition from texel to texel as wide as a part: the mean is then the overlap of turned texels with those
-    of the cube, as nearly as parts can follow it. So a sun in one texel glides instead of flickering, and
-    turns that map the cube onto itself permute the texels. As parts cover some texels of the old light more
-    than others, its values are weighted to make up for that; and each color is scaled so that its integral
-    over the sphere stays what it was. Constant light stays as it is. The light is meant to be non-negative.
+    Each texel is the mean of ``samples`` x ``samples`` parts. The value of a part is interpolated bilinearly, with a
+    transition between texels that is as wide as a part. The mean then approximates the overlap of rotated texels with
+    those of the cube. A sun in one texel therefore moves smoothly instead of flickering, and rotations that map the
+    cube onto itself permute the texels. Parts cover some texels of the original light more than others; its values are
+    weighted to compensate. Each color is scaled so that its integral over the sphere is conserved. Constant light does
+    not change. The light should not be negative.
 
-    Differentiable in both arguments; at the identity the gradient is the central one of a piecewise smooth
-    function.
+    The result is differentiable in both arguments. At the identity the gradient is the central one of a piecewise
+    smooth function.
 
     Args:
         light: One light, or a batch of them.
-        rotation: A proper rotation matrix. Not checked, as this is jitted; other matrices give wrong light.
+        rotation: A proper rotation matrix. It is not checked, because this function is jitted; other matrices give
+            wrong results.
         samples: Parts along the edge of a texel.
 
     Returns:
-        The turned light.
+        The rotated light.
 
     Raises:
         ValueError: The number of samples is below 1.
@@ -182,7 +183,7 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
         raise ValueError(f"samples must be at least 1, got {samples}")
     radiance = light.radiance
     n = radiance.shape[-2]
-    # Points on the cube have texel fractions for coordinates, which quarter turns keep exactly.
+    # Points on the cube have coordinates in fractions of texels, which quarter turns preserve exactly.
     point = cubemap.point(size=n * samples).astype(radiance.dtype)
     source = (point[..., None] * rotation.astype(radiance.dtype)).sum(-2)
     area = cubemap.solid_angle(size=n).astype(radiance.dtype)[..., None]
@@ -207,14 +208,14 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
 @jit
 def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-    """Radiance that arrives from some directions in the world, bilinear between texels.
+    """Radiance that arrives from given directions in world coordinates, interpolated bilinearly between texels.
 
     Args:
         light: One light, not a batch.
-        direction: Directions of any length.
+        direction: Directions of any length, in world coordinates.
 
     Returns:
-        Radiance.
+        Radiance for each direction, in the units of the light.
     """
     return cubemap.lookup(light.radiance, direction)
 
@@ -271,7 +272,7 @@ def _clean(image: np.ndarray, name: str) -> np.ndarray:
 
 
 def _box_edge(count: int, *, on_edge: bool) -> np.ndarray:
-    """Where the boxes around equidistant samples on [-1, 1] meet; the outermost may be on its ends."""
+    """Edges of the boxes around equidistant samples on [-1, 1]. With `on_edge` the outer samples are at the ends."""
     if not on_edge or count == 1:
         return np.linspace(-1, 1, count + 1)
     return np.clip((2 * np.arange(count + 1) - 1) / (count - 1) - 1, -1, 1)
@@ -285,7 +286,7 @@ def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
 
 
 def _resample_cube(face: np.ndarray, edge: np.ndarray, size: int) -> np.ndarray:
-    """Exact area means: pixels and texels are both rectangles on a face, and so are their overlaps."""
+    """Exact area means: pixels, texels and their overlaps are all rectangles on a face."""
     texel_edge = np.linspace(-1, 1, size + 1)
     cut = np.union1d(edge, texel_edge)
     pixel = np.searchsorted(edge, (cut[1:] + cut[:-1]) / 2) - 1
@@ -304,8 +305,8 @@ def _resample_cube(face: np.ndarray, edge: np.ndarray, size: int) -> np.ndarray:
 
 
 def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
-    """Deals out small parts of the pixels to texels, given the edges of the pixels' rows and columns."""
-    # A texel is at least 2 / (3 size) wide, in the corners of a face: let some eight parts fall across it.
+    """Distributes small parts of the pixels to texels, given the edges of the pixels' rows and columns."""
+    # A texel is at least 2 / (3 size) wide, in the corners of a face. About eight parts should fall across it.
     around = max(12 * size * 2 * np.pi, _AROUND)
     parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
     repeat = [-(-count // _PARTS) for count in parts]
@@ -315,7 +316,7 @@ def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.nda
     longitude = _subdivide(_subdivide(longitude, repeat[1]), columns).reshape(-1)
 
     # Axes: rows of pixels, rows of parts, columns of pixels, columns of parts. The samples of a pixel lie on a
-    # sheared lattice: on a straight one, those along a texel's edge would fall on the same side together.
+    # sheared lattice: on a regular one, all samples along a texel's edge would fall on the same side of it.
     height, width = (
         -np.diff(np.sin(latitude)).reshape(-1, rows, 1, 1),
         -np.diff(longitude).reshape(-1, columns),
@@ -335,7 +336,7 @@ def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.nda
             flux[c] += np.bincount(index, (radiance * area).ravel(), minlength=weight.size)
     mean = (flux / weight).reshape(-1, 6, size, size)
 
-    # Parts approximate the texels' areas; what that changes in the integral, per mille, is spread over the sphere.
+    # Parts approximate the texels' areas. The resulting change of the integral, about 0.1 %, is spread over the sphere.
     after = (mean * _solid_angle(np.linspace(-1, 1, size + 1))).sum((1, 2, 3))
     before = flux.sum(axis=1)
     scale = np.divide(before, after, out=np.ones_like(before), where=after != 0)
@@ -343,7 +344,7 @@ def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.nda
 
 
 def _solid_angle(edge: np.ndarray) -> np.ndarray:
-    """Solid angles of the rectangles on a face between some lines, the same ones for rows and columns."""
+    """Solid angles of the rectangles of a grid on a face, given its lines, which are the same for rows and columns."""
     corner = np.arctan2(edge[:, None] * edge, np.sqrt(1 + edge[:, None] ** 2 + edge**2))
     return np.diff(np.diff(corner, axis=0), axis=1)
 
@@ -356,8 +357,8 @@ def _subdivide(edge: np.ndarray, parts: int) -> np.ndarray:
 
 
 def _texel_index(latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
-    """Flat indices of the texels at some latitudes and longitudes, which are broadcast."""
-    # Around the horizon, a face spans a quarter turn and the column depends on the longitude alone.
+    """Flat indices of the texels at given latitudes and longitudes, which are broadcast."""
+    # On the four side faces, each spans a quarter turn and the column depends only on the longitude.
     turn = np.round(longitude / (np.pi / 2)).astype(int)
     offset = longitude - turn * (np.pi / 2)
     side = np.array([4, 0, 5, 1])[turn % 4]  # +z, +x, -z, -x

@@ -1,11 +1,11 @@
-"""Scenes made by formula whose surfaces light each other: two sides of chess, a room, a corner, a ring on a table.
+"""Procedural scenes with strong interreflection: two sides of chess, a room, a corner, a ring on a table.
 
-Light comes from afar, so each is open somewhere. Three rules keep light that is known at vertices clean: things that
-stand on others leave a gap; vertices are just outside the foot of a thing rather than beneath it, where they would
-spread its darkness over their triangles; and where regions meet in a groove it is round or slanted, since a vertex
-that lies in the plane of another region's faces would start its rays in them once the regions are relit apart.
+Light is distant, so each scene is open somewhere. Three rules avoid artifacts of lighting that is computed at vertices.
+First, objects that stand on others leave a gap. Second, vertices lie just outside of the foot of an object, not below
+it, where they would spread its shadow over their triangles. Third, grooves between regions are rounded or slanted: a
+vertex in the plane of another region's faces would start its rays inside of them when the regions are relit separately.
 
-Reference: Sun, Zhou, Chen, Lin, Shi, Guo 2007, section 5, has such scenes.
+Reference: Sun, Zhou, Chen, Lin, Shi, Guo 2007, section 5, shows such scenes.
 """
 
 import itertools
@@ -19,54 +19,55 @@ from jaxprt.scene import builtin
 from jaxprt.scene.mesh import Mesh, bounds, grid_face, join, split
 from jaxprt.scene.shapes import Part, assemble, curve, patch, sweep
 
-_CELL = 0.1  # Spacing of the room's vertices, by which floor and walls share those where they meet.
-_GAP = 0.003  # Between things in the room and on the table, about 5e-4 of the diagonals.
-_DIGITS = 9  # Places are rounded, so that the same place is the same number on every side.
-_CLEAR = 0.01  # By which things stop short of the lines of the grid.
-_ROUND = 0.01  # Radius between floor, walls and ceiling.
+_CELL = 0.1  # spacing of the room's vertices; floor and walls share vertices where they meet
+_GAP = 0.003  # gap between objects in the room and on the table, about 5e-4 of the diagonals
+_DIGITS = 9  # coordinates are rounded, so that equal positions are equal numbers
+_CLEAR = 0.01  # distance of objects from the lines of the grid
+_ROUND = 0.01  # radius of the rounding between floor, walls and ceiling
 _WALLS = np.array([[-2, 0, -2], [2, 2.5, 2]])
-_WINDOW = (0.8, -0.4), (2.1, 1.2)  # Lowest and highest (y, z), in the wall at -x.
-_REVEAL = 0.2  # Depth of the window.
-_RUG = (-1.3, -0.8), (1.3, 0.6)  # Lowest and highest (x, z).
-_PILE = 0.02  # Height of the rug, and width of its slanted hem.
+_WINDOW = (0.8, -0.4), (2.1, 1.2)  # lowest and highest (y, z), in the wall at -x
+_REVEAL = 0.2  # depth of the window
+_RUG = (-1.3, -0.8), (1.3, 0.6)  # lowest and highest (x, z)
+_PILE = 0.02  # height of the rug, and width of its slanted hem
 _VASE = [(0.042, 0), (0.062, 0.03), (0.105, 0.12), (0.085, 0.21), (0.045, 0.27), (0.058, 0.32)]
 _VASE_INSIDE = [(0.05, 0.32), (0.037, 0.27), (0.076, 0.205), (0.096, 0.12), (0.054, 0.035), (0, 0.02)]
 
-_CORNER_GAP = 5e-4  # Of the object's diagonal, as in `ground_plane`.
-_CORNER_ROUND = 5e-3  # Of the object's longest side: radius between floor and walls.
-_NEAR, _FAR = 0.3, 0.9  # From the object to the walls, and to the open edges of the floor, over its longest side.
-_ABOVE = 0.4  # Of the walls over the object's top, likewise.
+_CORNER_GAP = 5e-4  # gap below the object, relative to its diagonal, as in `ground_plane`
+_CORNER_ROUND = 5e-3  # radius of the rounding between floor and walls, relative to the object's longest side
+_NEAR, _FAR = 0.3, 0.9  # distances from the object to walls and to open edges, relative to its longest side
+_ABOVE = 0.4  # height of the walls above the object's top, relative to its longest side
 
-_RING = 0.93, 1.0, 0.5  # Inner and outer radius, height.
+_RING = 0.93, 1.0, 0.5  # inner and outer radius, height
 _RING_SECTORS, _RING_STEP = 96, 0.042
-_TABLE = 2.4, 0.12  # Radius and thickness.
-_SHELLS = 24, 18  # Circles of vertices inside the ring and around it.
+_TABLE = 2.4, 0.12  # radius and thickness
+_SHELLS = 24, 18  # circles of vertices inside of the ring and around it
 
-_Sides = Sequence[tuple[int, int]]  # Of a box: their axis, and 0 for its lower end or 1 for the higher.
+_Sides = Sequence[tuple[int, int]]  # sides of a box: axis, and 0 for the lower end or 1 for the higher
 
 
 def chess_sides() -> Mesh:
-    """The scene of `builtin.chess` with the pieces on the two sides of the board's diagonal apart.
+    """The scene of `builtin.chess`, with separate regions for the pieces on the two sides of the board's diagonal.
 
     Returns:
-        16,778 vertices in four regions: 0 one side's pieces (king, queen, bishop), 1 the other's (rook, two pawns),
-        2 the board's light squares, 3 the dark ones and its side.
+        A mesh of 16,778 vertices in four regions: 0 the pieces of one side (king, queen, bishop), 1 those of the other
+        side (rook, two pawns), 2 the light squares, 3 the dark squares and the side of the board.
     """
     pieces, light, dark = split(builtin.chess())
     x, _, z = np.asarray(pieces.position).T
-    side = jnp.asarray(z > x, jnp.int32)  # No piece stands on the diagonal.
+    side = jnp.asarray(z > x, jnp.int32)  # no piece stands on the diagonal
     return join([Mesh(pieces.position, pieces.face, pieces.normal, pieces.tangent, side), light, dark])
 
 
 def room() -> Mesh:
     """A furnished room, 4 x 4 and 2.5 high, open to +z, with a window in the wall at -x.
 
-    Floor, walls and ceiling are seen from inside only, but stop light from both sides. Their cells are
-    0.1 wide. The sun of `builtin.daylight` falls through the window on rug, table and sofa.
+    Floor, walls and ceiling are visible from inside only, but block light from both sides. Their cells are 0.1 wide.
+    The sun of `builtin.daylight` shines through the window onto rug, table and sofa.
 
     Returns:
-        14,364 vertices in twelve regions: 0 floor and 1 sofa, which are meant to change; 2 the wall with the window,
-        3 the back wall, 4 the wall at +x, 5 ceiling, 6 rug, 7 table, 8 lamp, 9 vase, 10 picture, 11 cushions.
+        A mesh of 14,364 vertices in twelve regions: 0 floor and 1 sofa, whose materials are meant to change; 2 the wall
+        with the window, 3 the back wall, 4 the wall at +x, 5 ceiling, 6 rug, 7 table, 8 lamp, 9 vase, 10 picture, 11
+        cushions.
     """
     floor, wall, back, right, ceiling = _shell(_WALLS, _ROUND, _CELL, ((1, 0), (0, 0), (2, 0), (0, 1), (1, 1)))
     rug, sofa, table = _rug(), _sofa(), _table()
@@ -79,17 +80,18 @@ def room() -> Mesh:
 
 
 def corner(mesh: Mesh, *, cells: int = 64) -> Mesh:
-    """An object in a corner: on a floor, before a wall at -z and one at +x.
+    """Places an object in a corner: on a floor, in front of a wall at -z and a wall at +x.
 
-    Floor and walls are scaled to the longest side of the object's bounds. The floor lies 5e-4 of the
-    object's diagonal below its lowest face, and extends further to -x and +z, where the corner is open.
+    Floor and walls are scaled to the longest side of the object's bounding box. The floor lies below the object's
+    lowest face, by 5e-4 of its diagonal. It extends farther to -x and +z, where the corner is open.
 
     Args:
-        mesh: The object; vertices without faces do not count for its bounds.
-        cells: Parts of the floor's longer edge; all cells have about this size.
+        mesh: The object. Vertices without faces do not count for its bounding box.
+        cells: Number of cells along the floor's longer edge. The cells of the walls have about the same size.
 
     Returns:
-        The object's vertices first, with all it had of regions as 0; 1 the floor, 2 the wall at -z, 3 the wall at +x.
+        A mesh with the object's vertices first. Its regions are 0 the object, 1 the floor, 2 the wall at -z and 3 the
+        wall at +x.
 
     Raises:
         ValueError: Fewer than 1 cell.
@@ -107,16 +109,18 @@ def corner(mesh: Mesh, *, cells: int = 64) -> Mesh:
 
 
 def ring(*, spacing: float = 1.0) -> Mesh:
-    """A metal ring that lies on a round table, on whose top its inside gathers light to a caustic.
+    """A metal ring on a round table. Its inside reflects light into a caustic on the table.
 
-    The ring's radius is 1 and its height 0.5, the table's radius 2.4. The top's vertices stand on
-    circles, none of them beneath the ring; inside it their spacing is 0.038.
+    The ring has a radius of 1 and a height of 0.5, the table a radius of 2.4. The vertices of the table's top lie on
+    circles, none of them below the ring. Inside of the ring their spacing is 0.038.
 
     Args:
-        spacing: Of the vertices, as a multiple of that.
+        spacing: Spacing of the vertices, relative to the default.
 
     Returns:
-        10,969 vertices in two regions: 0 the ring, closed, and 1 the table, its top and its side.
+        A mesh of 10,969 vertices in two regions: 0 the closed ring, and 1 the top and side of the table. Another
+            spacing
+        changes the number of vertices.
 
     Raises:
         ValueError: The spacing is not from 0.25 to 4.
@@ -127,7 +131,7 @@ def ring(*, spacing: float = 1.0) -> Mesh:
     profile = [(inner, _GAP), (outer, _GAP), (outer, _GAP + height), (inner, _GAP + height)]
     inside, around = (round(each / spacing) for each in _SHELLS)
     edge, thickness = _TABLE
-    growth = np.linspace(0, 1, around) ** 1.3  # Finest beside the ring.
+    growth = np.linspace(0, 1, around) ** 1.3  # finest beside the ring
     clear = outer + _CLEAR
     radius = [np.linspace(0, inner - _CLEAR, inside + 1), clear + (edge - clear) * growth]
     side, slope = curve([(edge, -thickness), (edge, 0)], step=thickness, turn=1.0)
@@ -136,14 +140,14 @@ def ring(*, spacing: float = 1.0) -> Mesh:
 
 
 def _reveal() -> list[Part]:
-    """The window's four sides."""
+    """The four sides of the window's reveal."""
     (y0, z0), (y1, z1) = _WINDOW
     inside = np.array([[_WALLS[0][0], y, z] for y, z in ((y0, z0), (y0, z1), (y1, z1), (y1, z0))])
     return _between(inside, inside - [_REVEAL, 0, 0])
 
 
 def _rug() -> list[Part]:
-    """The rug with its hem, whose rim shares its places with the floor's."""
+    """The rug with its hem, whose rim has the same positions as the floor's vertices."""
     (x0, z0), (x1, z1) = _RUG
     rim = np.array([[x0, 0, z1], [x1, 0, z1], [x1, 0, z0], [x0, 0, z0]])
     top = rim + _PILE * np.array([[1, 1, -1], [-1, 1, -1], [-1, 1, 1], [1, 1, 1]])
@@ -151,7 +155,7 @@ def _rug() -> list[Part]:
 
 
 def _sofa() -> list[Part]:
-    """Base, arms, back and two seats, against the back wall."""
+    """The sofa's base, arms, back and two seats, against the back wall."""
     inner = 0.9 - _CLEAR
     arms = [_block((x, _GAP, -1.89), (x + 0.2 - 2 * _CLEAR, 0.58, -1.01), 0.04) for x in (-1.09, 0.91)]
     seats = [_block((x, 0.263, -1.65), (x + inner - _GAP / 2, 0.45, -0.99), 0.05) for x in (-inner, _GAP / 2)]
@@ -186,7 +190,7 @@ def _table() -> list[Part]:
 
 
 def _lamp() -> list[Part]:
-    """A standing lamp of a foot with a pole, a bulb and a shade."""
+    """A floor lamp: a foot with a pole, a bulb and a shade."""
     pole = [[(0.13, 0), (0.13, 0.025)], [(0.13, 0.025), (0.018, 0.035)], [(0.018, 0.035), (0.018, 1.3)]]
     bulb = [(0.02, 1.31), (0.055, 1.36), (0.045, 1.41), (0, 1.44)]
     runs = [[(0.13, 0), (0, 0)][::-1], *pole, [(0.018, 1.3), (0, 1.3)], [(0, 1.31), (0.02, 1.31)], bulb]
@@ -195,13 +199,13 @@ def _lamp() -> list[Part]:
 
 
 def _vase() -> list[Part]:
-    """A vase, hollow, with a foot and a lip."""
+    """A hollow vase with a foot and a lip."""
     lip = [_VASE[-1], _VASE_INSIDE[0]]
     return [_turned(run, 32, step=0.025) for run in ([(0, 0), _VASE[0]], _VASE, lip, _VASE_INSIDE)]
 
 
 def _turned(control: list, sectors: int, *, step: float = 0.07) -> Part:
-    """A smooth run of a turned thing."""
+    """A smooth surface of revolution."""
     if control[0][0] == 0:
         point = np.array(control, float)
         return sweep(point, np.array([[1.0, 0], [1, 0]]), sectors=sectors)
@@ -209,20 +213,20 @@ def _turned(control: list, sectors: int, *, step: float = 0.07) -> Part:
 
 
 def _band(profile: list, sectors: int, step: float) -> list[Part]:
-    """A closed band of four corners turned about y, sharp at each; they run outward at the bottom."""
+    """A profile of four corners revolved about y, sharp at each corner. The corners run outward at the bottom."""
     around = itertools.pairwise([*profile, profile[0]])
     return [sweep(*curve(list(ends), step=step, turn=1.0), sectors=sectors) for ends in around]
 
 
 def _disk(radius: np.ndarray) -> Part:
-    """A disk that faces up, its vertices on circles about one in the middle, eight more on each.
+    """A disk that faces up. Its vertices lie on circles around one in the center, with eight more on each circle.
 
-    A square grid of which concentric squares have become circles: cells have about one size.
+    It is a square grid whose concentric squares have become circles, so all cells have about the same size.
     """
     count = len(radius) - 1
     z, x = np.meshgrid(*[np.arange(-count, count + 1)] * 2, indexing="ij")
     shell = np.maximum(np.abs(x), np.abs(z))
-    # Place along the square, 0 to 8 times its number from the middle of the side at +x to +z.
+    # Position along the square, from 0 to 8 times its index, starting at the center of the side at +x, towards +z.
     along = np.select([(x == shell) & (z > -shell), z == shell, x == -shell], [z, 2 * shell - x, 4 * shell - z])
     along = np.where((z == -shell) & (x > -shell), 6 * shell + x, along)
     turn = np.pi / 4 * along / np.maximum(shell, 1)
@@ -238,7 +242,7 @@ def _between(first: np.ndarray, second: np.ndarray) -> list[Part]:
 
 
 def _panel(corner: list) -> Part:
-    """A flat quadrangle of the room in its cells, in places that do not depend on which corner is named first."""
+    """A flat quadrilateral of the room, divided into cells. Positions do not depend on which corner comes first."""
     (a, b), (c, _) = np.array(corner, float)
     rows, columns = (max(1, round(float(np.linalg.norm(edge)) / _CELL)) for edge in (c - a, b - a))
     position, face, normal = patch(corner, rows=rows, columns=columns)
@@ -246,7 +250,7 @@ def _panel(corner: list) -> Part:
 
 
 def _without(part: Part, axes: tuple[int, int], low: tuple[float, float], high: tuple[float, float]) -> Part:
-    """A part less the faces in a rectangle across two axes."""
+    """A part without the faces inside of a rectangle in the plane of two axes."""
     position, face, normal = part
     middle = position[face].mean(1)[:, axes]
     used, face = np.unique(face[~((middle > low) & (middle < high)).all(1)], return_inverse=True)
@@ -254,7 +258,7 @@ def _without(part: Part, axes: tuple[int, int], low: tuple[float, float], high: 
 
 
 def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> Part:
-    """A closed box with rounded edges, smooth all around."""
+    """A closed box with rounded edges and smooth normals."""
     sides = _sides(np.array([low, high], float), np.full((2, 3), radius), step, list(np.ndindex(3, 2)))
     start = np.cumsum([0, *(len(position) for position, _, _ in sides)])
     position, face, normal = zip(*sides, strict=True)
@@ -264,7 +268,7 @@ def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> Pa
 
 
 def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[Part]:
-    """Some sides of a box that face inward; round where they meet, and straight elsewhere."""
+    """Some sides of a box, facing inward. Edges between them are rounded, other edges straight."""
     rounding = np.zeros((2, 3))
     for axis, end in sides:
         rounding[end, axis] = radius
@@ -273,7 +277,7 @@ def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[P
 
 
 def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> list[Part]:
-    """Sides of a box that face outward, with a line of vertices on both sides of the rounding at each end."""
+    """Some sides of a box, facing outward, with a line of vertices on both sides of the rounding at each end."""
     line = []
     for (a, b), (r, s) in zip(box.T, radius.T, strict=True):
         inner = np.linspace(a, b, max(1, round((b - a) / cell)) + 1)
@@ -293,6 +297,6 @@ def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> l
 
 
 def _moved(part: Part, place: tuple[float, float, float]) -> Part:
-    """A part shifted."""
+    """A translated part."""
     position, face, normal = part
     return position + np.array(place), face, normal

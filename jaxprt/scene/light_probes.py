@@ -1,4 +1,4 @@
-"""Harmonics of an environment: light probes as other tools have them, and irradiance."""
+"""Spherical harmonics of an environment: light probes in the conventions of other tools, and irradiance."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,33 +10,34 @@ from jaxprt.scene.environment import Environment
 from jaxprt.sphere import harmonics, lighting
 
 _DEGREE = 2
-_COSINE = (1.0, 2 / 3, 1 / 4)  # what a clamped cosine over pi leaves of each band: Ramamoorthi and Hanrahan 2001
+_COSINE = (1.0, 2 / 3, 1 / 4)  # factor of a clamped cosine over pi on each band: Ramamoorthi and Hanrahan 2001
 _MIRRORED = (3, 4, 7)  # harmonics that are odd in x
 TOOLS = ("three.js", "Filament", "Unity")
 
 
 def light_probe(environment: Environment, *, tool: str) -> Float[Array, "9 3"]:
-    """The first nine harmonics of a light, in the scaling and the axes of a tool: light for its diffuse materials.
+    """The first nine spherical harmonics of a light, in the scaling and axes of a tool, for its diffuse lighting.
 
-    With c the coefficients of the orthonormal basis, in the order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2:
+    Let c be the coefficients in the orthonormal basis, in the order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2. Then:
 
-    * "three.js": c, the coefficients of radiance. `new LightProbe(new SphericalHarmonics3().fromArray(probe.flat()))`;
-      its shaders multiply the bands by pi, 2 pi / 3 and pi / 4 for irradiance.
-    * "Filament": c times the clamped cosine over pi and times the factors of the basis, so that the sum of
-      coefficients times the bare polynomials above is irradiance over pi. `IndirectLight.Builder.irradiance(3, probe)`.
-    * "Unity": the same for `SphericalHarmonicsL2`, `probe[k, color]` for its `sh[color, k]`. Unity's axes are
-      left-handed: its x is our -x, as importers of glTF have it.
+    * "three.js" gets c, the coefficients of radiance: `new LightProbe(new
+    SphericalHarmonics3().fromArray(probe.flat()))`.
+      Its shaders multiply the bands by pi, 2 pi / 3 and pi / 4 for irradiance.
+    * "Filament" gets c times the factors of the clamped cosine over pi and of the basis. The sum of coefficients times
+      the bare polynomials above is then irradiance over pi: `IndirectLight.Builder.irradiance(3, probe)`.
+    * "Unity" gets the same for `SphericalHarmonicsL2`, with `probe[k, color]` for its `sh[color, k]`. Unity's axes are
+      left-handed: its x is our -x, the convention of glTF importers.
 
     Args:
         environment: One light.
         tool: "three.js", "Filament" or "Unity".
 
     Returns:
-        Coefficients of each color, in the radiance's units; nothing is clamped.
+        Coefficients of each color, in the units of the radiance. Nothing is clamped.
 
     Raises:
-        TypeError: The light is no Environment.
-        ValueError: It is a batch of lights, or there is no such tool.
+        TypeError: `environment` is not an `Environment`.
+        ValueError: `environment` is a batch of lights, or the tool is unknown.
 
     Reference: three.js r187, src/math/SphericalHarmonics3.js; Filament, IndirectLight.h and
     shaders/src/surface_light_indirect.fs; Unity's core render pipeline library, EntityLighting.hlsl; Ramamoorthi and
@@ -59,23 +60,24 @@ def light_probe(environment: Environment, *, tool: str) -> Float[Array, "9 3"]:
 
 
 def irradiance(environment: Environment, normal: ArrayLike, *, degree: int = 8) -> Float[Array, "... c"]:
-    """Irradiance of surfaces under an environment by their normals, without shadows and without a table.
+    """Irradiance of an environment for given surface normals, without shadows.
 
-    By the harmonics of the light. Degree 2, nine coefficients, is what is usual; higher degrees cost little.
+    It is computed from the light's spherical harmonics. Degree 2 (nine coefficients) is usual; higher degrees cost
+    little.
 
     Args:
         environment: One light.
-        normal: Unit normals in the world.
-        degree: The largest l.
+        normal: Unit normals in world coordinates.
+        degree: Largest degree l of the harmonics.
 
     Returns:
-        Irradiance in the radiance's units times sr; it can be slightly negative where a small sun rings.
-        Differentiable in light and normals.
+        Irradiance in the units of the radiance times sr. It may be slightly negative because of ringing around a small
+        sun. It is differentiable in the light and the normals.
 
     Raises:
-        TypeError: The light is no Environment.
-        ValueError: It is a batch of lights or not finite, normals are not [.., 3] or not finite, or the degree is
-            negative.
+        TypeError: `environment` is not an `Environment`.
+        ValueError: `environment` is a batch of lights or not finite, normals are not [.., 3] or not finite, or the
+            degree is negative.
 
     Reference: Ramamoorthi and Hanrahan 2001, "An efficient representation for irradiance environment maps".
     """

@@ -1,4 +1,4 @@
-"""A few directions that stand for distant light, denser where it is brighter."""
+"""Sampling of distant light by a small number of directions."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,17 +10,17 @@ from jaxprt import require
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap, harmonics
 
-_LEVELS = 12  # of the curve inside of a texel
+_LEVELS = 12  # levels of the space-filling curve inside of a texel
 
 
 class LightSamples(NamedTuple):
-    """Directions, and what light from there counts.
+    """Directions that sample lights, and their weights.
 
     The sum over directions of weight times visibility times cosine is the radiance of a white diffuse surface.
 
     Attributes:
-        direction: Unit directions in the world.
-        weight: Radiance times solid angle over pi, for each light and color; 0 in the directions of other lights.
+        direction: Unit directions in world coordinates.
+        weight: Radiance times solid angle over pi, for each light and color; 0 for directions that sample other lights.
     """
 
     direction: Float32[np.ndarray, "d 3"]
@@ -28,20 +28,20 @@ class LightSamples(NamedTuple):
 
 
 def importance(environments: Sequence[Environment], *, count: int) -> LightSamples:
-    """Samples lights in proportion to the power of their texels, the same number of directions for each.
+    """Samples lights in proportion to the power of their texels, with the same number of directions for each light.
 
-    Directions lie at equal steps of the power along a space-filling curve through all texels, which goes on inside of
-    each texel: those of a sun, which get many, have them spread over their area.
+    Directions are at equal steps of power along a space-filling curve through all texels. The curve continues inside of
+    each texel, so the many directions of a texel with a sun are spread over its area.
 
     Args:
         environments: One or more lights, each with any size and number of colors.
-        count: Directions for each.
+        count: Number of directions for each light.
 
     Returns:
-        The samples. Where a light has fewer colors than another, its weights of the others are 0.
+        The samples. If a light has fewer colors than another, its weights for the missing colors are 0.
 
     Raises:
-        TypeError: There is no list of lights.
+        TypeError: `environments` is not a sequence of lights.
         ValueError: There are no lights, one is a batch, or the count is below 1.
     """
     if not isinstance(environments, Sequence):
@@ -63,14 +63,14 @@ def importance(environments: Sequence[Environment], *, count: int) -> LightSampl
 
 
 def natural(*, size: int, degree: int) -> LightSamples:
-    """Light of natural spectrum from unknown directions, in the middle of each texel of a cubemap.
+    """Samples that represent the average over lights with a natural spectrum and unknown orientation.
 
-    There is one light, whose colors are spherical harmonics. The sum of the squares of what a surface makes of them
-    is the mean, over all such lights, of the square of its radiance.
+    There is one direction per cubemap texel, and one light whose colors are weighted spherical harmonics. The sum over
+    colors of a surface's squared radiance equals the mean of its squared radiance over all such lights.
 
     Args:
         size: Texels along the edge of a face.
-        degree: The highest degree of the harmonics.
+        degree: Highest degree of the harmonics.
 
     Raises:
         ValueError: The size is below 1, or the degree is negative.
@@ -84,7 +84,7 @@ def natural(*, size: int, degree: int) -> LightSamples:
 
 
 def _sampled(radiance: np.ndarray, count: int) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d c"]]:
-    """Directions to one light, and their weights."""
+    """Directions that sample one light, and their weights."""
     size = radiance.shape[1]
     order = _curve(size)
     texel = radiance.reshape(-1, radiance.shape[-1])[order]
@@ -101,14 +101,14 @@ def _sampled(radiance: np.ndarray, count: int) -> tuple[Float[np.ndarray, "d 3"]
     s, t = 2 * (np.stack([column, row]) + inside) / size - 1
     point = np.einsum("da,dac->dc", np.stack([s, t, np.ones(count)], -1), cubemap.axes()[face])
     length = np.linalg.norm(point, axis=1, keepdims=True)
-    # Points are even on the texel; the solid angle around each is not.
+    # Points are uniform in texel coordinates; the solid angle around each point is not.
     solid = (2 / size) ** 2 / length**3
     weight = texel[at] * solid * (total[-1] / count / power[at] / np.pi)[:, None]
     return point / length, weight
 
 
 def _curve(size: int) -> Int[np.ndarray, " d"]:
-    """Numbers of the texels in the order of Lebesgue's curve on each face: neighbors come close to each other."""
+    """Texel indices along the Lebesgue (Z-order) curve on each face, which keeps neighbors close to each other."""
     row, column = np.divmod(np.arange(size**2), size)
     bits = range(size.bit_length())
     code = sum(((row >> bit & 1) << 2 * bit + 1) | ((column >> bit & 1) << 2 * bit) for bit in bits)
@@ -117,7 +117,7 @@ def _curve(size: int) -> Int[np.ndarray, " d"]:
 
 
 def _on_curve(fraction: Float[np.ndarray, " d"]) -> Float[np.ndarray, "2 d"]:
-    """Column and row in a texel, from 0 to 1, where so much of the curve's continuation inside of it is passed."""
+    """Column and row within a texel, from 0 to 1, at a fraction of the curve's length inside of the texel."""
     place = np.full((2, len(fraction)), 0.5**_LEVELS / 2)
     for level in range(1, _LEVELS + 1):
         quarter = np.clip(np.floor(4 * fraction), 0, 3)

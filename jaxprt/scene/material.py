@@ -1,4 +1,4 @@
-"""Metallic-roughness materials with textures, and their parameters at points of a surface."""
+"""Metallic-roughness materials with textures, and their evaluation at surface points."""
 
 import equinox as eqx
 import jax
@@ -18,23 +18,23 @@ def _scalar(value) -> Array:
 
 
 def _color(value) -> Array:
-    """A number or a color as an array [3]."""
+    """A number or a color as an array of shape [3]."""
     value = jnp.asarray(value, jnp.result_type(float))
     return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
 
 
 class Texture(eqx.Module):
-    """An image on a surface.
+    """A texture: an image, and how texture coordinates map to it.
 
     Attributes:
         image: Linear values, first row on top.
-        transform: Affine transform from texture coordinates (u, v, 1), v up, to places in the image.
-        set: Which of the mesh's two sets of texture coordinates it takes, 0 or 1.
-        wrap: What lies beyond the image's edges along u and along v: see ``texture.WRAPS``.
-        mipmap: The image's mip map, from `mipmapped`; None where it is made anew for each picture.
+        transform: Affine transform from texture coordinates (u, v, 1), v up, to coordinates in the image.
+        set: Index of the mesh's set of texture coordinates that it uses, 0 or 1.
+        wrap: Wrap mode along u and along v, each one of ``texture.WRAPS``.
+        mipmap: The image's mip map, from `mipmapped`; if None, it is computed for each picture.
 
     Raises:
-        ValueError: The image or the transform is not finite, or there is no such set or wrap mode.
+        ValueError: The image or the transform is not finite, or the set or wrap mode does not exist.
     """
 
     image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
@@ -56,12 +56,12 @@ class Texture(eqx.Module):
     def at(
         self, *coordinates: Float[Array, "*b 2"], slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None
     ) -> Float[Array, "*b c"]:
-        """Values of the image, given all sets of texture coordinates.
+        """Looks up the image, given all sets of texture coordinates.
 
         Args:
-            coordinates: Places in each set.
-            slopes: Change of each from one pixel to the next, to the right and down: the image is then averaged over
-                the pixels.
+            coordinates: Texture coordinates in each set.
+            slopes: For each set, the change of the coordinates from one pixel to the next, to the right and down. The
+                image is then averaged over the footprint of each pixel.
         """
         turn = self.transform[:, :2]
         moved = jnp.einsum("ij,...j->...i", turn, coordinates[self.set], precision="highest") + self.transform[:, 2]
@@ -71,26 +71,26 @@ class Texture(eqx.Module):
         return mipmap.lookup(self.mipmapped().mipmap, moved, slope, wrap=self.wrap)
 
     def mipmapped(self) -> "Texture":
-        """The same with its mip map."""
+        """The texture together with its mip map."""
         if self.mipmap is not None:
             return self
         return eqx.tree_at(lambda each: each.mipmap, self, mipmap.make(self.image), is_leaf=lambda each: each is None)
 
 
 class Surface(eqx.Module):
-    """Parameters of a material at points, in the local frame (tangent, bitangent, normal) of each.
+    """Material parameters at surface points, in the local frame (tangent, bitangent, normal) of each point.
 
     Attributes:
-        base_color: Linear color: the albedo of a dielectric, the reflectance at normal incidence of a metal.
-        metallic: 0 for a dielectric to 1 for a metal.
-        roughness: Perceptual roughness; its square is the microfacet distribution's alpha.
+        base_color: Linear color: the albedo of a dielectric, or the reflectance of a metal at normal incidence.
+        metallic: From 0 for a dielectric to 1 for a metal.
+        roughness: Perceptual roughness; its square is alpha of the microfacet distribution.
         emissive: Radiance that the surface emits.
         ior: Index of refraction of the dielectric; 0 stands for a reflectance of 1 at normal incidence.
         specular: Weight of the dielectric's specular reflection.
         specular_color: Color of the dielectric's reflectance at normal incidence.
-        anisotropy: Strength, from 0 to 1.
-        direction: Unit vector (along tangent, along bitangent) in which highlights are stretched.
-        normal: Unit normal of the normal map.
+        anisotropy: Strength of the anisotropy, from 0 to 1.
+        direction: Unit vector (tangent, bitangent component) along which highlights are stretched.
+        normal: Unit normal from the normal map.
     """
 
     base_color: Float[Array, "*b 3"]
@@ -108,28 +108,29 @@ class Surface(eqx.Module):
 class TexturedMaterial(eqx.Module):
     """The metallic-roughness material of glTF 2.0: factors, and textures that multiply them.
 
-    Factors are leaves with the defaults of the specification: a white, rough metal. Gray factors may be numbers where
-    colors are wanted. A texture that the material does not have is None. Parameters mean what `Surface` says.
+    Factors are pytree leaves with the defaults of the specification: a white, rough metal. A gray color may be given as
+    one number. Missing textures are None. `Surface` explains the parameters.
 
     Attributes:
         base_color: Linear color, from 0 to 1.
-        metallic: From 0 to 1.
-        roughness: From 0 to 1.
-        emissive: Radiance; KHR_materials_emissive_strength is multiplied in.
-        ior: Index of refraction, at least 1, or 0; KHR_materials_ior.
-        specular: From 0 to 1; KHR_materials_specular.
-        specular_color: Linear color.
-        anisotropy: Strength, from 0 to 1; KHR_materials_anisotropy.
-        rotation: Angle of the anisotropy's direction from the tangent to the bitangent, in radians.
+        metallic: Fraction of metal, from 0 to 1.
+        roughness: Perceptual roughness, from 0 to 1.
+        emissive: Emitted radiance, including the factor of KHR_materials_emissive_strength.
+        ior: Index of refraction, at least 1, or 0; see KHR_materials_ior.
+        specular: Weight of the specular reflection, from 0 to 1; see KHR_materials_specular.
+        specular_color: Linear color of the specular reflection.
+        anisotropy: Strength of the anisotropy, from 0 to 1; see KHR_materials_anisotropy.
+        rotation: Angle from the tangent towards the bitangent of the anisotropy's direction, in radians.
         normal_scale: Factor on the slopes of the normal map.
-        base_color_texture: [h w 3].
-        metallic_texture: [h w 1].
-        roughness_texture: [h w 1].
-        emissive_texture: [h w 3].
-        specular_texture: [h w 1].
-        specular_color_texture: [h w 3].
-        anisotropy_texture: [h w 3]: direction in the first two channels, as (direction + 1) / 2, and strength.
-        normal_texture: [h w 3]: (normal + 1) / 2 in the frame of tangent, bitangent and normal.
+        base_color_texture: Texture [h w 3] that multiplies the base color.
+        metallic_texture: Texture [h w 1] that multiplies `metallic`.
+        roughness_texture: Texture [h w 1] that multiplies `roughness`.
+        emissive_texture: Texture [h w 3] that multiplies `emissive`.
+        specular_texture: Texture [h w 1] that multiplies `specular`.
+        specular_color_texture: Texture [h w 3] that multiplies the specular color.
+        anisotropy_texture: Texture [h w 3] with the direction, as (direction + 1) / 2, in the first two channels, and
+            a factor on the strength in the third.
+        normal_texture: Normal map [h w 3], as (normal + 1) / 2 in the frame of tangent, bitangent and normal.
 
     Raises:
         TypeError: A texture is an array, not a `Texture`.
@@ -173,13 +174,13 @@ class TexturedMaterial(eqx.Module):
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 
     def mipmapped(self) -> "TexturedMaterial":
-        """The same with mip maps of all its textures: what pictures would else make anew each time."""
+        """The material with mip maps of all its textures, so that pictures need not compute them each time."""
         is_texture = lambda each: isinstance(each, Texture)  # noqa: E731
         return jax.tree.map(lambda each: each.mipmapped() if is_texture(each) else each, self, is_leaf=is_texture)
 
     @property
     def textures(self) -> tuple[Texture, ...]:
-        """The textures that it has."""
+        """All textures of the material."""
         return tuple(each for each in vars(self).values() if isinstance(each, Texture))
 
     @jit
@@ -192,23 +193,22 @@ class TexturedMaterial(eqx.Module):
         handedness: Float[Array, "*b"] | None = None,
         slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None,
     ) -> Surface:
-        """Parameters at points: vertices of a mesh, or points of a picture.
+        """Evaluates the material at points: vertices of a mesh, or shading points of a picture.
 
-        Differentiable in the factors, the images and, within texels, the coordinates. Gradients are finite where a
-        normal map or a direction of anisotropy is zero; the normal is then that of the surface, the direction the
-        tangent.
+        The result is differentiable in the factors, the images and, within texels, the coordinates. If a normal map or
+        a direction of anisotropy is zero, the normal of the surface or the tangent is used, and gradients are finite.
 
         Args:
-            coordinate: Texture coordinates, v up: `Mesh.texture`.
-            second: Second texture coordinates, for textures that take these; the first ones where it is None.
+            coordinate: Texture coordinates with v up, as in `Mesh.texture`.
+            second: Second set of texture coordinates; the first set if None.
             color: Colors that multiply the base color.
-            handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite;
-                1 everywhere where it is None. Results are in the right-handed frame.
-            slopes: Change of both coordinates from one pixel to the next, over which textures are then averaged: see
-                `Texture.at`.
+            handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; 1
+                everywhere if None. Results are in the right-handed frame.
+            slopes: For both sets, the change of the coordinates from one pixel to the next, to the right and down.
+                Textures are then averaged over the footprint of each pixel.
 
         Returns:
-            The parameters.
+            The material parameters at the points.
         """
         places = (coordinate, coordinate if second is None else second)
         batch = coordinate.shape[:-1]
@@ -254,13 +254,13 @@ class TexturedMaterial(eqx.Module):
             up = jnp.asarray([0, 0, 1], self.normal_scale.dtype)
             return jnp.broadcast_to(up, (*places[0].shape[:-1], 3))
         slope = 2 * self.normal_texture.at(*places, slopes=slopes) - 1
-        # Last axis first, since the normal is what takes the place of zero.
+        # The last axis comes first, because `_unit` replaces zero by the first axis, here the normal.
         scaled = jnp.stack([slope[..., 2], slope[..., 0] * self.normal_scale, slope[..., 1] * self.normal_scale], -1)
         return jnp.roll(_unit(scaled), -1, -1)
 
 
 def _unit(vector: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
-    """Vectors at unit length; the first axis, with zero gradient, for those that are zero."""
+    """Vectors scaled to unit length. Zero vectors become the first axis, with zero gradient."""
     square = jnp.sum(vector**2, -1, keepdims=True)
     zero = square < jnp.finfo(vector.dtype).tiny
     first = jnp.zeros_like(vector).at[..., 0].set(1)

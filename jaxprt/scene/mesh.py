@@ -1,4 +1,4 @@
-"""Triangle meshes: the type, making them from files and arrays, joining and splitting, the ground beneath."""
+"""Triangle meshes: construction from files and arrays, joining, splitting, rotation, and a ground plane."""
 
 import pathlib
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry
 from jaxprt.sphere import directions
 
-_CREASE = np.cos(np.radians(40))  # Split vertices share a normal where each alone is as near to it as this.
-_GAP = 5e-4  # Of the diagonal, between a mesh and the ground: more than rays start off a surface.
+_CREASE = np.cos(np.radians(40))  # smallest cosine between a shared normal and that of each split vertex
+_GAP = 5e-4  # gap above the ground, relative to the diagonal; larger than the offset of ray origins
 _BLOCK = 8192
-_ORTHOGONAL = 1e-4  # What rounding may do to R R^T of a rotation made in float32.
-_DENSE = 0.4  # Spacing of the ground's vertices in its center, over that of a uniform grid.
+_ORTHOGONAL = 1e-4  # rounding error of R R^T for a float32 rotation
+_DENSE = 0.4  # spacing of the ground's vertices at its center, relative to that of a uniform grid
 
 
 class Mesh(eqx.Module):
@@ -26,11 +26,12 @@ class Mesh(eqx.Module):
 
     Attributes:
         position: Vertex positions in world units.
-        face: Vertex indices of each triangle; counter-clockwise seen from the front.
+        face: Vertex indices of each triangle, counterclockwise as seen from the front.
         normal: Unit shading normals.
         tangent: Unit tangents, orthogonal to the normals.
-        region: Number of the material region that each vertex belongs to, from 0.
-        texture: Coordinates of each vertex in images, as `texture.lookup` takes them; None where there are none.
+        region: Index of the material region that each vertex belongs to, from 0.
+        texture: Texture coordinates (u, v) of each vertex, with (0, 0) at the lower left corner of the image; None if
+            there are none.
     """
 
     position: Float[Array, "v 3"]
@@ -42,38 +43,39 @@ class Mesh(eqx.Module):
 
 
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
-    """Loads a PLY, OBJ, STL, OFF, GLB or glTF file.
+    """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
 
-    Vertices and faces keep the file's order; nothing is merged. Polygons become fans of triangles. Where an OBJ's
-    corners differ in normal or texture coordinates, a vertex is split. All meshes of a glTF's default scene are
-    placed by their nodes and joined; its tangents are kept. Materials and images are not read: `load_scene` reads
-    them. Texture coordinates are read, and are 0 where only some geometries of the file have them or they are not
-    finite. All faces of an OBJ's material or group must have them. Where an OBJ's faces name texture coordinates that
-    the file does not have, its material is loaded without them, with a warning.
+    Vertices and faces keep the order of the file, and no vertices are merged. Polygons are divided into fans of
+    triangles. An OBJ vertex is split where its corners differ in normal or texture coordinates. All meshes of a glTF
+    file's default scene are transformed by their nodes and joined, and its tangents are kept. Texture coordinates are 0
+    where only some geometries of the file have them or they are not finite. All faces of an OBJ material or group must
+    have them; if they refer to texture coordinates that do not exist, the material is loaded without them, with a
+    warning.
 
-    Normals are the file's. Where they are absent, zero or NaN they are the mean of the faces around weighted
-    by their angles, also across vertices split at a seam, up to creases of some 80 degrees. STL has neither
-    shared vertices nor creases: its vertices have the normals of their faces, flat.
+    Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
+    weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
+    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces.
 
     Args:
         path: The file.
-        groups: Number the regions by an OBJ's objects and groups or a glTF's nodes, instead of by material.
+        groups: Whether regions are the objects and groups of an OBJ file or the nodes of a glTF file, instead of
+            materials.
 
     Returns:
-        The mesh; an OBJ's regions are numbered in the order of their first appearance, a glTF's in the order of its
-        materials, those without material last, or with `groups` in the order of its nodes.
+        The mesh. The regions of an OBJ file are numbered by first appearance. Those of a glTF file are in the order of
+        its materials, with parts without material last, or with `groups` in the order of its nodes.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is of no known kind, damaged or empty, has positions that are not finite, or faces that
-            name missing vertices. An OBJ that was cut off between two faces cannot be told from a whole one.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, or faces that
+            refer to missing vertices. An OBJ file truncated between two faces cannot be detected.
     """
     path = pathlib.Path(path)
     return from_file(mesh_file.read(path, groups=groups), path)
 
 
 def from_file(geometry: Geometry, path: pathlib.Path) -> Mesh:
-    """The mesh of what was read from a file, with normals and checks as in `load_mesh`."""
+    """A mesh from the geometry of a file, with the normals and checks of `load_mesh`."""
     position, face, normal, tangent, _, texture, _, _, region = geometry
     welded = path.suffix.lower() != ".stl"
     return _make(position, face, normal, tangent, region, texture, name=str(path), welded=welded)
@@ -89,38 +91,39 @@ def make_mesh(
     texture: Float[ArrayLike, "v 2"] | None = None,
     name: str = "mesh",
 ) -> Mesh:
-    """Makes a mesh of arrays in memory, with the checks of ``load_mesh``.
+    """Makes a mesh from arrays in memory, with the checks of ``load_mesh``.
 
     Args:
-        position: Vertex positions.
-        face: Vertex indices of each triangle; counter-clockwise seen from the front.
-        normal: Normals of any length. Those that are zero or NaN, and all where it is None, are the mean of the faces
-            around weighted by their angles: split a vertex to have a crease. Where faces cancel, one
-            of them is taken; a vertex without faces gets +y.
-        tangent: Tangents of any length, made orthogonal to the normals; ``directions.tangent`` where it is None,
-            and for those that are zero, NaN or parallel to the normal.
-        region: Numbers from 0; None makes all 0.
-        texture: Coordinates in images, (0, 0) for the lower left corner and (1, 1) for the upper right one.
-        name: What to call the mesh in messages.
+        position: Vertex positions in world units.
+        face: Vertex indices of each triangle, counterclockwise as seen from the front.
+        normal: Normals of any length. Normals that are zero or NaN, and all if None, become means of the adjacent face
+            normals, weighted by angle. For a crease, split the vertex. If the face normals cancel, one of them is used;
+            a vertex without faces gets +y.
+        tangent: Tangents of any length; they are made orthogonal to the normals. If None, and for tangents that are
+            zero, NaN or parallel to the normal, ``directions.tangent`` is used.
+        region: Index of each vertex's region, from 0; None makes all 0.
+        texture: Texture coordinates, (0, 0) at the lower left corner of the image and (1, 1) at the upper right one.
+        name: Name of the mesh in error messages.
 
     Returns:
         The mesh, in float32 and int32.
 
     Raises:
-        ValueError: An array has another shape or kind of number, there are no vertices or faces, a position or texture
-            coordinate is not finite, a face names a missing vertex, or a region is negative.
+        ValueError: An array has a wrong shape or type, there are no vertices or faces, a position or texture coordinate
+            is not finite, a face refers to a missing vertex, or a region is negative.
     """
     return _make(position, face, normal, tangent, region, texture, name=name, welded=False)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Puts meshes into one, with regions renumbered in order: 0 ... of the first, then those of the next.
+    """Joins meshes into one. Regions are renumbered consecutively, mesh by mesh.
 
     Args:
-        meshes: One or more; the numbers of their regions may have gaps.
+        meshes: One or more meshes. The indices of their regions may have gaps.
 
     Returns:
-        A mesh that ``split`` takes apart again. Where some have texture coordinates, those of others are (0, 0).
+        The joined mesh; ``split`` takes it apart again. If only some meshes have texture coordinates, those of the
+        others are (0, 0).
 
     Raises:
         ValueError: There are no meshes.
@@ -135,7 +138,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
         face.append(np.asarray(mesh.face) + first_vertex)
         first_region += len(used)
         first_vertex += len(mesh.position)
-    # In NumPy, so that new shapes do not compile; likewise below.
+    # NumPy, here and below, so that new shapes do not cause compilation.
     position, normal, tangent = (
         jax.device_put(np.concatenate([getattr(mesh, field) for mesh in meshes]))
         for field in ("position", "normal", "tangent")
@@ -149,7 +152,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def split(mesh: Mesh) -> list[Mesh]:
-    """Takes a mesh apart into its regions, in ascending order; each becomes region 0 of a mesh of its own.
+    """Splits a mesh into one mesh per region, in ascending order. Each part becomes region 0 of its mesh.
 
     Raises:
         ValueError: The corners of a face are in different regions. Duplicate such vertices first.
@@ -178,10 +181,10 @@ def split(mesh: Mesh) -> list[Mesh]:
 
 
 def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
-    """The mesh turned by a rotation about the origin, frames and all.
+    """Rotates a mesh about the origin: positions, normals and tangents.
 
     Raises:
-        ValueError: The matrix is no proper rotation: it mirrors, scales or shears.
+        ValueError: The matrix is not a proper rotation: it mirrors, scales or shears.
     """
     matrix = np.asarray(rotation, np.float64)
     same = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL)
@@ -195,17 +198,17 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
 
 
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
-    """The mesh brushed along a direction: its tangents are that direction, projected to every tangent plane.
+    """Sets the tangents of a mesh to a direction of brushing, projected to the tangent plane of each vertex.
 
-    Where it is parallel to the normal, the normal's own tangent of `sphere.directions` takes its place.
+    Where the direction is parallel to the normal, the default tangent of `sphere.directions` is used instead.
 
     Args:
         mesh: The mesh.
-        direction: In the world, of any length: one, or one for each vertex, as of `texture.dpdu`. Of the latter zeros
-            count as parallel to the normal.
+        direction: Direction in world coordinates, of any length. Either one for all vertices, or one for each vertex,
+            such as the result of `texture.dpdu`. A zero direction of a single vertex counts as parallel to the normal.
 
     Raises:
-        ValueError: The direction is zero, or not three finite numbers; or those of vertices are not.
+        ValueError: The common direction is zero, or a direction is not three finite numbers.
 
     Reference: Kautz, Sloan, Snyder 2002, section 6.
     """
@@ -220,15 +223,16 @@ def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
 
 
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
-    """A square grid of ground for a mesh to stand on, centered under it.
+    """A square ground plane centered under a mesh.
 
-    It lies 5e-4 of the mesh's diagonal below the lowest face. Vertices are 2.5 times as dense in the center as
-    a uniform grid's, and half as dense at the edge, since shadows are finest where the mesh touches down.
+    It lies below the lowest face by 5e-4 of the mesh's diagonal. Compared with a uniform grid, vertices are 2.5 times
+    as dense at the center and half as dense at the edge, because shadows are sharpest where the mesh touches the
+    ground.
 
     Args:
-        mesh: What stands on it; vertices without faces do not count.
-        vertices: About how many; the nearest square number of at least 4 is taken.
-        extent: Side of the square over the longer horizontal side of the mesh.
+        mesh: The mesh that stands on the ground. Vertices without faces do not count.
+        vertices: Approximate number of vertices. The nearest square number of at least 4 is used.
+        extent: Side of the square, relative to the longer horizontal side of the mesh.
 
     Returns:
         A mesh of one region with normals +y.
@@ -253,20 +257,20 @@ def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> M
 
 
 def bounds(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Lowest and highest coordinates of the faces, in float64; vertices without faces do not count."""
+    """Lowest and highest coordinates of the bounding box, in float64. Vertices without faces do not count."""
     corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)].reshape(-1, 3)
     return corner.min(0), corner.max(0)
 
 
 def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
-    """Triangles between rows of vertices; their front is where (next row) x (next column) points."""
+    """Triangles of a grid of vertices. The front is the side to which (next row) x (next column) points."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
     return (corner + np.array([0, columns, columns + 1, 0, columns + 1, 1])).reshape(-1, 3)
 
 
 def _make(position, face, normal, tangent, region, texture, *, name: str, welded: bool) -> Mesh:
     position = _array(position, "position", (None, 3), name)
-    with np.errstate(over="ignore"):  # What overflows float32 is reported below.
+    with np.errstate(over="ignore"):  # overflow of float32 is reported below
         position = position.astype(np.float32)
     count = len(position)
     face = _array(face, "face", (None, 3), name, whole=True)
@@ -289,7 +293,7 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
 
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
-    """A field as an array, of the shape that it must have; None is any number."""
+    """A field as an array, checked for its shape. None in `shape` stands for any size."""
     array = np.asarray(value)
     fits = array.ndim == len(shape) and all(must in (None, n) for must, n in zip(shape, array.shape, strict=True))
     kinds = (jnp.integer,) if whole else (jnp.integer, jnp.floating)
@@ -331,7 +335,7 @@ def _check(position: np.ndarray, face: np.ndarray, region: np.ndarray, name: str
 
 
 def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
-    """Unit normals and tangents, in blocks of one shape so that not every mesh compiles anew."""
+    """Unit normals and tangents, computed in blocks of one shape so that new meshes do not cause compilation."""
     count = len(normal)
     pad = ((0, -count % _BLOCK), (0, 0))
     normal, tangent = (np.pad(field.astype(np.float32), pad).reshape(-1, _BLOCK, 3) for field in (normal, tangent))
@@ -341,12 +345,12 @@ def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
 
 
 def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.ndarray:
-    """Unit normals: means of face normals weighted by their angles at the vertex."""
+    """Unit normals: means of face normals, weighted by their angles at the vertex."""
     corner = position[face]
     edge = np.roll(corner, -1, 1) - corner
     cross = np.cross(edge[:, 0], edge[:, 1])
     area = np.linalg.norm(cross, axis=1)
-    # A face thinner than what float32 tells apart has a direction by rounding alone.
+    # The normal of a face thinner than the resolution of float32 is only rounding error.
     thickness = 2 * np.spacing(np.abs(corner).max((1, 2)).astype(np.float32)).astype(np.float64)
     thin = area <= thickness * np.linalg.norm(edge, axis=2).max(1)
     unit = cross / np.where(area > 0, area, 1)[:, None]
@@ -365,7 +369,7 @@ def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.n
         shared = mean(place.reshape(-1)[vertex], place.max() + 1)[place.reshape(-1)]
         smooth = (shared * normal).sum(1, keepdims=True) > _CREASE
         normal = np.where(smooth, shared, normal)
-    # Where faces cancel any of them will do, thin ones last.
+    # Where face normals cancel, any of them is used, thin faces last.
     order = np.argsort(~thin, kind="stable")
     some = np.tile([0.0, 1.0, 0.0], (len(position), 1))
     order = order[area[order] > 0]
@@ -374,7 +378,7 @@ def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.n
 
 
 def areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
-    """A third of the area of the triangles around each vertex: weights by which means over vertices are over area."""
+    """A third of the area of the triangles around each vertex: weights for means over the surface."""
     face = np.asarray(mesh.face)
     corner = np.asarray(mesh.position, np.float64)[face]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2

@@ -1,4 +1,4 @@
-"""Mip maps: textures averaged over the footprints of pixels."""
+"""Mip maps: texture lookups that average over the footprints of pixels."""
 
 import functools
 import math
@@ -12,15 +12,15 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit
 from jaxprt.scene import texture
 
-_PROBES = 4  # along a footprint that is longer than wide
-_LONG = 1.5  # times its width, from where one probe does not do
+_PROBES = 4  # probes along an elongated footprint
+_LONG = 1.5  # ratio of length to width above which one probe is not enough
 
 
 class Mipmap(eqx.Module):
-    """An image at its own resolution, at half of it, and so on down to one texel.
+    """A pyramid of an image: its full resolution, half of that, and so on down to one texel.
 
     Attributes:
-        texel: Those of all levels, row by row, the finest first.
+        texel: Texels of all levels, row by row, the finest level first.
         shape: Height and width of each level.
     """
 
@@ -30,9 +30,9 @@ class Mipmap(eqx.Module):
 
 @jit
 def make(image: Float[Array, "h w c"]) -> Mipmap:
-    """The levels of an image, each the mean of the one before over texels of twice the edge.
+    """Computes the mip map of an image. Each level averages the level before over texels of twice the edge.
 
-    Edges of odd length are halved and rounded up; texels then count by the area that is covered.
+    Odd sizes are halved and rounded up. Texels at the border are then weighted by the area that they cover.
     """
     levels = [image]
     while max(levels[-1].shape[:2]) > 1:
@@ -64,15 +64,16 @@ def _halved(image: Array, axis: int) -> Array:
 def lookup(
     mipmap: Mipmap, coordinate: Float[Array, "p 2"], slope: Float[Array, "2 p 2"], *, wrap: tuple[str, str]
 ) -> Float[Array, "p c"]:
-    """A texture averaged over the footprint of each point's pixel.
+    """Looks up a texture, averaged over the footprint of each point's pixel.
 
-    Trilinear, at four places along the footprint of pixels that see the surface at a flat angle.
+    Interpolation is trilinear. If a pixel sees the surface at a grazing angle, four lookups along its footprint are
+    averaged.
 
     Args:
         mipmap: The texture.
-        coordinate: Places as for `jaxprt.scene.texture.lookup`.
-        slope: Change of the coordinates from one pixel to the next to the right, and to the next one down.
-        wrap: What lies beyond the edges.
+        coordinate: Texture coordinates, in the convention of `jaxprt.scene.texture.lookup`.
+        slope: Change of the coordinates from one pixel to the next, to the right and down.
+        wrap: Wrap modes along u and v.
 
     Reference: Williams 1983, "Pyramidal parametrics"; Heckbert 1986, "Survey of texture mapping", section 4.
     """

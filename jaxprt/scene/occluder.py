@@ -1,4 +1,4 @@
-"""Simplified meshes, to cast shadows in place of the mesh that is lit."""
+"""Simplified meshes that cast shadows in place of the original mesh."""
 
 import fast_simplification
 import numpy as np
@@ -6,35 +6,37 @@ import scipy
 
 from jaxprt.scene.mesh import Mesh, bounds, join, make_mesh
 
-_UNIT = 1000.0  # Diagonal at which edges are collapsed, since thresholds are absolute: the first is 1.5e-6 of it.
+_UNIT = 1000.0  # meshes are scaled to this diagonal, because thresholds are absolute: the first is 1.5e-6 of it
 
 
 def simplify(mesh: Mesh, *, faces: int) -> Mesh:
-    """The mesh with fewer faces, to cast shadows in its place: edges collapsed by their quadric error.
+    """Simplifies a mesh by collapsing edges with the smallest quadric error, for use as an occluder.
 
-    Vertices at one place and in one region count as one, so that seams of texture coordinates do not matter. The two
-    sides of a sheet, faces on the same three places, stay as they are: each side would come to lie before the other
-    somewhere. Boundaries stay as they are, those between regions too: a ground of two triangles
-    remains, a plane of many keeps its rim and little else, and the faces go where the mesh is curved. The result is
-    the same in every run, and at every size of the mesh but for rounding.
+    Vertices of one region at the same position count as one, so seams of texture coordinates do not matter. The two
+    sides of a sheet (faces with the same three positions) are not simplified, because each side would end up in front
+    of the other somewhere. Boundaries are preserved, including those between regions. A ground of two triangles
+    therefore remains, a finely divided plane keeps little more than its rim, and most faces remain where the mesh is
+    curved. The result is the same in every run and, up to rounding, at every scale of the mesh.
 
-    Of the bunny and its ground, 112,669 faces, 11,000 remain within 0.11 % of the bunny's diagonal from its vertices,
-    0.02 % in the root mean square. Rays then cost a fifth less, and triangles take a tenth of the memory. Radiance of
-    the vertices of the full mesh under Grace changes by 2.6 % on the bunny, glossy, and by 0.6 % on the ground.
+    For the bunny and its ground (112,669 faces), 11,000 faces stay within 0.11 % of the bunny's diagonal from its
+    vertices, with a root mean square of 0.02 %. Rays then cost a fifth less, and triangles take a tenth of the memory.
+    Under Grace, radiance at the vertices of the full mesh changes by 2.6 % on the glossy bunny and by 0.6 % on the
+    ground.
 
     Args:
-        mesh: What casts shadows. Faces without area cast none and are left out, as are vertices without faces.
-        faces: How many to come down to. More are left where boundaries need them.
+        mesh: The mesh to simplify. Degenerate faces and vertices without faces are removed.
+        faces: Target number of faces. More remain if boundaries require them.
 
     Returns:
-        A mesh with normals of its own and the regions of the original, of which a connected piece has the most
-        frequent; the mesh itself where it has no more faces.
+        The simplified mesh, with new normals. A connected piece gets the most frequent of its original regions. If the
+        mesh does not have more faces than `faces`, it is returned unchanged.
 
     Raises:
-        ValueError: Fewer than 4 faces are asked for, or no face has an area.
+        ValueError: `faces` is below 4, or all faces are degenerate.
 
-    Reference: Garland, Heckbert 1997, by fast-simplification, which takes edges below a rising threshold in the order
-    of their faces instead of the least one; Wang, Tran, Luebke 2004, section 4.2, for the use.
+    Reference: Garland, Heckbert 1997, implemented by fast-simplification, which collapses edges below a rising
+    threshold in the order of their faces instead of the best edge first; Wang, Tran, Luebke 2004, section 4.2, for the
+    use.
     """
     if faces < 4:
         raise ValueError(f"faces must be at least 4, got {faces}")
@@ -63,7 +65,7 @@ def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
 
 
 def _collapse(mesh: Mesh, chosen: np.ndarray, faces: int) -> Mesh:
-    """`simplify` for some faces, of which no two coincide."""
+    """`simplify` for some faces, no two of which coincide."""
     low, high = bounds(mesh)
     unit = _UNIT / (float(np.linalg.norm(high - low)) or 1.0)
     place = np.column_stack([(np.asarray(mesh.position, np.float64) - low) * unit, mesh.region])
@@ -74,7 +76,7 @@ def _collapse(mesh: Mesh, chosen: np.ndarray, faces: int) -> Mesh:
         place[:, :3].copy(), face, target_count=min(faces, len(face)), preserve_border=True
     )
     position, face = result[0], result[1]
-    # Each piece has the region that most of its vertices are nearest to: at seams two are equally near.
+    # Each piece gets the region that is nearest to most of its vertices; at seams two regions are equally near.
     graph = scipy.sparse.coo_array(
         (np.ones(face.size), (face.ravel(), np.roll(face, 1, 1).ravel())), (len(position),) * 2
     )

@@ -1,4 +1,4 @@
-"""Points on the triangles of a mesh: where radiance is asked for between the vertices."""
+"""Points on the triangles of a mesh, for evaluation between vertices."""
 
 import functools
 from functools import partial
@@ -14,16 +14,17 @@ from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.sphere import directions
 
-_ROUNDED = 1e-4  # by which weights may miss the triangle
+_ROUNDED = 1e-4  # tolerance of barycentric coordinates
 
 
 class Points(eqx.Module):
-    """Points on the triangles of a mesh, each a weighted mean of the corners of its triangle.
+    """Points on the triangles of a mesh, in barycentric coordinates.
 
     Attributes:
-        corner: Numbers of the vertices.
-        weight: Barycentric weights of each; they sum to 1.
-        slope: Change of the weights from one pixel to the next, to the right and down; None for points of no picture.
+        corner: Vertex indices of each point's triangle.
+        weight: Barycentric coordinates, which sum to 1.
+        slope: Change of the barycentric coordinates from one pixel to the next, to the right and down; None for points
+            that do not belong to a picture.
     """
 
     corner: Int[Array, "k p"]
@@ -35,19 +36,19 @@ class Points(eqx.Module):
         return self.corner.shape[1]
 
     def carry(self, attribute: Num[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
-        """An attribute of the vertices, along an axis, interpolated at the points: linear in it."""
+        """Interpolates a vertex attribute at the points. The vertices are along `axis`; the result is linear in it."""
         return _carried(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array, "v c"]) -> Float[Array, "2 p c"]:
-        """Change of an attribute of the vertices from one pixel to the next, to the right and down."""
+        """Change of a vertex attribute from one pixel to the next, to the right and down."""
         assert self.slope is not None
         return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])
 
     def check(self, vertices: int) -> None:
-        """Refuses points of other vertices, and outside of their triangles. Inside of `jax.jit` values are not known.
+        """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`.
 
         Raises:
-            ValueError: A corner is none of so many vertices, or weights are negative or do not sum to 1.
+            ValueError: A corner is not below the number of vertices, or weights are negative or do not sum to 1.
         """
         shapes = list(np.shape(self.corner)), list(np.shape(self.weight))
         if len(shapes[0]) != 2 or shapes[0] != shapes[1]:
@@ -61,10 +62,10 @@ class Points(eqx.Module):
                 raise ValueError(f"the weights of points must sum to 1, got {total[worst]:g} at point {worst}")
 
     def frame(self, frame: Float[Array, "v 3 3"]) -> Float[Array, "p 3 3"]:
-        """Shading frames: the interpolated normal at unit length, and the interpolated tangent orthogonal to it.
+        """Shading frames at the points: normals are interpolated and normalized, tangents made orthogonal to them.
 
         Args:
-            frame: Those of the vertices; rows are tangent, bitangent, normal.
+            frame: Shading frames of the vertices; rows are tangent, bitangent, normal.
         """
         return _frames(self.corner, self.weight, frame)
 
@@ -91,23 +92,23 @@ def _frames(corner: Array, weight: Array, frame: Array) -> Array:
 def placed(
     position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], points: Points | None
 ) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 3"]]:
-    """Positions and shading frames of points; those of the vertices for None."""
+    """Positions and shading frames of points, or of the vertices if `points` is None."""
     return (position, frame) if points is None else (points.carry(position), points.frame(frame))
 
 
 def on_triangles(
     face: Integer[ArrayLike, "f 3"], triangle: Integer[ArrayLike, " p"], barycentric: Float[ArrayLike, "p 3"]
 ) -> Points:
-    """Points given by their triangles, as `jaxprt.image.rasterize` and ray tracers have them.
+    """Makes points from triangle indices and barycentric coordinates, such as those of `jaxprt.image.rasterize`.
 
     Args:
         face: Triangles of the mesh, `Mesh.face`.
-        triangle: The number of each point's triangle.
-        barycentric: Weights of its three vertices, which sum to 1.
+        triangle: Index of each point's triangle.
+        barycentric: Barycentric coordinates of each point, which sum to 1.
 
     Raises:
-        ValueError: There is no such triangle, or a point lies outside its triangle. Inside `jax.jit` values are not
-            known: the nearest number counts there, and weights are taken as they are.
+        ValueError: A triangle does not exist, or a point lies outside of its triangle. Inside `jax.jit` this is not
+            checked: indices are clamped, and barycentric coordinates are used as they are.
     """
     if np.shape(barycentric) != (*np.shape(triangle), 3) or np.ndim(triangle) != 1:
         shapes = f"{list(np.shape(triangle))} and {list(np.shape(barycentric))}"

@@ -1,4 +1,4 @@
-"""Scenes: meshes with their materials, cameras, and lights."""
+"""Scenes: meshes with materials, cameras, and lights."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,23 +18,24 @@ from jaxprt.scene.points import Points
 
 
 class Part(eqx.Module):
-    """A mesh of one material.
+    """A mesh with one material.
 
-    What belongs to vertices and not to the material, but matters to textures only, is here and not in the mesh.
+    Vertex attributes that only textured materials use are stored here and not in the mesh.
 
     Attributes:
-        name: What to call it; each part of a scene has another name.
-        mesh: The mesh. Its regions are not looked at.
-        material: A material with textures, or any BRDF: a callable (wi, wo) -> value.
-        color: Linear colors of the vertices, which multiply the base color; None for white.
-        second: A second set of texture coordinates, as `Mesh.texture` is the first; None where there is none.
+        name: Name of the part, unique within a scene.
+        mesh: The mesh. Its regions are ignored.
+        material: A material with textures, or any BRDF: a callable (wi, wo) -> value in 1/sr.
+        color: Linear vertex colors, which multiply the base color; None for white.
+        second: Second set of texture coordinates (`Mesh.texture` is the first); None if there is none.
         handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; None
             for 1 everywhere.
 
     Raises:
-        TypeError: The name is no text, the mesh no mesh, or the material is neither a `TexturedMaterial` nor callable.
+        TypeError: The name is not a string, the mesh is not a `Mesh`, or the material is neither a `TexturedMaterial`
+            nor callable.
         ValueError: The mesh has no vertices or faces, an array does not have one row per vertex or is not finite, or
-            the material has textures and the mesh does not have the coordinates that they take.
+            the material has textures but the mesh lacks their texture coordinates.
     """
 
     name: str = eqx.field(static=True)
@@ -45,7 +46,7 @@ class Part(eqx.Module):
     handedness: Float[Array, " v"] | None = None
 
     def __check_init__(self):
-        """Refuses names that are no text, parts without vertices, and what does not belong to their vertices."""
+        """Refuses a wrong type of name or mesh, a mesh without vertices, and arrays of other vertices."""
         if not isinstance(self.name, str):
             raise TypeError(f"the name of a part must be text, got {self.name!r}")
         require.kind(f"the mesh of part {self.name!r}", self.mesh, Mesh, source="scene.make_mesh or load_mesh")
@@ -70,10 +71,10 @@ class Part(eqx.Module):
                 raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
 
     def surface(self, points: Points | None = None) -> Surface:
-        """Parameters of the material at the vertices, or at points.
+        """Material parameters at the vertices, or at surface points.
 
         Args:
-            points: On the triangles of the mesh; with slopes textures are averaged over the points' pixels.
+            points: Points on the mesh; the vertices if None. If they have slopes, textures are averaged over pixels.
 
         Raises:
             TypeError: The material is a BRDF, which has no textures.
@@ -93,21 +94,21 @@ class Part(eqx.Module):
 
 
 def _three(value: Any) -> Array:
-    """A number or three of them as an array [3]."""
+    """A number or three numbers as an array of shape [3]."""
     value = jnp.asarray(value, jnp.result_type(float))
     return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
 
 
 class PointLight(eqx.Module):
-    """A light without extent near the objects, which shines in all directions alike.
+    """A point light near the objects that emits equally in all directions.
 
     Attributes:
-        name: What to call it; another one than those of all parts and point lights of a scene.
-        position: In world units.
-        intensity: Radiant intensity: radiance times area, in units of radiance times squared world units.
+        name: Name of the light, different from those of all parts and other point lights of the scene.
+        position: Position in world units.
+        intensity: Radiant intensity, in units of radiance times squared world units.
 
     Raises:
-        TypeError: The name is no text.
+        TypeError: The name is not a string.
         ValueError: The position or the intensity is not finite, or the intensity is negative.
     """
 
@@ -116,7 +117,7 @@ class PointLight(eqx.Module):
     intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
 
     def __check_init__(self):
-        """Refuses what is not finite."""
+        """Refuses values that are not finite."""
         if not isinstance(self.name, str):
             raise TypeError(f"the name of a point light must be text, got {self.name!r}")
         require.position(f"the position of point light {self.name!r}", self.position)
@@ -131,17 +132,17 @@ def _tuple(items: Any) -> tuple:
 
 
 class Scene(eqx.Module):
-    """What is looked at: parts with their materials, from where, and in which light.
+    """A scene: parts with their materials, cameras, and lights.
 
     Attributes:
         parts: The parts, in order.
-        cameras: Cameras, as a file has them; empty if none.
-        environments: Lights, as a file has them; empty if none.
-        point_lights: Lights near the parts; empty if none. Parts that emit are lamps too.
+        cameras: The cameras; may be empty.
+        environments: The distant lights; may be empty.
+        point_lights: The point lights; may be empty. Parts that emit light are area lights.
 
     Raises:
-        TypeError: Something else than parts, cameras, environments and point lights is among them.
-        ValueError: There are no parts, or two parts or point lights have one name.
+        TypeError: A field holds an object of another class.
+        ValueError: There are no parts, or two parts or point lights have the same name.
     """
 
     parts: tuple[Part, ...] = eqx.field(converter=_tuple)
@@ -167,10 +168,10 @@ class Scene(eqx.Module):
             raise ValueError(f"each part of a scene must have a name of its own, got several called {twice}")
 
     def __getitem__(self, name: str) -> Part:
-        """The part of a name.
+        """The part with a given name.
 
         Raises:
-            KeyError: No part has it.
+            KeyError: No part has this name.
         """
         for part in self.parts:
             if part.name == name:
@@ -179,9 +180,9 @@ class Scene(eqx.Module):
 
     @property
     def mesh(self) -> Mesh:
-        """All parts as one mesh, joined anew at each access.
+        """All parts joined into one mesh. It is computed at each access.
 
-        Regions are the numbers of the parts; `mesh.split` takes it apart.
+        Regions are the indices of the parts, so `mesh.split` takes the mesh apart again.
         """
         return meshes.join(
             [
@@ -192,7 +193,7 @@ class Scene(eqx.Module):
 
 
 def numbered(names: Sequence[str]) -> list[str]:
-    """The names with numbers after those that came before: "wood", "wood 2", "wood 3"."""
+    """Makes names unique by appending numbers to repeated ones: "wood", "wood 2", "wood 3"."""
     taken: set[str] = set()
     result = []
     for name in names:

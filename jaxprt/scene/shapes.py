@@ -1,6 +1,6 @@
-"""What embedded scenes are made of: curves, surfaces of revolution, flat quadrangles.
+"""Building blocks of procedural scenes: curves, surfaces of revolution, flat quadrilaterals.
 
-A part is a triple of positions, faces and normals of any length, in float64.
+A part is a triple of positions, faces and normals (of any length), in float64.
 """
 
 import numpy as np
@@ -8,19 +8,21 @@ from jaxtyping import Float, Int
 
 from jaxprt.scene.mesh import Mesh, grid_face, make_mesh
 
-# Sizes have no names, which would have to be the same in all parts of a list.
+# Sizes are unnamed, because named sizes would have to be equal in all parts of a list.
 Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]
 
 
 def curve(control: list, *, step: float, turn: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Points and unit tangents of a smooth curve through control points, denser where it bends; straight through two.
+    """Points and unit tangents of a smooth curve through control points, denser where it bends.
 
-    A Hermite spline over chord length. Where it meets the axis it is horizontal, the middle of a smooth surface.
+    The curve is a Hermite spline over chord length, and straight for two control points. It is horizontal where it
+    meets the axis, so that the surface is smooth there.
 
     Args:
         control: Two or more points (radius, height); only the last may be on the axis.
-        step: Longest step along the curve.
-        turn: Largest turn in a step, in radians; a long turn takes its share of the step.
+        step: Largest distance between points along a straight part of the curve.
+        turn: Largest change of direction between points, in radians. Between two points, length / step + bend / turn is
+            at most 1.
     """
     point = np.array(control, float)
     if point[-1, 0] == 0:
@@ -59,19 +61,19 @@ def sweep(
     lift: Float[np.ndarray, "n 2"] | None = None,
     waves: int = 0,
 ) -> Part:
-    """A curve turned about y, between two of the sectors' borders or all around.
+    """Revolves a curve about y, all around or between two sector borders.
 
-    The curve has its outside on the right. Where it starts or ends on the axis stands one vertex.
+    The outside is on the right of the curve. Where the curve starts or ends on the axis there is one vertex.
 
     Args:
-        point: Points (radius, height), as from `curve`.
-        slope: The curve's tangents there.
-        sectors: Parts of the full turn.
-        first: Border of a sector where the surface starts.
-        last: Border where it ends; None closes it.
-        lift: How far the crests of waves around the axis rise above each point, and how fast that grows along the
-            curve; None leaves it round.
-        waves: Their number around.
+        point: Points (radius, height), such as those of `curve`.
+        slope: Tangents of the curve at the points.
+        sectors: Number of sectors of the full turn.
+        first: Sector border at which the surface starts.
+        last: Sector border at which it ends; None closes the surface.
+        lift: Height of the crests of waves around the axis above each point, and its derivative along the curve; None
+            for no waves.
+        waves: Number of waves around the axis.
     """
     columns = sectors if last is None else last - first + 1
     turn = 2 * np.pi * (first + np.arange(columns)) / sectors
@@ -96,12 +98,12 @@ def sweep(
 
 
 def patch(corner: list, *, rows: int, columns: int) -> Part:
-    """A flat quadrangle; its front is where (next row) x (next column) points.
+    """A flat quadrilateral. The front is the side to which (next row) x (next column) points.
 
     Args:
-        corner: Its corners [row column 3], two by two.
-        rows: Parts from one row of corners to the next.
-        columns: Parts along a row.
+        corner: Corners as an array [row column 3] of two rows and two columns.
+        rows: Number of cells from one row of corners to the other.
+        columns: Number of cells along a row.
     """
     (a, b), (c, d) = np.array(corner, float)
     v, u = np.meshgrid(np.arange(rows + 1) / rows, np.arange(columns + 1) / columns, indexing="ij")
@@ -112,7 +114,7 @@ def patch(corner: list, *, rows: int, columns: int) -> Part:
 
 
 def assemble(parts: list[Part]) -> Mesh:
-    """One mesh of several parts, all of region 0."""
+    """Joins several parts into one mesh with a single region 0."""
     start = np.cumsum([0, *(len(position) for position, _, _ in parts)])
     position, face, normal = zip(*parts, strict=True)
     face = np.concatenate([part + first for part, first in zip(face, start[:-1], strict=True)])

@@ -1,7 +1,7 @@
-"""Triangles divided at the middles of their edges, so that a mesh has vertices where they are needed.
+"""Subdivision of triangles at the midpoints of their edges, to add vertices where they are needed.
 
-Vertices at one place count as one when edges are looked for: both sides of a seam are divided alike, and so are parts
-of a scene that share a border. The surface has no gaps afterwards that it did not have before.
+Edges are identified by the positions of their endpoints. Both sides of a seam are therefore divided in the same way,
+and so are parts of a scene that share a border. Subdivision opens no gaps in the surface.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene.mesh import Mesh, make_mesh
 from jaxprt.scene.scene import Part, Scene
 
-# Steps by which points fill a square evenly, the first two of the R2 sequence.
+# Steps of the additive recurrence R2, which fills a square evenly.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
-_CANCELED = 1e-6  # Length of the mean of two unit normals below which it has no direction.
+_CANCELED = 1e-6  # two unit normals cancel if their mean is shorter than this
 
-# Triangles that replace one whose edges are cut or not, counted from its longest edge. Corners are 0 to 2, from the
-# start of that edge; 3 to 5 are the middles of the edges from there.
+# Triangles that replace a triangle, by which of its edges are cut, counted from the longest edge. Corners are 0 to 2,
+# from the start of that edge; 3 to 5 are the midpoints of the edges in the same order.
 _CHILDREN = {
     (False, False, False): [[0, 1, 2]],
     (True, False, False): [[0, 3, 2], [3, 1, 2]],
@@ -34,12 +34,12 @@ _CHILDREN = {
 
 
 class Division(NamedTuple):
-    """Triangles after a division. Added vertices come after those that were there.
+    """The result of a subdivision step. Added vertices follow the existing ones.
 
     Attributes:
-        face: Vertices of each triangle.
-        origin: Number of the triangle that each was cut from, in ascending order.
-        parent: The two vertices in whose middle each added vertex lies, the lower number first.
+        face: Vertex indices of each triangle.
+        origin: Index of the triangle from which each was cut, in ascending order.
+        parent: The two vertices between which each added vertex lies, the lower index first.
     """
 
     face: Int[np.ndarray, "f 3"]
@@ -51,8 +51,8 @@ class Points(NamedTuple):
     """Points on triangles.
 
     Attributes:
-        triangle: The triangle of each.
-        weight: Barycentric weights of its corners.
+        triangle: Index of each point's triangle.
+        weight: Barycentric coordinates of each point.
     """
 
     triangle: Int[np.ndarray, " p"]
@@ -60,18 +60,18 @@ class Points(NamedTuple):
 
 
 class Edges:
-    """The edges of a mesh, found by the places of their ends.
+    """The edges of a mesh, identified by the positions of their endpoints.
 
     Args:
         position: Positions of the vertices.
-        face: Vertices of each triangle.
+        face: Vertex indices of each triangle.
 
     Attributes:
-        face: Vertices of each triangle.
-        number: Number of the edge from each corner of a triangle to the next: equal for all triangles at the edge.
+        face: Vertex indices of each triangle.
+        number: Index of the edge from each corner of a triangle to the next. All triangles at an edge share its index.
         length: Length of each edge.
-        added: How many vertices the middle of each edge needs: two at a seam.
-        longest: Number of each triangle's longest edge; of equally long ones, that of the highest number.
+        added: Number of vertices that the midpoint of each edge needs: two at a seam.
+        longest: Index of each triangle's longest edge; among equally long ones, the highest index.
     """
 
     def __init__(self, position: Float[ArrayLike, "v 3"], face: Integer[ArrayLike, "f 3"]):
@@ -92,9 +92,9 @@ class Edges:
         self.added = np.bincount(self.number.ravel()[one], minlength=len(first))
 
     def closed(self, marked: Bool[np.ndarray, " e"]) -> Bool[np.ndarray, " e"]:
-        """The marked edges, and the longest edge of each triangle that has a marked one.
+        """Extends marked edges by the longest edge of each triangle that has a marked edge, until none is missing.
 
-        These can be cut without gaps, and angles stay above half of the smallest angle that there was. Edges without
+        These edges can be cut without gaps, and angles stay above half of the smallest original angle. Edges of zero
         length are not cut.
 
         Reference: Rivara 1984, "Algorithms for refining triangular grids suitable for adaptive and multigrid
@@ -106,13 +106,13 @@ class Edges:
         return marked
 
     def divide(self, marked: Bool[np.ndarray, " e"]) -> Division:
-        """Cuts marked edges in the middle.
+        """Cuts marked edges at their midpoints.
 
-        A triangle whose three edges are cut becomes four similar ones. Another is cut from the middle of its longest
-        edge to the opposite corner first.
+        A triangle whose three edges are marked is divided into four similar ones. Other triangles are first cut from
+        the midpoint of their longest edge to the opposite corner.
 
         Args:
-            marked: The edges, from `closed`.
+            marked: Mask of the edges, from `closed`.
 
         Reference: Carstensen 2004, "An adaptive mesh-refining algorithm allowing for an H1 stable L2 projection onto
         Courant finite element spaces": red, green and blue refinement.
@@ -134,26 +134,26 @@ class Edges:
         return Division(np.concatenate(face)[order], np.concatenate(origin)[order], ends)
 
     def _pairs(self) -> np.ndarray:
-        """One number for the two vertices at the ends of each triangle's edges."""
+        """One integer key for the two endpoints of each triangle's edges."""
         low, high = np.moveaxis(np.sort(self._ends, -1), -1, 0)
         return low * self._vertices + high
 
 
 def middle(value: Float[np.ndarray, "v *c"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n *c"]:
-    """Values in the middle between vertices, in the type of the values."""
+    """Values at the midpoints between vertices, in the type of the values."""
     return value[parent].mean(1)
 
 
 def middle_normal(normal: Float[np.ndarray, "v 3"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Normals in the middle between vertices, not of unit length; that of the first where two cancel."""
+    """Normals at the midpoints between vertices, not of unit length. If two cancel, that of the first vertex."""
     mean = middle(normal, parent)
     return np.where(np.linalg.norm(mean, axis=1, keepdims=True) > _CANCELED, mean, normal[parent[:, 0]])
 
 
 def scatter(count: Int[np.ndarray, " f"]) -> Points:
-    """Points that fill triangles evenly, so many in each; they are the same in every run.
+    """A given number of evenly distributed points in each triangle; the same in every run.
 
-    Reference: the additive recurrence R2, folded from the square into the triangle.
+    Points follow the additive recurrence R2, folded from the square into the triangle.
     """
     triangle = np.repeat(np.arange(len(count)), count)
     rank = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
@@ -163,12 +163,12 @@ def scatter(count: Int[np.ndarray, " f"]) -> Points:
 
 
 def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -> Points:
-    """The same points in the triangles after a division.
+    """Finds the triangles of points after a subdivision step. The positions do not change.
 
     Args:
-        points: The points. They lie in no triangle that has a vertex twice.
-        face: Vertices of each triangle before the division.
-        division: The division.
+        points: The points. None lies in a triangle with a repeated vertex.
+        face: Vertex indices of each triangle before the step.
+        division: The subdivision step.
     """
     children = np.bincount(division.origin, minlength=len(face))[points.triangle]
     first = np.searchsorted(division.origin, points.triangle)
@@ -177,7 +177,7 @@ def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -
     triangle, weight = first, np.full(points.weight.shape, -np.inf)
     for number in range(4):
         child = first + np.minimum(number, children - 1)
-        # Weights of the corners of the old triangle at the corners of the new one.
+        # Barycentric coordinates of the new triangle's corners in the old triangle.
         corner = (ends[division.face[child]][..., None] == face[points.triangle][:, None, None]).mean(2)
         now = np.linalg.solve(np.swapaxes(corner, 1, 2), points.weight[..., None])[..., 0]
         better = now.min(1) > weight.min(1)
@@ -186,19 +186,20 @@ def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -
 
 
 def subdivide(mesh: Mesh, divisions: Sequence[Division]) -> Mesh:
-    """The mesh after divisions of its triangles, one after another.
+    """Applies successive subdivision steps to a mesh.
 
-    Positions and texture coordinates are interpolated, so that the surface and the images on it stay the same.
-    Normals are interpolated as pictures interpolate them, and made unit; tangents are made orthogonal to them. An added
-    vertex is in the region of the first of the two between which it lies. Vertices that were there stay as they are.
+    Positions and texture coordinates are interpolated, so the surface and its textures do not change. Normals are
+    interpolated in the same way as for shading and normalized; tangents are made orthogonal to them. An added vertex
+    gets the region of the first of the two vertices between which it lies. Existing vertices do not change.
     """
     return _subdivided(mesh, [each.parent for each in divisions], divisions[-1].face) if divisions else mesh
 
 
 def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
-    """The scene after divisions of the triangles of `scene.mesh`.
+    """Applies successive subdivision steps of `scene.mesh` to a scene.
 
-    Parts keep their materials. Colors and second texture coordinates are interpolated. The rest is as in `subdivide`.
+    Parts keep their materials. Vertex colors and second texture coordinates are interpolated. `subdivide` explains what
+    happens to the meshes.
 
     Raises:
         TypeError: The material of a part has one BRDF for each vertex.
@@ -229,17 +230,17 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
 
 
 def divide(scene: Scene, *, edge: float) -> Scene:
-    """The scene with all edges halved that are longer than a length, until none is left.
+    """Subdivides a scene until no edge is longer than a given length.
 
     Args:
         scene: The scene.
-        edge: The largest length of an edge, in world units.
+        edge: Largest length of an edge, in world units.
 
     Returns:
-        The scene; see `subdivide_scene`.
+        The scene with more vertices. Materials do not change; attributes of added vertices are interpolated.
 
     Raises:
-        TypeError: There is no scene, or the material of a part has one BRDF for each vertex.
+        TypeError: `scene` is not a `Scene`, or the material of a part has one BRDF for each vertex.
         ValueError: The length is not positive and finite.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
@@ -259,7 +260,7 @@ def divide(scene: Scene, *, edge: float) -> Scene:
 
 
 def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> Mesh:
-    """The mesh with added vertices, each between two of those before it."""
+    """The mesh with added vertices, each between two earlier ones."""
     triangle = jax.device_put(face.astype(np.asarray(mesh.face).dtype))
     if not any(len(each) for each in parents):
         return eqx.tree_at(lambda each: each.face, mesh, triangle)
@@ -268,7 +269,7 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
     normal = np.asarray(mesh.normal, np.float64)
     for parent in parents:
         normal = np.concatenate([normal, middle_normal(normal, parent)])
-    # Of one face that has no area: only frames are made.
+    # A single degenerate face, because only frames are computed here.
     new = make_mesh(position[count:], np.zeros((1, 3), int), normal=normal[count:], tangent=tangent[count:])
 
     def appended(old, rows):
@@ -280,7 +281,7 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
 
 
 def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
-    """The part with added vertices, each between two of those before it."""
+    """The part with added vertices, each between two earlier ones."""
     color, second = (
         None if each is None else jax.device_put(_rows(each, parents)) for each in (part.color, part.second)
     )
@@ -289,7 +290,7 @@ def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray
 
 
 def _rows(value, parents: Sequence[np.ndarray]) -> np.ndarray:
-    """Values of all vertices; those of added ones are means."""
+    """Values of all vertices. Added vertices get the mean of their two parents."""
     value = np.asarray(value)
     for parent in parents:
         value = np.concatenate([value, middle(value, parent)])
@@ -297,7 +298,7 @@ def _rows(value, parents: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _first(value, parents: Sequence[np.ndarray]) -> np.ndarray:
-    """Values of all vertices; those of added ones are those of the first between which they lie."""
+    """Values of all vertices. Added vertices get the value of their first parent."""
     value = np.asarray(value)
     for parent in parents:
         value = np.concatenate([value, value[parent[:, 0]]])
@@ -305,7 +306,7 @@ def _first(value, parents: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def places(position: np.ndarray) -> np.ndarray:
-    """Numbers that are equal for vertices at one place."""
+    """Integers that are equal for vertices at the same position."""
     order = np.lexsort(position.T)
     another = (position[order[1:]] != position[order[:-1]]).any(1)
     place = np.empty(len(position), np.int64)

@@ -1,4 +1,4 @@
-"""Images on surfaces: the color of a texture at each vertex, and how it lies there."""
+"""Texture lookup, and the derivatives and handedness of texture coordinates on a mesh."""
 
 import functools
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxprt.compile import jit
 from jaxprt.scene.mesh import Mesh
 
-WRAPS = ("repeat", "mirror", "clamp")  # What is beyond the edges: the image again, its mirror image, its border.
+WRAPS = ("repeat", "mirror", "clamp")  # beyond the edges: the image again, its mirror image, or its border texels
 
 
 @functools.partial(jit, static_argnames="wrap")
@@ -18,24 +18,27 @@ def lookup(
 ) -> Float[Array, "*b c"]:
     """Bilinear interpolation of a texture.
 
-    Coordinates are as in OBJ files, and as trimesh gives those of glTF: (0, 0) is the lower left corner of the image
-    and (1, 1) the upper right one. Centers of texels lie half a texel inside.
+    Coordinates follow the convention of OBJ files: (0, 0) is the lower left corner of the image and (1, 1) the upper
+    right one. Centers of texels lie half a texel inside.
 
-    A vertex takes the texture at one place: details finer than the mesh's edges are not averaged but missed. Pictures
-    show them by `lookup(image, interpolate(fragments, mesh.face, mesh.texture))` of `image`, for each pixel.
-    Opposite edges of an image that repeats are blended: at u = 0 and at u = 1 is the mean of the two.
-    Linear in the image; in the coordinates differentiable except where they pass the center of a row or column.
+    A lookup at a vertex samples the texture at one point, so details finer than the mesh's edges are missed, not
+    averaged. To show them in a picture, look up each pixel:
+    `lookup(image, interpolate(fragments, mesh.face, mesh.texture))`.
+
+    With "repeat", opposite edges of the image are blended: the value at u = 0 and at u = 1 is the mean of both edges.
+
+    The result is linear in the image. It is differentiable in the coordinates except at centers of rows and columns.
 
     Args:
-        image: The texture, first row on top; linear values, not sRGB-encoded ones, if it is to be an albedo.
-        coordinate: Places u to the right and v up, over width and height: `Mesh.texture`.
-        wrap: What lies beyond the edges, along u and along v: each one of ``WRAPS``.
+        image: The texture, first row on top. Albedo textures must be linear, not sRGB-encoded.
+        coordinate: Texture coordinates with u to the right and v up, as in `Mesh.texture`.
+        wrap: Wrap mode along u and along v, each one of ``WRAPS``.
 
     Returns:
-        Values of the image, for example weights of `separable.modulate`.
+        Values of the image at the coordinates, for example weights for `separable.modulate`.
 
     Raises:
-        ValueError: The image has no axis of colors, coordinates are no pairs, or a wrap mode is unknown.
+        ValueError: The image has no axis of colors, coordinates are not pairs, or a wrap mode is unknown.
     """
     if image.ndim != 3 or coordinate.shape[-1:] != (2,):
         got = f"{list(image.shape)} and {list(coordinate.shape)}"
@@ -54,9 +57,9 @@ def bilinear(
     shape: tuple[int | Int[Array, "*b"], int | Int[Array, "*b"]],
     wrap: tuple[str, str],
 ) -> list[tuple[tuple[Int[Array, "*b"], Int[Array, "*b"]], Float[Array, "*b"]]]:
-    """Row, column and weight of the four texels around each place in an image of a height and width."""
+    """Row, column and weight of the four texels around each coordinate, in an image of a given height and width."""
     height, width = shape
-    # Reduced to one period first: multiplied by the width, far coordinates would lose digits.
+    # Reduced to one period first, because large coordinates times the width would lose precision.
     x = _reduced(coordinate[..., 0], wrap[0]) * width - 0.5
     y = (1 - _reduced(coordinate[..., 1], wrap[1])) * height - 0.5
     column, row = jnp.floor(x), jnp.floor(y)
@@ -70,14 +73,14 @@ def bilinear(
 
 
 def _reduced(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
-    """Coordinates within the one period of the image, or the two of an image and its mirror image."""
+    """Coordinates reduced to one period: the image, or the image followed by its mirror image."""
     if wrap == "clamp":
         return jnp.clip(place, 0, 1)
     return place - jnp.floor(place) if wrap == "repeat" else place - 2 * jnp.floor(place / 2)
 
 
 def _inside(index: Int[Array, "*b"], size: int | Int[Array, "*b"], wrap: str) -> Int[Array, "*b"]:
-    """Numbers of the texels that stand for those beyond the edges."""
+    """Indices of the texels that replace those beyond the edges."""
     if wrap == "clamp":
         return jnp.clip(index, 0, size - 1)
     if wrap == "repeat":
@@ -87,11 +90,11 @@ def _inside(index: Int[Array, "*b"], size: int | Int[Array, "*b"], wrap: str) ->
 
 
 def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """How a point moves on the surface as the texture's coordinate u grows, in world units: for `mesh.brush`.
+    """Derivative of the position by the texture coordinate u at each vertex, in world units, for `mesh.brush`.
 
-    The mean of the faces around a vertex, weighted by how much of the texture they cover; zero where they cover
-    nothing. Faces on which it points the other way, beyond a seam at which the texture is mirrored, count with the
-    opposite sign: what is brushed looks alike from both ends.
+    It is the mean over the adjacent faces, weighted by their area in the texture, and zero if that area is zero. Faces
+    whose derivative points the opposite way, beyond a seam at which the texture is mirrored, count with the opposite
+    sign, because brushing has no sign.
 
     Raises:
         ValueError: The mesh has no texture coordinates.
@@ -104,14 +107,14 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     corner, place = (np.asarray(each, np.float64)[face] for each in (mesh.position, mesh.texture))
     edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
     covered = np.linalg.det(step)
-    # What cancels to within what float32 coordinates tell says nothing.
+    # Differences within the rounding of float32 coordinates are not meaningful.
     least = 4 * np.finfo(np.float32).eps * np.abs(place).max((1, 2)) * np.abs(step).max((1, 2))
     covered = np.where(np.abs(covered) > least, covered, 0)
     weighted = np.sign(covered)[:, None] * (edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:])
     vertex, weight, along = face.ravel(), np.repeat(np.abs(covered), 3), np.repeat(weighted, 3, axis=0)
     order = np.argsort(weight, kind="stable")
     first = np.zeros((len(mesh.position), 3))
-    first[vertex[order]] = along[order]  # The last to be written covers most.
+    first[vertex[order]] = along[order]  # the last one written covers most
     along = np.where(np.sum(along * first[vertex], 1, keepdims=True) < 0, -along, along)
     total = np.bincount(vertex, weight, len(first))
     mean = np.stack([np.bincount(vertex, along[:, axis], len(first)) for axis in range(3)], -1)
@@ -119,9 +122,9 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
 
 
 def handedness(mesh: Mesh) -> Float[np.ndarray, " v"]:
-    """On which side of the tangent the image's upper edge lies: 1 or -1 for each vertex.
+    """Handedness of the texture coordinates at each vertex: 1, or -1 where the texture is mirrored.
 
-    It is -1 where the image is mirrored on the surface: there the bitangent of the image is -cross(normal, tangent).
+    Where it is -1, the bitangent of the texture is -cross(normal, tangent).
 
     Raises:
         ValueError: The mesh has no texture coordinates.

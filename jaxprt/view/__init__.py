@@ -1,4 +1,4 @@
-"""The viewer: a scene to play with, in a notebook or in a browser."""
+"""Interactive viewer for relit scenes, in a notebook or in a browser."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,21 +19,22 @@ def view(
     environments: Mapping[str, Environment] | None = None,
     height: int = 480,
 ) -> Any:
-    """A viewer in a notebook. It needs the extra `jaxprt[view]`.
+    """Makes an interactive viewer for a notebook. It needs the extra `jaxprt[view]`.
 
     Args:
-        scene: From `jaxprt.precompute`; or the same scene by several systems, by their names.
-        environments: Lights by names, all of the size of the scene's transport; the scene's own or the two embedded
-            ones if None.
-        height: Of the viewer in pixels of the page.
+        scene: The result of `jaxprt.precompute`, or a dictionary from names to results of several systems for the same
+            scene.
+        environments: Dictionary from names to lights. Their size must be that of the scene's transport. If None, the
+            scene's own lights or the two embedded ones.
+        height: Height of the viewer in pixels of the page.
 
     Returns:
-        The widget, which the notebook shows where it is a cell's last value.
+        A widget. The notebook displays it if it is the last value of a cell.
 
     Raises:
         ImportError: anywidget is not installed.
-        TypeError: No relit scenes, or no environments.
-        ValueError: There are none, they are of different scenes, or lights are of several sizes.
+        TypeError: `scene` holds something other than relit scenes, or `environments` something other than lights.
+        ValueError: There is no scene or no light, the scenes differ, or the lights have different sizes.
     """
     try:
         from jaxprt.view.widget import Viewer
@@ -48,16 +49,21 @@ def serve(
     environments: Mapping[str, Environment] | None = None,
     port: int = 0,
 ) -> Server:
-    """A viewer for a browser on this machine: open its `url`, and `close` it in the end.
-
-    Arguments and errors are those of `view`.
+    """Starts a viewer for a browser on this machine. Open its `url`, and call `close` when done.
 
     Args:
-        scene: As in `view`.
-        environments: As in `view`.
-        port: Of this machine; a free one if 0.
+        scene: The result of `jaxprt.precompute`, or a dictionary from names to results of several systems for the same
+            scene.
+        environments: Dictionary from names to lights. Their size must be that of the scene's transport. If None, the
+            scene's own lights or the two embedded ones.
+        port: Port of this machine; 0 chooses a free one.
 
     Returns:
-        The server, which serves already.
+        The running server.
+
+    Raises:
+        TypeError: `scene` holds something other than relit scenes, or `environments` something other than lights.
+        ValueError: There is no scene or no light, the scenes differ, or the lights have different sizes.
+        OSError: The port is in use or not permitted.
     """
     return Server(Session(scene, environments=environments), port=port)

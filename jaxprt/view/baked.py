@@ -1,4 +1,4 @@
-"""Scenes as binary glTF with the radiance of one light and one view in the colors of the vertices."""
+"""Export of binary glTF with baked lighting: vertex colors hold the radiance for one light and one view."""
 
 import json
 import os
@@ -28,25 +28,26 @@ def export_baked(
     eye: Float[Array, "3"] | None = None,
     materials: Mapping[str, Any] | None = None,
 ) -> float:
-    """Writes a scene as binary glTF, baked: it shows the radiance of one light towards one eye from everywhere.
+    """Writes a scene as binary glTF with baked lighting: radiance under one light towards one eye position.
 
-    Each part is a mesh with radiance in COLOR_0, and a material of KHR_materials_unlit. glTF's colors are linear and
-    end at 1, so all are divided by the largest radiance; the file has that number in its `extras` as `exposure`. What
-    is negative counts as 0. The names in the file say that it is baked.
+    Each part becomes a mesh with radiance in COLOR_0 and an unlit material (KHR_materials_unlit). From other eye
+    positions the file shows the same radiance. Colors in glTF are linear and at most 1, so all are divided by the
+    largest radiance, which is stored as `exposure` in `extras`. Negative radiance becomes 0. Names in the file state
+    that it is baked.
 
     Args:
-        scene: From `jaxprt.precompute`.
+        scene: The result of `jaxprt.precompute`.
         path: The file, `*.glb`.
         environment: The light.
-        eye: Position of the viewer; that of the scene's camera if None.
-        materials: Other materials of some parts.
+        eye: Position of the viewer in world units; that of the scene's camera if None.
+        materials: Dictionary from names of parts to materials that replace their own.
 
     Returns:
-        What the colors of the file must be multiplied by to be radiance.
+        The factor by which the colors in the file must be multiplied to give radiance.
 
     Raises:
-        TypeError: No relit scene, or no environment.
-        ValueError: A file of another kind, or what `RelitScene.radiance` refuses.
+        TypeError: `scene` is not a relit scene, or `environment` is not an `Environment`.
+        ValueError: The suffix of the file is not .glb, or `RelitScene.radiance` refuses the light, eye or materials.
 
     Reference: Khronos, glTF 2.0 specification, sections 3.7.2 and 4.4; KHR_materials_unlit.
     """

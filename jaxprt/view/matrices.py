@@ -1,4 +1,4 @@
-"""Transfer matrices in a page that relights without Python: harmonics of the visibility in bytes, and BRDF tables."""
+"""Transfer matrices for exported pages: spherical harmonics of visibility as bytes, and BRDF tables."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,23 +8,23 @@ from jaxprt.sphere import harmonics
 from jaxprt.systems import harmonic
 from jaxprt.systems.harmonic.transfer import from_visibility, to_visibility
 
-_EQUAL = 1e-3  # relative error of matrices that are those of a visibility, and of tables that are symmetric
-_KNOTS = 64  # of the roughness, at most
+_EQUAL = 1e-3  # largest relative error at which matrices count as products of a visibility, and tables as symmetric
+_KNOTS = 64  # most knots of the roughness
 _CHANNELS = 4
 
 
 class CoarseMatrix(harmonic.TransferMatrix):
-    """The matrices of a visibility that was rounded.
+    """Transfer matrices that are computed from the harmonics of a quantized visibility.
 
     Attributes:
-        visible: Harmonics of the visibility in the world, of twice the degree.
+        visible: Harmonics of the visibility in world coordinates, of twice the degree of the matrices.
     """
 
     visible: Float[Array, "k v"]
 
 
 def check(name: str, system: harmonic.HarmonicSystem) -> None:
-    """Refuses parts that a page does not have."""
+    """Refuses parts that an exported page does not support."""
     table, knots = system.brdf.table, [len(each) for each in system.brdf.knot]
     if not system.brdf.isotropic:
         raise ValueError(f"part {name!r} must have an isotropic BRDF to be exported, got an anisotropic one")
@@ -41,10 +41,10 @@ def check(name: str, system: harmonic.HarmonicSystem) -> None:
 
 
 def visibility_of(name: str, system: harmonic.HarmonicSystem) -> Float[np.ndarray, "k v"]:
-    """Harmonics of the visibility that a part's matrices were made of, of twice their degree.
+    """Harmonics of the visibility from which a part's transfer matrices were computed, of twice their degree.
 
     Raises:
-        ValueError: The matrices are of no visibility: with interreflection, for example.
+        ValueError: The matrices do not come from a visibility, for example because they include interreflection.
     """
     transport = system.transport
     if isinstance(transport, CoarseMatrix):
@@ -61,12 +61,12 @@ def visibility_of(name: str, system: harmonic.HarmonicSystem) -> Float[np.ndarra
 
 
 def truncated(visible: Float[np.ndarray, "k v"], degree: int | None) -> Float[np.ndarray, "m v"]:
-    """Harmonics of visibility that matrices of a degree have; all for None."""
+    """Harmonics of visibility that matrices of a degree need; all if None."""
     return visible if degree is None else visible[: (2 * degree + 1) ** 2]
 
 
 def reduced(system: harmonic.HarmonicSystem, visible: Float[np.ndarray, "k v"]) -> harmonic.HarmonicSystem:
-    """A system with another visibility, which may be of a lower degree."""
+    """The system with its visibility replaced by another one, which may have a lower degree."""
     old, degree = system.transport, harmonics.degree_of(len(visible)) // 2
     coefficient = jnp.asarray(visible, old.matrix.dtype)
     matrix = from_visibility(coefficient, old.frame, degree=degree)[:, None]
@@ -75,11 +75,11 @@ def reduced(system: harmonic.HarmonicSystem, visible: Float[np.ndarray, "k v"]) 
 
 
 def plane_table(name: str, brdf: harmonic.HarmonicBrdf) -> Float[np.ndarray, "h q e 4"]:
-    """A table for each knot and node of the view, with entries for each band and each of `degree + 1` directions.
+    """Table of a BRDF by zonal harmonics: for each knot, view node, band and each of `degree + 1` directions.
 
-    A BRDF that is symmetric about the plane of the view and the normal is, band by band, a sum of zonal harmonics
-    about directions in this plane. Its dot product with the light is then the sum of the values of the light's bands
-    in these directions, times the entries: the page needs no rotation of harmonics.
+    A BRDF that is symmetric about the plane of the view direction and the normal can be written, in each band, as a sum
+    of zonal harmonics about directions in this plane. Its dot product with the light is then the sum of the light's
+    bands, evaluated in these directions, times the entries. The page therefore does not need to rotate harmonics.
 
     Raises:
         ValueError: The BRDF is not symmetric.
@@ -103,10 +103,10 @@ def plane_table(name: str, brdf: harmonic.HarmonicBrdf) -> Float[np.ndarray, "h 
 
 
 def words(system: harmonic.HarmonicSystem) -> int:
-    """Words of four bytes that the visibility of a vertex takes."""
+    """Number of 4-byte words for the visibility of a vertex."""
     return -(-((2 * system.degree + 1) ** 2) // 4)
 
 
 def nbytes(system: harmonic.HarmonicSystem, degree: int) -> int:
-    """Bytes of the visibility of all vertices, up to a degree of the matrices."""
+    """Size in bytes of the visibility of all vertices, for matrices of a degree."""
     return system.vertices * (2 * min(system.degree, degree) + 1) ** 2

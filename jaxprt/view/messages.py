@@ -1,4 +1,4 @@
-"""What browser and Python tell each other: messages with arrays beside them, checked where they enter."""
+"""Messages between browser and Python: JSON with binary arrays, validated on receipt."""
 
 import json
 import math
@@ -10,24 +10,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-MOST_BYTES = 1 << 29  # of a message with a picture of an environment in it
+MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
 _LARGEST_HALF = 65504.0
 
 
 class Reply(NamedTuple):
-    """An answer: what JSON holds, and arrays as bytes."""
+    """An answer: its JSON content, and arrays as bytes."""
 
     content: dict[str, Any]
     buffers: list[bytes]
 
 
 class Lamp(NamedTuple):
-    """Light put by hand: a disk on the sphere.
+    """A light that the user has added: a disk of constant radiance at infinity.
 
     Attributes:
-        direction: Of its middle in the environment before it is turned.
-        angle: From its middle to its rim, in radians.
-        radiance: Linear radiance.
+        direction: Direction to the center of the disk, in the environment before it is rotated.
+        angle: Angle from the center to the rim, in radians.
+        radiance: Linear radiance of the disk.
     """
 
     direction: tuple[float, ...]
@@ -36,18 +36,18 @@ class Lamp(NamedTuple):
 
 
 class Look(NamedTuple):
-    """All that a picture depends on; hashable, so that what is made from a piece of it can be kept.
+    """Everything that a picture depends on. It is hashable, so that results can be cached by its fields.
 
     Attributes:
-        system: Name of one of the systems.
-        light: Number of one of the lights.
-        turn: Angle by which the light is turned about +y, in radians.
-        lamps: Lights put by hand.
+        system: Name of the system.
+        light: Index of the light.
+        turn: Angle by which the light is rotated about +y, in radians.
+        lamps: Lights that the user has added.
         eye: Position of the viewer in world units.
-        target: What the viewer looks at.
+        target: Point that the viewer looks at.
         field_of_view: Full vertical angle of view in radians.
-        bounces: Whether parts reflect light onto each other.
-        material: For names of parts, values of those of `MATERIAL` that were changed.
+        bounces: Whether interreflection between parts is included.
+        material: Changed material parameters, named in `MATERIAL`, for each changed part.
     """
 
     system: str
@@ -61,15 +61,15 @@ class Look(NamedTuple):
     material: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]
 
 
-# What of a material can change: how many numbers it has, and the largest of them.
+# Material parameters that can change: their number of values and largest value.
 MATERIAL = {"roughness": (1, 1.0), "exponent": (1, 1e6), "f0": (1, 1.0), "diffuse": (3, 1.0), "specular": (3, 1.0)}
 
 
 def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> Look:
-    """The look that a message asks for.
+    """Parses the look that a message requests.
 
     Raises:
-        ValueError: A piece is missing, is no finite number in its range, or names what there is not.
+        ValueError: A field is missing, is not a finite number in its range, or names something that does not exist.
     """
     system = message.get("system")
     if not isinstance(system, str) or system not in systems:
@@ -94,10 +94,10 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
 
 
 def number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
-    """A finite number of a message.
+    """Reads a finite number from a message.
 
     Raises:
-        ValueError: It is none, or out of its range.
+        ValueError: The field is not a finite number, or is out of range.
     """
     value = message.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -110,10 +110,10 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
 def numbers(
     message: Mapping[str, Any], name: str, count: int, *, low: float = -1e30, high: float = 1e30
 ) -> tuple[float, ...]:
-    """Some finite numbers of a message.
+    """Reads a list of `count` finite numbers from a message.
 
     Raises:
-        ValueError: They are not so many, or out of their range.
+        ValueError: The field has another number of values, or a value is not a finite number in the range.
     """
     value = _items(message, name)
     if len(value) != count:
@@ -122,17 +122,17 @@ def numbers(
 
 
 def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
-    """A message and its arrays as one string of bytes: the length of the JSON, the JSON, the arrays."""
+    """Packs a message and its arrays into bytes: the length of the JSON, the JSON, and the arrays."""
     head = json.dumps({"content": content, "lengths": [len(each) for each in buffers]}, allow_nan=False).encode()
-    head += b" " * (-(len(head) + 4) % 8)  # arrays begin at multiples of eight
+    head += b" " * (-(len(head) + 4) % 8)  # arrays are aligned to eight bytes
     return b"".join([struct.pack("<I", len(head)), head, *(each + bytes(-len(each) % 8) for each in buffers)])
 
 
 def unpack(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """The message and the arrays that `pack` has made one string of.
+    """Unpacks bytes from `pack` into the message and its arrays.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The bytes are not a packed message.
     """
     try:
         (length,) = struct.unpack_from("<I", data)
@@ -149,15 +149,16 @@ def unpack(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
-    """Linear colors as bytes.
+    """Encodes linear colors as bytes.
 
     Args:
-        color: Three channels in the last axis.
-        stops: None for half floats. Otherwise colors are exposed by these, and become bytes as displays take them,
-            compressed with zlib.
+        color: Linear colors with three channels in the last axis.
+        stops: Exposure in stops. Colors are then exposed, encoded as 8-bit sRGB and compressed with zlib. None encodes
+            half floats.
 
     Returns:
-        The bytes, and the factor that half floats must be multiplied by: 1 but where the brightest is beyond them.
+        The bytes, and the factor by which half floats must be multiplied. It is 1 unless the brightest color exceeds
+        the range of half floats.
     """
     value = np.asarray(color, np.float32)
     if stops is None:
@@ -166,7 +167,7 @@ def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
     exposed = np.clip(value * np.float32(2.0**stops), 0, 1)
     display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
     level = np.round(255 * display).astype(np.uint8)
-    # Channel by channel, differences from entry to entry: neighbours are alike.
+    # Differences between successive entries of a channel compress better, because neighbors are similar.
     flat = np.moveaxis(level.reshape(-1, level.shape[-1]), -1, 0)
     return zlib.compress(np.diff(flat, axis=1, prepend=np.uint8(0)).tobytes(), 1), 1.0
 

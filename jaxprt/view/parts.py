@@ -1,4 +1,4 @@
-"""What a page that relights without Python holds of the parts of a scene, as arrays."""
+"""Data of a scene's parts in exported pages, which relight in the browser without Python."""
 
 import math
 from typing import Any
@@ -28,14 +28,14 @@ from jaxprt.view.reduced import (
     visibility_of,
 )
 
-NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # of scenes without glossy parts
+NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # for scenes without glossy parts
 _STARTS = ("first", "tableStart", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
-_SHINY = [3, 4]  # terms that the page's module has for `ShininessFamily`
-_SKY = 64  # texels along the edge of a light's faces, at most
+_SHINY = [3, 4]  # terms by which the page's module represents `ShininessFamily`
+_SKY = 64  # most texels along the edge of a light's faces
 
 
 def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes]]:
-    """What the page's module reads of the parts, and the arrays of all: see `Piece` in the module for their order."""
+    """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
     systems, bits = systems_of(reduced), bits_of(reduced)
     vectors, visible = [vectors_of(each) for each in systems], visibility_of(reduced)
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
@@ -73,7 +73,7 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
 
 
 def _about(system: Exported) -> dict[str, Any]:
-    """What the page's module is told of the system of a part."""
+    """JSON description of a part's system for the page's module."""
     about = {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": [], "laplacian": 1.0}
     if isinstance(system, lobe.LobeSystem):
         return about | {"lobes": system.brdf.lobes, "steps": float(system.brdf.weight.shape[-1] - 1), **_knot(system)}
@@ -88,14 +88,14 @@ def _knot(system: lobe.LobeSystem | harmonic.HarmonicSystem) -> dict[str, list[f
 
 
 def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
-    """Whole numbers of units, in rows of a length."""
+    """Values quantized to integer multiples of the units, in rows of a given length."""
     padded = np.zeros((value.shape[1], length))
     padded[:, : len(value)] = np.round(value / unit[: len(value), None]).T
     return padded
 
 
 def _scales(reduced: RelitScene, level: int) -> dict[str, Any]:
-    """The scales of visibility that are left."""
+    """The scales of visibility that the page keeps."""
     scale = scale_of(reduced)
     if scale is None:
         return NO_SCALES
@@ -104,7 +104,7 @@ def _scales(reduced: RelitScene, level: int) -> dict[str, Any]:
 
 
 def mips(size: int) -> list[int]:
-    """Edges of the faces that the page makes of a light."""
+    """Sizes of the cubemaps in the mip chain that the page computes from a light."""
     while size > _SKY and size % 2 == 0:
         size //= 2
     result = [size]
@@ -114,7 +114,7 @@ def mips(size: int) -> list[int]:
 
 
 def blurring(size: int) -> dict[str, Any]:
-    """How the light is blurred to all widths: see `jaxprt.systems.lobe.relight.prefilter`."""
+    """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.relight.prefilter` does."""
     scale = relight.scales(size)
     pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
     source, own, concentration = zip(*(relight.blur(*each, size=size) for each in pairs), strict=True)
@@ -130,7 +130,7 @@ def blurring(size: int) -> dict[str, Any]:
 
 
 def _family(shading: Shading) -> dict[str, list]:
-    """Terms that the channels are, as the page's module numbers them, and their factors; empty for other BRDFs."""
+    """Numbers of the BRDF terms of a part's channels in the page's module, and their factors; empty if unknown."""
     if shading.blend is None or shading.scale is None:
         return {"terms": [], "scale": []}
     terms = _SHINY if isinstance(shading.brdf, ShininessFamily) else list(shading.term)
@@ -145,9 +145,9 @@ def _means(system: Exported, level: int) -> np.ndarray:
 
 
 def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
-    """A table of lobes: for each knot and node the mean and log concentration of each lobe, its weights; albedos.
+    """Table of a part's BRDF. Parts with transfer matrices use `jaxprt.view.matrices.plane_table`.
 
-    That of a part with matrices: `jaxprt.view.matrices.plane_table`.
+    For lobes it holds, for each knot and view node, the mean, log concentration and weights of each lobe, and albedos.
     """
     if isinstance(system, harmonic.HarmonicSystem):
         return matrices.plane_table(name, system.brdf)
@@ -167,7 +167,7 @@ def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
 
 
 def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
-    """Weights of the channels at each vertex and, last, what it emits; with the first the logarithm of roughness."""
+    """Channel weights at each vertex, followed by its emission. The first row also holds the logarithm of roughness."""
     count = len(shading.mesh.position)
     if shading.blend is not None:
         weight = np.asarray(shading.blend.weight)
@@ -181,7 +181,7 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     result[:, :-1, :3] = weight
     if shading.blend is not None and shading.blend.parameter:
         result[:, 0, 3] = np.asarray(shading.blend.parameter[0])
-    elif isinstance(shading.brdf, Channels):  # GGX of one roughness, whose axes are alike
+    elif isinstance(shading.brdf, Channels):  # isotropic GGX with a constant roughness
         result[:, 0, 3] = np.log(next(float(each.roughness[0]) for each in shading.brdf.model if isinstance(each, GGX)))
     if shading.emitted is not None:
         result[:, -1, :3] = np.asarray(shading.emitted)
@@ -189,7 +189,7 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
 
 
 def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
-    """A material that is one for all vertices, by its numbers; None for others."""
+    """Parameters of a material that is the same at all vertices; None for other materials."""
     if isinstance(material, BlinnPhong) and isinstance(shading.brdf, ShininessFamily):
         values = {
             name: np.broadcast_to(np.asarray(getattr(material, name), float), 3) for name in ("diffuse", "specular")

@@ -1,4 +1,4 @@
-"""Scenes as one file of HTML that relights them without Python, in the browser's GPU."""
+"""Export of a scene as a single HTML file that relights it on the browser's GPU, without Python."""
 
 import base64
 import html
@@ -23,10 +23,10 @@ from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of, 
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
-_MOST_BITS = 2**27  # bytes of visibility of single texels, which graphics cards take
-_SPARE = 64  # bytes that a page may differ by for another error
-_FIRST = 2  # scale of visibility that is the finest one in bytes
-_VIEWS = 4  # from which the error is measured
+_MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
+_SPARE = 64  # bytes by which the page's size may change when another error is written into it
+_FIRST = 2  # finest scale of visibility that is stored as bytes
+_VIEWS = 4  # views from which the error is measured
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title><link rel="icon" href="data:,">
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
@@ -45,16 +45,16 @@ mount(document.getElementById("viewer"), answers(content, buffers));
 
 
 class Piece(NamedTuple):
-    """A scene in a file.
+    """Description of an exported page.
 
     Attributes:
         path: The file.
-        nbytes: Its size.
-        edge: Texels along the edge of the faces of the finest visibility in it; 0 without glossy parts.
-        texels: Whether the brightest texels of the light are summed one by one, for shadows of a small sun.
-        degree: Highest degree of the transfer matrices in it; None without parts of the harmonic system.
-        error: Relative L2 error of its radiance at the vertices against that of the scene, over four views, in the
-            light where it is largest.
+        nbytes: Size of the file in bytes.
+        edge: Texels along a face's edge of the finest visibility in the page; 0 without glossy parts.
+        texels: Whether the brightest texels of the light are summed one by one, for sharp shadows of a small sun.
+        degree: Highest degree of the transfer matrices in the page; None without parts of the harmonic system.
+        error: Relative L2 error of the page's vertex radiance against that of the scene, over four views and for the
+            light with the largest error.
     """
 
     path: pathlib.Path
@@ -72,26 +72,29 @@ def export(
     environments: Mapping[str, Environment] | None = None,
     most: int = 32_000_000,
 ) -> Piece:
-    """Writes a page that relights a scene without Python, by the browser's GPU: the viewer, and what it needs.
+    """Writes an HTML page that shows and relights a scene on the browser's GPU, without Python.
 
-    Direct light alone: ideally diffuse parts by transfer vectors in bytes, parts of the system "harmonic" by transfer
-    matrices, as harmonics of their visibility in bytes, and others by lobes and by means of visibility, all as fine as
-    fit in the size that is asked for; and the brightest texels of the light one by one, where they fit, on the parts
-    that have them. What the viewer changes can be changed in it: light, turned or another, lamps, and materials that
-    are one for all of a part. A Radiance HDR file that is dropped on it is a light.
+    The page contains the viewer and all data. It computes direct light only. Ideally diffuse parts use transfer vectors
+    and parts of the system "harmonic" use transfer matrices, from harmonics of their visibility; both are stored as
+    bytes. Other parts use lobes and averaged visibility. All are stored as finely as `most` permits. If they fit, the
+    brightest texels of the light are summed one by one on the parts that support it. As in the viewer, the user can
+    rotate or replace the light, add lamps, and change materials that are constant over a part. A Radiance HDR file that
+    is dropped on the page becomes a light.
 
     Args:
-        scene: From `jaxprt.precompute`, with the systems "lobe" and "harmonic".
+        scene: The result of `jaxprt.precompute`, with the systems "lobe" and "harmonic".
         path: The file, `*.html`.
-        environments: Lights by names; the scene's own or the two embedded ones if None.
+        environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
         most: Largest size of the file in bytes.
 
     Returns:
-        Its size, and its error against the scene, bounces included if the scene has them.
+        A description of the page, with its size and its error against the scene. If the scene has bounces, the error
+        includes that they are missing in the page.
 
     Raises:
-        TypeError: No relit scene, or no environments.
-        ValueError: A file of another kind, a part that is of another system or anisotropic, or one that does not fit.
+        TypeError: `scene` is not a relit scene, or `environments` holds something other than lights.
+        ValueError: The suffix of the file is not .html, a part has another system or is anisotropic, or the page does
+            not fit into `most` bytes.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
     path = pathlib.Path(path)
@@ -100,7 +103,7 @@ def export(
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     bits = bits_of(scene)
-    # Shadows of a small sun are worth more than fine means of visibility.
+    # Sharp shadows of a small sun matter more than finely averaged visibility.
     fits = bits is not None and sum(each.size for each in bits if each is not None) <= _MOST_BITS
     least = 0
     for texels, size in itertools.product([True, False] if fits else [False], _sizes(scene)):
@@ -121,7 +124,7 @@ def export(
 
 
 class _Size(NamedTuple):
-    """How fine a page is: the finest scale of visibility, texels along its edge, and the degree of matrices."""
+    """Resolution of a page: the finest scale of visibility, texels along its edge, and the degree of matrices."""
 
     level: int
     edge: int
@@ -129,7 +132,7 @@ class _Size(NamedTuple):
 
 
 def _sizes(scene: RelitScene) -> list[_Size]:
-    """Sizes, from the finest to the coarsest: what takes more bytes becomes coarser first."""
+    """Resolutions from the finest to the coarsest. The data that takes more bytes is reduced first."""
     systems, scale = systems_of(scene), scale_of(scene)
     lobes = sum(each.vertices for each in systems if isinstance(each, lobe.LobeSystem))
     matrix = [each for each in systems if isinstance(each, harmonic.HarmonicSystem)]
@@ -150,7 +153,7 @@ def _sizes(scene: RelitScene) -> list[_Size]:
 
 
 def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
-    """Relative error over some views around the scene."""
+    """Relative L2 error over some views around the scene."""
     off = whole = 0.0
     for number in range(_VIEWS):
         turn = stages.about(2 * np.pi * number / _VIEWS)
@@ -171,7 +174,7 @@ def _page(
     error: float,
     title: str,
 ) -> bytes:
-    """The file."""
+    """The content of the HTML file."""
     reply = session.answer({"kind": "scene"})
     content, arrays = kept
     mips = parts.mips(next(iter(lights.values())).radiance.shape[-2])

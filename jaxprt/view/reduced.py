@@ -1,4 +1,4 @@
-"""Relit scenes with less in them: what a page that relights without Python has of them."""
+"""Relit scenes at reduced resolution, as exported pages contain them."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,61 +14,61 @@ from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.protocol import Joined, System
 from jaxprt.view import matrices
 
-_LIGHT = 32  # texels along the edge of the light's faces that lobes are read from
-_TEXELS = 64  # brightest texels that are summed one by one
+_LIGHT = 32  # texels along a face's edge of the light that lobes are looked up in
+_TEXELS = 64  # number of brightest texels that are summed one by one
 _GRAZING = 1e-3
-_KNOTS = 64  # of a table's parameter, at most
+_KNOTS = 64  # most knots of a table's parameter
 
 Exported = lobe.LobeSystem | harmonic.DiffuseSystem | harmonic.HarmonicSystem
 
 
 class CoarseTransport(lobe.LobeTransport):
-    """Visibility without its finest scales, read under a light of another size.
+    """Visibility without its finest scales, for a light of another size.
 
     Attributes:
-        edge: Texels along the edge of visibility's faces.
-        spread: That of the finest scale which is left.
+        edge: Texels along a face's edge of the visibility.
+        spread: Width of the finest remaining scale.
     """
 
     edge: int = eqx.field(static=True)
     spread: float = eqx.field(static=True)
 
     def lobe_visibility(self, face, s, t, spread, points=None):
-        """What each vertex sees of its lobes, by the scales that are left."""
+        """Visible fraction of each vertex's lobes, from the remaining scales."""
         whole = lobe.LobeTransport(self.pyramid, self.vector, self.position, self.frame, self.edge)
         return whole.lobe_visibility(face, s, t, jnp.maximum(spread, self.spread), points)
 
 
 class CoarseSystem(lobe.LobeSystem):
-    """Lobes under a light with fewer texels than it has."""
+    """A lobe system that reduces the resolution of its light."""
 
     def light(self, environment: Environment) -> lobe.LobeLight:
-        """The light with fewer texels, blurred."""
+        """The light at reduced resolution, blurred for lobes."""
         return super().light(resized(environment, size=self.transport.size))
 
 
 class LobesAlone(eqx.Module):
-    """What lobes carry of a BRDF, in 1/sr.
+    """The part of a BRDF that its lobes represent, in 1/sr.
 
     Attributes:
-        table: The lobes.
+        table: Table of the lobes.
     """
 
     table: lobe.LobeBrdf
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-        """Value: the lobes over the cosine, which counts as at least 0.001."""
+        """Value of the lobes divided by the cosine, which is at least 0.001."""
         return self.table(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
 
 
 def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = None) -> RelitScene:
-    """A scene as a page has it: without bounces and fine visibility of lobes, its vectors and matrices of bytes.
+    """A scene as an exported page contains it: no bounces, coarser visibility, and vectors and matrices as bytes.
 
     Args:
         scene: The scene.
         level: Finest scale of visibility, as `jaxprt.systems.lobe.pyramid.scales` numbers them.
-        texels: Whether the brightest texels of the light are summed one by one, on the parts that have them.
-        degree: Highest degree of transfer matrices; None for that which they have.
+        texels: Whether the brightest texels of the light are summed one by one, on the parts that support it.
+        degree: Highest degree of the transfer matrices; None keeps their degree.
     """
     systems = systems_of(scene)
     vectors = [vectors_of(each) for each in systems]
@@ -97,7 +97,7 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
 
 
 def _with_texels(system: System, full: System, shading: Shading) -> System:
-    """A system with the brightest texels of the light, each taken in its middle."""
+    """A system that sums the brightest texels of the light one by one, each at its center."""
     assert isinstance(full, bright_texels.BrightTexels)
     brdf = shading.brdf
     if isinstance(system, lobe.LobeSystem) and shading.blend is None:
@@ -106,12 +106,12 @@ def _with_texels(system: System, full: System, shading: Shading) -> System:
 
 
 def texels_of(size: int) -> int:
-    """How many texels of a light are summed one by one."""
+    """Number of texels of a light that are summed one by one."""
     return min(_TEXELS, 6 * size**2 - 1)
 
 
 def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"] | None] | None:
-    """Visibility of single texels for each part, None for one that has none; None where no part or not all lobes do."""
+    """Visibility of single texels for each part, None for parts without; None if a lobe part or every part lacks it."""
     result = [_bits(each) for each in scene.direct.part]
     lobes = [isinstance(each, lobe.LobeSystem) for each in systems_of(scene)]
     missing = [each is None for each in result]
@@ -132,11 +132,11 @@ def _bits(system: System) -> UInt8[np.ndarray, "v n"] | None:
 
 
 def resized(light: Environment, *, size: int) -> Environment:
-    """A light with fewer texels: means over the sphere.
+    """A light at reduced resolution: means over groups of texels.
 
     Args:
         light: The light.
-        size: A divisor of the edge of its faces.
+        size: Texels along a face's edge, a divisor of the light's own.
     """
     large = light.radiance.shape[-2]
     area = jnp.asarray(cubemap.solid_angle(size=large))[..., None]
@@ -146,7 +146,7 @@ def resized(light: Environment, *, size: int) -> Environment:
 
 
 def systems_of(scene: RelitScene) -> list[Exported]:
-    """The systems of the parts without single texels; refuses those that a page does not have."""
+    """The systems of the parts without single texels. Refuses systems that an exported page does not support."""
     result: list[Exported] = []
     for part, system in zip(scene.scene.parts, scene.direct.part, strict=True):
         own = system.system if isinstance(system, bright_texels.BrightTexels) else system
@@ -174,7 +174,7 @@ def _check(name: str, brdf: lobe.LobeBrdf) -> None:
 
 
 def scale_of(scene: RelitScene) -> pyramid.Scales | None:
-    """Scales of the visibility of the scene's glossy parts; None where there are none."""
+    """Scales of the visibility of the scene's glossy parts; None without glossy parts."""
     found = [each.transport for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)]
     if not found:
         return None
@@ -182,17 +182,17 @@ def scale_of(scene: RelitScene) -> pyramid.Scales | None:
 
 
 def edge_of(transport: lobe.LobeTransport) -> int:
-    """Texels along the edge of the faces of visibility."""
+    """Texels along a face's edge of the visibility."""
     return transport.edge if isinstance(transport, CoarseTransport) else transport.size
 
 
 def light_size(scene: RelitScene) -> int:
-    """Edge of the light that the lobes of a reduced scene are read from; 0 without lobes."""
+    """Texels along a face's edge of the light in which a reduced scene looks up its lobes; 0 without lobes."""
     return max((each.transport.size for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)), default=0)
 
 
 def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
-    """Transfer vectors of a part's vertices; none of one with matrices."""
+    """Transfer vectors of a part's vertices; empty for a part with transfer matrices."""
     if isinstance(system, harmonic.HarmonicSystem):
         return np.zeros((0, system.vertices))
     found = system.transport.vector
@@ -204,7 +204,7 @@ def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
 
 
 def visibility_of(scene: RelitScene) -> list[Float[np.ndarray, "k v"]]:
-    """Harmonics of the visibility of the vertices of each part; none of one without transfer matrices."""
+    """Harmonics of visibility at the vertices of each part; empty for parts without transfer matrices."""
     return [
         matrices.visibility_of(part.name, system)
         if isinstance(system, harmonic.HarmonicSystem)
@@ -214,7 +214,7 @@ def visibility_of(scene: RelitScene) -> list[Float[np.ndarray, "k v"]]:
 
 
 def vector_unit(vectors: list[np.ndarray]) -> Float[np.ndarray, " lm"]:
-    """What 1 of the signed bytes stands for, for each harmonic."""
+    """Quantization step of the signed bytes for each harmonic."""
     largest = np.zeros(max(map(len, vectors)))
     for each in vectors:
         largest[: len(each)] = np.maximum(largest[: len(each)], np.abs(each).max(1, initial=0))

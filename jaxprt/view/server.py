@@ -1,4 +1,4 @@
-"""The viewer without a notebook: a server on this machine alone, and the browser's page."""
+"""The viewer in a browser: a server that only this machine can reach, and the page that it serves."""
 
 import contextlib
 import http.server
@@ -33,7 +33,7 @@ const close = mount(document.getElementById("viewer"), ask);
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
 </script></body></html>
 """
-# Nothing from elsewhere is loaded, and no other page may show or read this one.
+# The page loads nothing from other hosts, and no other page may embed or read it.
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -44,21 +44,21 @@ _HEADERS = {
 
 
 class Server:
-    """A viewer at an address of this machine, until it is closed. Its address holds a random token.
+    """Serves a viewer on this machine until it is closed. Its address contains a random token.
 
     Attributes:
         url: The address.
     """
 
     def __init__(self, session: Session, *, port: int = 0):
-        """Starts to serve, in a thread of its own.
+        """Starts the server in a new thread.
 
         Args:
-            session: What to show.
-            port: Of this machine; a free one if 0.
+            session: The session to show.
+            port: Port of this machine; 0 chooses a free one.
 
         Raises:
-            OSError: The port is taken, or may not be.
+            OSError: The port is in use or not permitted.
         """
         token = secrets.token_urlsafe(16)
         self._server = _Listener(port, session, token)
@@ -67,11 +67,11 @@ class Server:
         self._thread.start()
 
     def close(self, *, patience: float = 10.0) -> None:
-        """Stops to serve, and gives the port back. Pictures that are being made are given up.
+        """Stops the server and releases the port. Unfinished pictures are abandoned.
 
         Args:
-            patience: Seconds to wait for answers that are being computed: a thread that computes when the interpreter
-                ends would end the process with an error.
+            patience: Seconds to wait for answers that are being computed. A thread that still computes when the
+                interpreter exits would end the process with an error.
         """
         self._server.session.end()
         self._server.shutdown()
@@ -110,24 +110,24 @@ class _Listener(http.server.ThreadingHTTPServer):
                     self.idle.set()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Remembers connections: browsers keep them open."""
+        """Records the connection, because browsers keep connections open."""
         self._open.add(request)
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forgets a connection that ends."""
+        """Removes the record of a connection that ends."""
         self._open.discard(request)
         super().shutdown_request(request)
 
     def server_close(self) -> None:
-        """Ends the connections that are open, too."""
+        """Closes open connections too."""
         super().server_close()
         for each in list(self._open):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Says nothing: a tab that was closed takes no answer."""
+        """Prints nothing: errors come from tabs that were closed before their answer."""
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -136,10 +136,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     server: _Listener  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing is logged: addresses hold the token."""
+        """Logs nothing, because addresses contain the token."""
 
     def do_GET(self) -> None:
-        """The page and its module."""
+        """Serves the page and its module."""
         if not self._allowed():
             return
         pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
@@ -151,7 +151,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._send(200, *found)
 
     def do_POST(self) -> None:
-        """A message of the page."""
+        """Answers a message of the page."""
         if not self._allowed():
             return
         length = self.headers.get("Content-Length", "")

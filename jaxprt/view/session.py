@@ -1,4 +1,4 @@
-"""One viewer's questions and their answers."""
+"""Answers the messages of a viewer."""
 
 import dataclasses
 import os
@@ -26,22 +26,22 @@ from jaxprt.view import messages, stages
 from jaxprt.view.messages import Look, Reply
 from jaxprt.view.stages import Stages
 
-_LARGEST = 2048.0  # pixels along an edge of a picture
+_LARGEST = 2048.0  # most pixels along an edge of a picture
 _PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
-_PIXELS = 400  # of a picture that the exact sum is compared at
-_COARSE = {"still": 2, "exact": 4}  # edge of a pixel of coarse pictures, in pixels
-_VIEWERS = 64  # whose newest look is remembered
+_PIXELS = 400  # pixels of a picture at which the exact sum is compared
+_COARSE = {"still": 2, "exact": 4}  # downscaling factor of coarse pictures
+_VIEWERS = 64  # most viewers whose newest look is remembered
 
 
 class _LateError(Exception):
-    """A later look has come from the viewer that a picture is for."""
+    """The viewer that requested a picture has sent a newer look."""
 
 
 class Session:
-    """What a viewer shows, and how it answers: the same for notebooks and for browsers.
+    """State of the viewer and its answers to messages, for notebooks and browsers alike.
 
-    Nothing queues: the browser asks for one look at a time. Looks are answered beside pictures at rest. A picture is
-    given up, between two of its steps, when a later look has come from the same viewer.
+    There is no queue, because the browser requests one look at a time. Looks are answered while full-quality pictures
+    are being computed. A picture is abandoned between two of its steps when the same viewer has sent a newer look.
 
     Attributes:
         stages: Lights, materials and views.
@@ -50,15 +50,16 @@ class Session:
     def __init__(
         self, systems: RelitScene | Mapping[str, RelitScene], *, environments: Mapping[str, Environment] | None = None
     ):
-        """Checks that all systems are of one scene, and all lights of one size.
+        """Checks that all systems have the same scene and all lights the same size.
 
         Args:
-            systems: The scene, made ready; or several systems of it, by names.
-            environments: Lights by names; the scene's own, or the two embedded ones.
+            systems: A relit scene, or a dictionary from names to several systems of one scene.
+            environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
 
         Raises:
-            TypeError: One of them is no relit scene, or no environment.
-            ValueError: There are none, they are of different scenes, or lights are of several sizes or batches.
+            TypeError: A system is not a relit scene, or a light is not an `Environment`.
+            ValueError: There is no system or light, the scenes differ, the lights have different sizes, or one is a
+                batch.
         """
         every = {"system": systems} if isinstance(systems, RelitScene) else dict(systems)
         if not every:
@@ -74,15 +75,15 @@ class Session:
         _check_lights(lights)
         self.stages = Stages(every, lights)
         self._lock = threading.Lock()
-        self._newest: OrderedDict[str, int] = OrderedDict()  # number of the newest look of each viewer
+        self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
         self._ended = False
 
     def end(self) -> None:
-        """Gives up the pictures that are being made: nobody waits for them any more."""
+        """Abandons the pictures that are being computed, because nobody waits for them any more."""
         self._ended = True
 
     def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
-        """The answer to a message of the browser. A message that is wrong is answered by one that says why."""
+        """Answers a message of the browser. The answer to an invalid message states the error."""
         kinds: dict[str, Callable[[Mapping[str, Any], Sequence[bytes]], Reply]] = {
             "scene": self._scene,
             "look": self._look,
@@ -102,7 +103,7 @@ class Session:
             return Reply({"kind": "error", "of": message.get("kind"), "message": str(error)}, [])
 
     def picture(self) -> Float[np.ndarray, "h w 3"]:
-        """What the viewer shows first, drawn from radiance at vertices, fit for a display."""
+        """The first picture of the viewer, from vertex radiance, encoded for display."""
         scene = self.stages.scene
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
@@ -159,7 +160,7 @@ class Session:
         return Reply(content, [data] if which is None else [data, np.packbits(which).tobytes()])
 
     def _which(self, message: Mapping[str, Any], look: Look) -> Bool[np.ndarray, " v"] | None:
-        """The vertices that a message asks for: those that the eye can see first, the others later; None for all."""
+        """Mask of the vertices that a message requests: those that face the eye, or the others; None for all."""
         asked = message.get("vertices", "all")
         if asked not in ("all", "seen", "unseen"):
             raise ValueError(f"vertices must be all, seen or unseen, got {asked!r}")
@@ -180,7 +181,7 @@ class Session:
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """The exact picture in direct light of the environment; and how far a picture of its size is off, by pixels."""
+        """The exact picture under direct light of the environment, and the relit picture's error at some pixels."""
         look, seq = self._parse(message)
         width, height, coarse = _size(message)
         between = self._between(message, seq)
@@ -198,7 +199,7 @@ class Session:
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
 
     def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """A picture of a light as it is before it is turned."""
+        """A picture of a light before rotation."""
         look, seq = self._parse(message)
         sky = np.asarray(self.stages.sky(look.light, look.lamps))
         data, scale = messages.encode(np.broadcast_to(sky, (*sky.shape[:2], 3)), stops=None)
@@ -206,7 +207,7 @@ class Session:
         return Reply({"kind": "sky", "seq": seq, "scale": scale, **size}, [data])
 
     def _drop(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """A file that was dropped on the viewer becomes a light."""
+        """Adds a light from a file that was dropped on the viewer."""
         file = pathlib.PurePath(str(message.get("name") or "light.hdr"))
         if len(buffers) != 1 or not len(buffers[0]):
             raise ValueError(f"{file.name} must hold an environment, got no bytes")
@@ -225,7 +226,7 @@ class Session:
             return Reply({"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}, [])
 
     def _between(self, message: Mapping[str, Any], seq: int) -> Callable[[], None]:
-        """What is called between the steps of a picture: it raises when a later look of its viewer has come."""
+        """A function to call between the steps of a picture. It raises if the viewer has sent a newer look."""
         viewer = _viewer(message)
 
         def between() -> None:
@@ -238,12 +239,12 @@ class Session:
 
 
 def _viewer(message: Mapping[str, Any]) -> str:
-    """The name that a viewer gave itself: each numbers its own looks."""
+    """The name that a viewer has chosen. Each viewer numbers its own looks."""
     return str(message.get("viewer", ""))[:64]
 
 
 def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
-    """Columns and rows of the picture that a message asks for, and whether it is a coarse one, which has fewer."""
+    """Width and height of the picture that a message requests, and whether it is a coarse one, which is smaller."""
     width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
     coarse = bool(message.get("coarse", False))
     step = _COARSE[message["kind"]] if coarse else 1

@@ -1,4 +1,4 @@
-"""What pictures are made of, stage by stage, kept until what it depends on changes."""
+"""Stages of picture computation, each cached until its inputs change."""
 
 import dataclasses
 import threading
@@ -20,27 +20,27 @@ from jaxprt.scene.environment import background, rotate
 from jaxprt.sphere import cubemap
 from jaxprt.view.messages import Lamp, Look
 
-_KEPT = 4  # results of each stage
-_FINE = 4  # parts along the edge of a texel, by which the rim of a lamp is found
-_SKY = 128  # rows of the picture of an environment
+_KEPT = 4  # cached results of each stage
+_FINE = 4  # subdivisions along a texel's edge, to resolve the rim of a lamp
+_SKY = 128  # height of the picture of an environment in pixels
 
 Made = TypeVar("Made")
 
 
 class Stages:
-    """Lights, materials, views and pictures of some systems of one scene. Threads may share it.
+    """Lights, materials, views and pictures of several systems of one scene. It is safe to share between threads.
 
     Attributes:
-        systems: The scene, made ready by each system, by names.
-        lights: Environments of one size.
+        systems: Relit scene of each system, by name.
+        lights: Environments of equal size.
         name: Names of the lights.
     """
 
     def __init__(self, systems: Mapping[str, RelitScene], environments: Mapping[str, Environment]):
-        """Keeps what there is; a light more may come."""
+        """Stores the systems and lights. More lights may be added later."""
         self.systems = dict(systems)
         self.name, self.lights = list(environments), list(environments.values())
-        # Without bounces; and without lamps too, as exact pictures are.
+        # Scenes without bounces; and without lamps too, to compare with exact pictures.
         given = {name: (each.scene, each.direct, each.shading) for name, each in systems.items()}
         self._bare = {name: RelitScene(*each, lamps=systems[name].lamps) for name, each in given.items()}
         self._direct = {name: RelitScene(*each) for name, each in given.items()}
@@ -49,7 +49,7 @@ class Stages:
 
     @property
     def scene(self) -> RelitScene:
-        """The scene by its first system."""
+        """The relit scene of the first system."""
         return next(iter(self.systems.values()))
 
     @property
@@ -58,15 +58,15 @@ class Stages:
         return self.lights[0].radiance.shape[-2]
 
     def system(self, look: Look) -> RelitScene:
-        """The system that a look wants."""
+        """The relit scene of the system that a look names."""
         return (self.systems if look.bounces else self._bare)[look.system]
 
     def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
-        """A light with the lamps in it."""
+        """A light with the lamps added, before rotation."""
         return self._once("unturned", (number, lamps), lambda: _with(self.lights[number], lamps))
 
     def environment(self, look: Look) -> Environment:
-        """The light of a look, turned."""
+        """The rotated light of a look."""
         unturned = self.unturned(look.light, look.lamps)
         if look.turn == 0:
             return unturned
@@ -74,7 +74,7 @@ class Stages:
         return self._once("environment", key, lambda: rotate(unturned, about(look.turn)))
 
     def sky(self, number: int, lamps: tuple[Lamp, ...]) -> Float[Array, "h w 3"]:
-        """A picture of a light, not turned: +y on top, +z in the middle."""
+        """A latitude-longitude picture of a light before rotation: +y on top, +z in the center."""
         latitude = np.pi * (0.5 - (np.arange(_SKY) + 0.5) / _SKY)[:, None]
         longitude = np.pi * (1 - 2 * (np.arange(2 * _SKY) + 0.5) / (2 * _SKY))
         ring = np.cos(latitude)
@@ -82,7 +82,7 @@ class Stages:
         return background(self.unturned(number, lamps), jnp.asarray(np.stack(way, -1), jnp.result_type(float)))
 
     def materials(self, look: Look) -> dict[str, TexturedMaterial | BlinnPhong]:
-        """The changed materials of a look."""
+        """The materials that a look changes, by part."""
         parts = {part.name: part for part in self.scene.scene.parts}
         unknown = [name for name, _ in look.material if name not in parts]
         if unknown:
@@ -90,12 +90,12 @@ class Stages:
         return {name: changed(parts[name].material, name, dict(values)) for name, values in look.material if values}
 
     def appearances(self, look: Look) -> dict[str, Appearance]:
-        """The same at the vertices."""
+        """The changed materials of a look, evaluated at the vertices."""
         key = look.system, look.material
         return self._once("material", key, lambda: self.system(look).appearances(self.materials(look)))
 
     def light_side(self, look: Look) -> Any:
-        """What the light is to the system, and what of it arrives."""
+        """The part of the system's computation that depends only on the light."""
         system = self.system(look)
         light_key = look.system, look.bounces, look.light, look.lamps, look.turn
         light = self._once("light", light_key, lambda: system.light(self.environment(look)))
@@ -105,22 +105,22 @@ class Stages:
         return self._once("shade", key, lambda: system.shade(light, self.appearances(look)))
 
     def view_side(self, look: Look) -> Any:
-        """What the eye and the materials are to the system."""
+        """The part of the system's computation that depends only on the eye and the materials."""
         key = look.system, look.bounces, look.eye, look.material
         eye = jnp.asarray(look.eye, jnp.result_type(float))
         return self._once("view", key, lambda: self.system(look).view(eye, self.appearances(look)))
 
     def color(self, look: Look) -> Float[np.ndarray, "v 3"]:
-        """Radiance of the vertices."""
+        """Radiance at the vertices towards the eye."""
 
         def combined() -> Float[np.ndarray, "v 3"]:
             color = np.asarray(self.system(look).combine(self.light_side(look), self.view_side(look)))
-            return np.broadcast_to(color, (len(color), 3))  # gray ones have one channel
+            return np.broadcast_to(color, (len(color), 3))  # gray scenes have one channel
 
         return self._once("color", look, combined)
 
     def facing(self, look: Look) -> Bool[np.ndarray, " v"]:
-        """Whether each vertex is a corner of a triangle that is seen from its front."""
+        """Whether each vertex belongs to a triangle whose front faces the eye."""
         mesh = self.scene.mesh
 
         def faces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,26 +140,26 @@ class Stages:
     def picture(
         self, look: Look, width: int, height: int, *, samples: int = 4, between: Between = None
     ) -> Float[np.ndarray, "h w 3"]:
-        """The picture at pixels. Options are those of `RelitScene.picture`."""
+        """The picture with shading at pixels. `RelitScene.picture` explains the options."""
         given = self.environment(look), camera(look, width, height)
         options = {"samples": samples, "between": between}
         found = self.system(look).picture(*given, materials=self.materials(look), **options)
         return np.broadcast_to(np.asarray(found), (height, width, 3))
 
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
-        """The picture in direct light of the environment alone."""
+        """The picture under direct light of the environment only."""
         given = self.environment(look), camera(look, width, height)
         found = self._direct[look.system].picture(*given, materials=self.materials(look), between=between)
         return np.broadcast_to(np.asarray(found), (height, width, 3))
 
     def changed_scene(self, look: Look) -> Scene:
-        """The scene with the changed materials in it."""
+        """The scene with the changed materials."""
         new, scene = self.materials(look), self.scene.scene
         parts = [dataclasses.replace(part, material=new.get(part.name, part.material)) for part in scene.parts]
         return dataclasses.replace(scene, parts=parts)
 
     def _once(self, stage: str, key: Hashable, make: Callable[[], Made]) -> Made:
-        """What was made from the same before, or else is made now."""
+        """The cached result for a key, computed now if it is missing."""
         with self._lock:
             kept = self._kept.setdefault(stage, OrderedDict())
             if key in kept:
@@ -174,7 +174,7 @@ class Stages:
 
 
 def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
-    """Faces whose corners go around counterclockwise, seen from the side that their normals point to."""
+    """Faces with corners in counterclockwise order as seen from the side to which their normals point."""
     face = np.asarray(mesh.face).astype("<u4")
     position, normal = np.asarray(mesh.position, np.float64), np.asarray(mesh.normal, np.float64)
     edge, other = (position[face[:, k]] - position[face[:, 0]] for k in (1, 2))
@@ -184,7 +184,7 @@ def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
 
 
 def about(angle: float) -> Float[Array, "3 3"]:
-    """The turn about +y by an angle in radians."""
+    """Rotation matrix about +y by an angle in radians."""
     c, s = np.cos(angle), np.sin(angle)
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
@@ -195,7 +195,7 @@ def camera(look: Look, width: int, height: int) -> Camera:
 
 
 def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
-    """What of a part's material can change, with its values now; None for a BRDF, which stays."""
+    """Parameters of a part's material that the viewer can change, with their values; None for a fixed BRDF."""
     if isinstance(material, BlinnPhong) and shading.blend is not None:
         least, most = exponent_range(shading)
         specular = np.broadcast_to(np.asarray(material.specular, float), (3,))
@@ -221,10 +221,10 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
 
 
 def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial | BlinnPhong:
-    """A material of other roughness, reflectance and colors.
+    """The material with other values of roughness, reflectance and colors.
 
     Raises:
-        ValueError: It is a BRDF, which cannot change.
+        ValueError: The material is a BRDF, which cannot change.
     """
     if isinstance(material, BlinnPhong):
         new = {each: jnp.asarray(values[each]) for each in ("diffuse", "exponent") if each in values}
@@ -244,7 +244,7 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
 
 
 def _tinted(color: Any, white: float, values: Mapping[str, Any]) -> Float[Array, "3"]:
-    """A color of another strength, of which 1 reflects so much at normal incidence, or of another tint."""
+    """A specular color with another strength or tint. A strength of 1 has the reflectance `white`."""
     old = np.broadcast_to(np.asarray(color), (3,))
     strength = values["f0"] / white if "f0" in values else float(old.max())
     tint = np.asarray(values["specular"]) if "specular" in values else old / max(old.max(), 1e-6)
@@ -258,7 +258,7 @@ def _f0(material: TexturedMaterial) -> float:
 
 
 def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
-    """A light with disks of light in it; one that is smaller than a texel keeps its flux."""
+    """A light with lamps added as disks. A disk smaller than a texel keeps its flux."""
     size = light.radiance.shape[-2]
     radiance = np.asarray(light.radiance, np.float64)
     if not lamps:

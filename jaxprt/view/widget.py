@@ -1,4 +1,4 @@
-"""The viewer in a notebook, by anywidget."""
+"""The viewer in a notebook, as an anywidget."""
 
 import base64
 import html
@@ -16,8 +16,8 @@ from jaxprt import files
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 
-# JupyterLab's outputs of one cell follow each other. The picture goes when the viewer has its first answer. Without a
-# kernel there is no viewer, and JupyterLab's words in its place, which are all that is in there, go.
+# JupyterLab stacks the outputs of a cell. The static picture disappears when the viewer has received its first answer.
+# Without a kernel there is no viewer, and the style hides the text that JupyterLab shows in its place.
 _STYLE = """<style>
 .jp-OutputArea-child:has(.jaxprt-picture):has(+ .jp-OutputArea-child .jaxprt-live),
 .jp-OutputArea-child:has(.jaxprt-picture) + .jp-OutputArea-child .jp-OutputArea-output.jupyter-widgets:not(:has(*))
@@ -26,38 +26,38 @@ _STYLE = """<style>
 
 
 class Viewer(anywidget.AnyWidget):
-    """A viewer in a cell.
+    """A viewer in a notebook cell.
 
-    Answers are made in threads of its own, so that a picture at rest does not keep looks waiting, nor the kernel. Of
-    pictures at rest there is one at a time.
+    Its own threads compute the answers, so that a full-quality picture blocks neither looks nor the kernel. At most one
+    full-quality picture is computed at a time.
 
     Attributes:
-        session: What it shows.
-        height: Of the viewer in the page's pixels.
+        session: The session that it shows.
+        height: Height of the viewer in pixels of the page.
     """
 
     _esm = MODULE
     height = traitlets.Int(480, min=1).tag(sync=True)
 
     def __init__(self, session: Session, *, height: int = 480):
-        """Shows a session."""
+        """Makes a viewer of a session."""
         super().__init__(height=height)
         self.session = session
         self._looks, self._rests = (ThreadPoolExecutor(1, thread_name_prefix="jaxprt-view") for _ in range(2))
         self.on_msg(self._heard)
 
     def close(self) -> None:
-        """Takes the viewer out of the notebook."""
+        """Removes the viewer from the notebook."""
         for each in (self._looks, self._rests):
             each.shutdown(wait=False, cancel_futures=True)
         super().close()
 
     def __repr__(self) -> str:
-        """The names of what it shows, the same in every run."""
+        """The names of the systems and lights; the same in every run."""
         return f"Viewer of {', '.join(part.name for part in self.session.stages.scene.scene.parts)}"
 
     def _ipython_display_(self, **options: Any) -> None:
-        """Shows a picture, and the widget that takes its place: a saved notebook has the picture without a kernel."""
+        """Displays a picture and the widget that replaces it. A saved notebook shows the picture without a kernel."""
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder) / "picture.png"
             files.write_png(path, self.session.picture())
@@ -68,7 +68,7 @@ class Viewer(anywidget.AnyWidget):
         found = super()._repr_mimebundle_(**options)
         if found is not None:
             data, more = found
-            data.pop("text/plain")  # which pages would show under the picture
+            data.pop("text/plain")  # pages would show it below the picture
             display(data, metadata=more, raw=True)
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:

@@ -1,4 +1,4 @@
-"""What vertices see of the distant sphere: rays, hits, stored visibility, the loop over blocks, and refinement."""
+"""Visibility of the distant sphere from mesh vertices: ray casting, storage, the block loop, and mesh refinement."""
 
 from jaxprt.visibility import blocks, diffuse, hits, members, occluder, points, rays, refinement, stored
 from jaxprt.visibility.blocks import Part, UnfinishedError

@@ -1,4 +1,4 @@
-"""The block loop: independent blocks, computed anywhere, stored as they come, resumed where they stopped."""
+"""The block loop of precomputation: computes independent blocks in any executor, stores each, and can resume."""
 
 import abc
 import collections
@@ -20,61 +20,61 @@ from jaxprt.files import mapped
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import Mesh
 
-_HELD = 1 << 28  # bytes of results, and of copies of a job, that are on their way at once
-_MOST = 4096  # blocks on their way at once
+_HELD = 1 << 28  # bytes of results, and of copies of a job, that may be in flight at once
+_MOST = 4096  # blocks that may be in flight at once
 
 
 class Job(abc.ABC):
-    """What a block loop computes. Travels to workers by pickle, once to each."""
+    """A computation in blocks. Each worker receives it once, by pickle."""
 
     @property
     @abc.abstractmethod
     def header(self) -> Mapping[str, Any]:
-        """What the result depends on, as JSON values; equal headers mean equal results, up to what `near` tells.
+        """Everything that the result depends on, as JSON values. Equal headers and `near` mean equal results.
 
-        With the name of a `system` belongs the version of its `algorithm`, which a release raises when results change.
+        It holds the name of the `system` and the version of its `algorithm`, which a release raises if results change.
         """
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        """Sketches, by `jaxprt.files.arrays.sketch`, of what the result depends on and rounding may change."""
+        """Sketches (see `jaxprt.files.arrays.sketch`) of input arrays that may differ by rounding."""
         return {}
 
     @property
     @abc.abstractmethod
     def layout(self) -> Mapping[str, Layout]:
-        """Per result array, the shape of one block."""
+        """Shape of one block of each result array."""
 
     @property
     @abc.abstractmethod
     def vertices(self) -> int:
-        """Number of vertices; the last block is padded beyond them."""
+        """Number of vertices. The last block is padded."""
 
     @property
     def step(self) -> int:
-        """Vertices in a block: the extent of the first result array along its axis, unless a job says otherwise."""
+        """Vertices per block: by default the extent of the first result array along its block axis."""
         at = next(iter(self.layout.values()))
         return at.shape[at.axis]
 
     @abc.abstractmethod
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
-        """One block of every result array, and the number of rays that it took."""
+        """Computes one block of every result array. Also returns the number of rays that it traced."""
 
 
 class Part(ThreadPoolExecutor):
-    """Computes the k-th of n equal parts of every job's blocks on this machine, and leaves the others to others.
+    """An executor that computes only the k-th of n equal parts of a job's blocks, on this machine.
 
-    Many machines share a job by this, with nothing but a folder in common. Give it as the `executor`, with the same
-    `path` everywhere. A job whose other parts are not finished yet raises `UnfinishedError`. The part that ends last,
-    or a call without a part, returns the whole result.
+    With it several machines can share a job; they need only a shared folder. Pass it as `executor`, with the same
+    `path` on every machine. A call whose part is finished while others are not raises `UnfinishedError`. The call that
+    finishes the last part, or a later call without a part, returns the whole result.
 
     Args:
-        number: Which part, from 1.
+        number: Number of the part, starting at 1.
         count: Number of parts.
 
     Raises:
-        TypeError: Numbers that are not whole.
-        ValueError: No such part.
+        TypeError: `number` or `count` is not an integer.
+        ValueError: `number` is not between 1 and `count`.
     """
 
     def __init__(self, number: int, count: int):
@@ -85,17 +85,17 @@ class Part(ThreadPoolExecutor):
         self.number, self.count = number, count
 
     def of(self, blocks: int) -> range:
-        """The blocks that this part computes. They are neighbors, so that two writers rarely meet in a file."""
+        """The blocks that this part computes. They are contiguous, so that two writers rarely use the same file."""
         return range((self.number - 1) * blocks // self.count, self.number * blocks // self.count)
 
 
 class UnfinishedError(RuntimeError):
-    """A part is done, but other parts of the same job are not."""
+    """This part of the job is finished, but other parts are not."""
 
 
 def cores() -> int:
-    """Number of cores that this process may use: those that a batch system gave it, where it gave some."""
-    affinity = getattr(os, "sched_getaffinity", None)  # Linux has it
+    """Number of cores that this process may use. A batch system may have assigned fewer than the machine has."""
+    affinity = getattr(os, "sched_getaffinity", None)  # only on Linux
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
@@ -109,24 +109,25 @@ def compute(
 ) -> dict[str, np.ndarray]:
     """Computes all blocks of a job.
 
-    With a path, each block is written where it is computed, if that machine sees the folder, and dropped.
+    With a path, the worker that computes a block also writes it, if it can access the folder.
 
     Args:
-        job: What to compute.
-        path: Folder in which finished blocks are kept; blocks found there are not computed again.
-        executor: Where blocks are computed; threads on this machine's cores if None. A `Part` computes its own blocks.
+        job: The computation.
+        path: Folder of the store. Finished blocks are kept there; blocks found there are not computed again.
+        executor: Executor that computes the blocks; threads on this machine's cores if None. A `Part` computes only
+            its own blocks.
         progress: Whether to show a progress bar.
-        label: Its text.
+        label: Text of the progress bar.
 
     Returns:
-        The result arrays; those that have a place for each vertex are cut to the number of vertices. With a path, those
-        whose vertices come first are maps of the store's files: pages are read when they are first used.
+        The result arrays. Arrays with one entry per vertex are cut to the number of vertices. With a path, arrays
+        whose first axis is that of the blocks are memory-mapped: pages are read when they are first used.
 
     Raises:
-        ValueError: The store at `path` was made from something else, or a part of a job has no path.
-        BlockingIOError: Another process is writing to it.
+        ValueError: The store at `path` was made from other inputs, or `executor` is a `Part` and there is no path.
+        BlockingIOError: Another process is writing to the store.
         OSError: The disk is full; finished blocks are kept in the store.
-        UnfinishedError: The part is done, and others are not.
+        UnfinishedError: This part is finished, but others are not.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
     blocks = -(-job.vertices // job.step)
@@ -146,7 +147,7 @@ def compute(
         bar.update(total - sum(_count(job, block) for block in todo))
         if todo:
             with store.writing((1, 1) if part is None else (part.number, part.count)):
-                # Another process may have finished some of them before this one got the lock.
+                # Another process may have finished some blocks before this one acquired the lock.
                 _run(job, _missing(store, todo), store.write, store, executor, bar)
         bar.update(bar.total - bar.n)
     if part is not None:
@@ -160,7 +161,7 @@ def compute(
 
 
 class _Kept:
-    """Results that are held in memory alone.
+    """Results that are held in memory only, without a store.
 
     Attributes:
         array: The result arrays.
@@ -174,7 +175,7 @@ class _Kept:
         }
 
     def place(self, block: int, array: Mapping[str, np.ndarray]) -> None:
-        """Puts one block of every array where it belongs."""
+        """Copies one block of every array to its place."""
         for name, at in self._job.layout.items():
             first = block * at.shape[at.axis]
             before = (slice(None),) * at.axis
@@ -183,7 +184,7 @@ class _Kept:
 
 
 def fingerprint(*array: Any) -> str:
-    """SHA-256 of arrays: their shapes, types and bytes."""
+    """SHA-256 of the shapes, types and bytes of some arrays."""
     digest = hashlib.sha256()
     for each in array:
         each = np.ascontiguousarray(np.asarray(each))
@@ -192,23 +193,23 @@ def fingerprint(*array: Any) -> str:
 
 
 def scene_key(mesh: Mesh) -> str:
-    """Fingerprint of a mesh's surfaces and regions, by which results for it know each other.
+    """Fingerprint of a mesh: its positions, normals, faces and regions. Results of the same mesh have the same key.
 
-    Tangents do not count, and neither do the types in which arrays are held.
+    Tangents do not count, and neither do the element types of the arrays.
     """
     single = [np.asarray(each, np.float32) for each in (mesh.position, mesh.normal)]
     return fingerprint(*single, *(np.asarray(each, np.int32) for each in (mesh.face, mesh.region)))
 
 
 def _run(job, todo, keep, store, executor, bar) -> None:
-    """Computes blocks and gives each to `keep`, unless the worker has written it to the store itself."""
+    """Computes blocks and passes each to `keep`, unless the worker has already written it to the store."""
     key = uuid.uuid4().hex
     own = ThreadPoolExecutor(cores()) if executor is None else None
     pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]
     here = own is not None or isinstance(executor, Part)
     _jobs[key] = job, store
-    # Where each core has a block, LAPACK's own threads wait by spinning: beside two busy processes clusters took three
-    # times as long. An executor that the caller brings has its own setting.
+    # Every core already computes a block, and the additional threads of LAPACK would wait by spinning: beside two
+    # busy processes clusters took three times as long. An executor that the caller passes has its own setting.
     limit = threadpool_limits(limits=1, user_api="blas") if here else None
     flow = _Flow(pool, key, (job, store), ahead=_ahead(job, here))
     rays = 0
@@ -238,9 +239,9 @@ def _run(job, todo, keep, store, executor, bar) -> None:
 
 
 class _Flow:
-    """Blocks on their way through an executor, a bounded number at a time, so that results do not pile up.
+    """Submits blocks to an executor, a bounded number at a time, so that results do not accumulate in memory.
 
-    The job travels to workers that do not know it yet, in a bounded number of copies too.
+    The job is sent to each worker that does not have it yet, also in a bounded number of copies.
     """
 
     def __init__(self, pool: Executor, key: str, work: tuple[Job, BlockStore | None], *, ahead: int):
@@ -252,7 +253,7 @@ class _Flow:
         self._pickle: bytes | None = None
 
     def results(self, todo) -> Iterator[tuple[int, tuple[Mapping[str, np.ndarray] | None, int]]]:
-        """Each block with its result, as they come."""
+        """Yields each block with its result, in order of completion."""
         waiting = collections.deque(todo)
         while waiting or self._flying:
             while waiting and len(self._flying) < self._ahead:
@@ -260,14 +261,14 @@ class _Flow:
             block = self._done.get()
             answer = self._flying.pop(block).result()
             self._carrying.discard(block)
-            if answer is None:  # The worker did not know the job: it, or another, gets it with its next block.
+            if answer is None:  # The worker did not have the job: a later block carries it.
                 self._asked += 1
                 waiting.appendleft(block)
             else:
                 yield block, answer
 
     def cancel(self) -> None:
-        """Cancels what has not begun."""
+        """Cancels the blocks that have not started."""
         for each in self._flying.values():
             each.cancel()
 
@@ -284,14 +285,14 @@ class _Flow:
         future.add_done_callback(lambda _: self._done.put(block))
 
 
-# Per process: the jobs that it was sent, the last two at most, and their stores where it can write to them.
+# The at most two latest jobs that this process has received, each with its store if the process can write to it.
 _jobs: dict[str, tuple[Job, BlockStore | None]] = {}
 
 
 def _work(key: str, sent: bytes | None, block: int) -> tuple[Mapping[str, np.ndarray] | None, int] | None:
-    """Runs in a worker: one block, or None where the worker has not been sent the job yet.
+    """Computes one block in a worker. Returns None if the worker has not received the job yet.
 
-    The arrays of the block are None where they have been written to the store.
+    In place of the block's arrays it returns None if it has written them to the store.
     """
     if sent is not None and key not in _jobs:
         while len(_jobs) > 1:
@@ -309,13 +310,13 @@ def _work(key: str, sent: bytes | None, block: int) -> tuple[Mapping[str, np.nda
 
 
 def _ahead(job: Job, here: bool) -> int:
-    """Blocks that are computed or wait for it at once: two a core here, some hundred megabytes of results elsewhere."""
+    """Largest number of blocks in flight: two per core on this machine, elsewhere some hundred megabytes of results."""
     size = sum(int(np.prod(at.shape)) * np.dtype(at.dtype).itemsize for at in job.layout.values())
     return 2 * cores() if here else max(2 * cores(), min(_HELD // max(1, size), _MOST))
 
 
 def _missing(store: BlockStore, blocks: Iterable[int]) -> list[int]:
-    """Those of some blocks that the store lacks; checksums are taken on all cores."""
+    """The blocks that are missing from the store. All cores check checksums."""
     written = store.written()
     with ThreadPoolExecutor(cores()) as pool:
         blocks = list(blocks)
@@ -324,7 +325,7 @@ def _missing(store: BlockStore, blocks: Iterable[int]) -> list[int]:
 
 
 def _entries(at: Layout, job: Job, blocks: int) -> int:
-    """Entries of an array along its axis: one for each vertex, or all of its blocks."""
+    """Entries of a whole array along its block axis: one per vertex, or the entries of all blocks."""
     return job.vertices if at.shape[at.axis] == job.step else at.shape[at.axis] * blocks
 
 

@@ -1,4 +1,4 @@
-"""What a white diffuse surface reflects of distant light, at any point of the surface."""
+"""Radiance that a white diffuse surface reflects under distant light, at any of its points."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,22 +12,22 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.rays import start_points
 
-_RAYS = 1 << 17  # rays in one call: what a core's cache holds
+_RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
 
 class DiffuseTracer:
-    """Traces light at points of a surface while the surface is divided.
+    """Traces shadow rays from points of a surface while the surface is being subdivided.
 
     Args:
-        mesh: The surface, before it is divided.
-        occluder: What casts shadows; it may have some or all triangles of the surface.
-        samples: The light.
-        pool: Where rays are traced.
+        mesh: The surface, before subdivision.
+        occluder: Geometry that casts shadows. It may contain some or all triangles of the surface.
+        samples: Directions and weights that sample the lights.
+        pool: Threads that trace the rays.
 
     Attributes:
-        nudge: How far from the surface rays start.
+        nudge: Distance of ray origins from the surface.
         casts: Which triangles of the surface are in the occluder.
-        double: Which triangles of the surface have the same corners as another one: the two sides of a sheet.
+        double: Which triangles of the surface have the same corners as another triangle: the two sides of a sheet.
     """
 
     casts: Bool[np.ndarray, " f"]
@@ -35,7 +35,7 @@ class DiffuseTracer:
 
     def __init__(self, mesh: Mesh, occluder: Mesh, samples: LightSamples, pool: ThreadPoolExecutor):
         self._samples, self._pool = samples, pool
-        # In NumPy, so that shapes do not compile.
+        # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
         self.nudge = self._rays.nudge
@@ -49,7 +49,7 @@ class DiffuseTracer:
         self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
 
     def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
-        """Light at the vertices of the surface before it is divided."""
+        """Reflected radiance at the vertices of the surface, before subdivision."""
         return self._light(start_points(self._mesh, self._rays), np.asarray(self._mesh.normal, np.float64))
 
     def at(
@@ -60,17 +60,17 @@ class DiffuseTracer:
         casting: Int[np.ndarray, "m 3"],
         vertex: Int[np.ndarray, " p"],
     ) -> Float32[np.ndarray, "p l c"]:
-        """Light at some vertices of the divided surface.
+        """Reflected radiance at some vertices of the subdivided surface.
 
         Args:
             position: Positions of all vertices.
-            normal: Their normals, of any length.
-            around: All triangles around the vertices that are asked for.
-            casting: What those triangles of the surface that are in the occluder have become.
-            vertex: The vertices.
+            normal: Normals of all vertices, of any length.
+            around: Vertex indices of all triangles around the vertices `vertex`.
+            casting: Vertex indices of the subdivided triangles that belong to the occluder.
+            vertex: Indices of the vertices at which radiance is wanted.
 
         Returns:
-            Light for each source and color of the samples.
+            Radiance for each light and color of the samples.
         """
         if not vertex.size:
             return np.zeros((0, *self._samples.weight.shape[1:]), np.float32)
@@ -84,7 +84,7 @@ class DiffuseTracer:
         return self._light(start[index[around.size :]], normal[vertex])
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Light that a surface of some normals reflects where rays start."""
+        """Radiance that surfaces with the given normals reflect at the given ray origins."""
         direction, weight = self._samples
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         upright = (normal / np.where(length > 0, length, 1)).astype(np.float32)
@@ -103,7 +103,7 @@ class DiffuseTracer:
 
 
 def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray | None = None) -> Mesh:
-    """A mesh in NumPy arrays, so that new shapes do not compile, with what `start_points` and `Occluder` look at."""
+    """A mesh in NumPy arrays, so that new shapes do not cause compilation. Fields that rays do not need are zero."""
     upright = np.zeros_like(position) if normal is None else normal
     fields = position.astype(np.float32), face.astype(np.int32), upright.astype(np.float32)
     place, corner, upright = (jax.device_put(each) for each in fields)

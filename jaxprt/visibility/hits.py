@@ -1,4 +1,4 @@
-"""Where rays from points on surfaces meet other surfaces, and whether they meet these from the front."""
+"""Intersections of rays from surface points with the scene, and whether rays hit the front of a surface."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -10,16 +10,17 @@ from jaxprt.visibility.occluder import Occluder
 def hits(
     occluder: Occluder, start: Float[np.ndarray, "b 3"], normal: Float[np.ndarray, "b 3"], *, size: int
 ) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " h"], Int[np.ndarray, "h 3"], Float[np.ndarray, "h 3"], int]:
-    """Where rays through the texels above some points' horizons meet a scene.
+    """Intersections of a scene with rays from some points through all cubemap texels above their horizons.
 
     Args:
         occluder: The scene.
-        start: Points where rays start.
-        normal: Normals there.
-        size: Edge of the faces through whose texels rays are sent.
+        start: Origins of the rays.
+        normal: Unit normals at these points.
+        size: Edge of the cubemap's faces in texels.
 
     Returns:
-        Of each hit the point, the texel, the triangle's corners and the weights of these; and the number of rays.
+        For each hit the index of the point, the index of the texel, the vertices of the triangle and its barycentric
+        coordinates; and the total number of rays.
     """
     area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
     direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
@@ -36,9 +37,10 @@ def front(
     corner: Int[np.ndarray, "h 3"],
     direction: Float[np.ndarray, "h 3"],
 ) -> Bool[np.ndarray, " h"]:
-    """Whether rays meet the fronts of triangles, which alone send light.
+    """Whether each ray hits the front of a triangle. Only fronts reflect light.
 
-    That is the side of the corners' normals together, since one of these may look away where the others are seen.
+    The front is the side to which the sum of the corners' normals points, because a single normal may face away from a
+    ray that hits the front.
     """
     at = occluder.position[corner]
     across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
@@ -52,12 +54,12 @@ def first_fronts(
     start: Float32[np.ndarray, "b 3"],
     direction: Float32[np.ndarray, "b 3"],
 ) -> tuple[Int[np.ndarray, " b"], Float[np.ndarray, "b 3"]]:
-    """The first triangle on each ray and the weights of its corners; -1 where rays meet nothing, or a back.
+    """The first triangle on each ray and its barycentric coordinates; -1 if the ray hits nothing or a back.
 
     Args:
         occluder: The scene.
-        normal: Normals of its vertices.
-        start: Where rays start.
+        normal: Normals of the scene's vertices.
+        start: Origins of the rays.
         direction: Unit directions.
     """
     triangle, _, barycentric = occluder.hit(start, direction)

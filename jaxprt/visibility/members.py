@@ -1,4 +1,4 @@
-"""Clusters of vertices that lie and face alike, which are decomposed together."""
+"""Clusters of vertices with similar positions and normals, whose transport is factored together."""
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -6,20 +6,20 @@ from jaxtyping import Array, Float, Int
 from jaxprt.decompose import clustering
 from jaxprt.visibility import blocks
 
-_CLUSTERS = 0.84  # for one vertex: 160 for 36,000
+_CLUSTERS = 0.84  # times the square root of the number of vertices: 160 clusters for 36,000 vertices
 
 
 def cluster(
     position: Float[Array | np.ndarray, "v 3"], normal: Float[Array | np.ndarray, "v 3"], *, clusters: int
 ) -> Int[np.ndarray, "p m"]:
-    """Vertices of each cluster, alike in position and normal, by `jaxprt.decompose.clustering.bisect`."""
+    """Indices of each cluster's vertices, by `jaxprt.decompose.clustering.bisect` in position and normal."""
     return clustering.bisect(coordinates(position, normal), clusters=clusters)
 
 
 def coordinates(
     position: Float[Array | np.ndarray, "v 3"], normal: Float[Array | np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v 6"]:
-    """Positions and normals in comparable units: each with a mean square of one."""
+    """Positions and normals of vertices as one array, each centered and scaled to a mean square of one."""
     coordinate = []
     for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
         offset = each - each.mean(0)
@@ -28,7 +28,7 @@ def coordinates(
 
 
 def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:
-    """A row of each vertex among the members of all clusters, one after another; those in several are in the last."""
+    """Row of each vertex in the concatenation of all clusters. A vertex of several clusters gets its last row."""
     row = member.ravel()
     result = np.zeros(row.max() + 1, np.int32)
     result[row] = np.arange(row.size)
@@ -36,29 +36,29 @@ def places(member: Int[np.ndarray, "p m"]) -> Int[np.ndarray, " v"]:
 
 
 def clusters_for(vertices: int) -> int:
-    """How many clusters suit a number of vertices: as many as its square root, about.
+    """A suitable number of clusters, proportional to the square root of the number of vertices.
 
-    On finer meshes there are both more of them, and more vertices in each. The error then stays the same with equal
-    components: fewer vertices in the clusters of coarse meshes make up for how far apart they are.
+    A finer mesh gets more clusters and more vertices in each. With an equal number of components the error then stays
+    the same: the clusters of a coarse mesh have fewer vertices, but these are farther apart.
     """
     return max(1, round(_CLUSTERS * vertices**0.5))
 
 
 class ClusterJob(blocks.Job):
-    """A job whose blocks are clusters.
+    """A job in which each block is a cluster of vertices.
 
     Attributes:
-        member: Vertices of each cluster.
+        member: Indices of each cluster's vertices.
     """
 
     member: np.ndarray
 
     @property
     def vertices(self) -> int:
-        """Number of members of all clusters."""
+        """Total number of members of all clusters."""
         return self.member.size
 
     @property
     def step(self) -> int:
-        """Number of members of a cluster."""
+        """Number of members of each cluster."""
         return self.member.shape[1]

@@ -1,4 +1,4 @@
-"""Triangles that rays meet, by Embree: the only rays of the package."""
+"""Ray casting against triangles, by Embree. All rays of the package are traced here."""
 
 import threading
 from functools import cached_property
@@ -10,19 +10,19 @@ from jaxtyping import Bool, Float32, Integer
 
 from jaxprt.scene.mesh import Mesh
 
-_NUDGE = 1e-5  # of the scene's diagonal, by which rays start off the surface
-_SMALLEST, _LARGEST = 1e-12, 1e13  # diagonals between which Embree's products of three lengths stay within float32
+_NUDGE = 1e-5  # offset of ray origins from the surface, as a share of the scene's diagonal
+_SMALLEST, _LARGEST = 1e-12, 1e13  # range of diagonals for which products of three lengths stay within float32
 
 
 class Occluder:
-    """Triangles that cast shadows, in Embree's form.
+    """Triangles that cast shadows, as an Embree scene.
 
     Args:
-        mesh: The triangles; those of zero area cast nothing.
+        mesh: The triangles. Degenerate ones cast no shadow.
 
     Raises:
-        ValueError: No triangles, positions that are not finite, faces that name missing vertices, or a size at which
-            float32 loses triangles.
+        ValueError: The mesh has no triangles, positions, normals or tangents are not finite, a face refers to a
+            missing vertex, or the mesh is so large or small that float32 would lose triangles.
     """
 
     def __init__(self, mesh: Mesh):
@@ -37,35 +37,35 @@ class Occluder:
                 f"what casts shadows must be {_SMALLEST:g} to {_LARGEST:g} units across, got {self.diagonal:.3g}: "
                 "scale it"
             )
-        # Far from the origin float32 itself is coarser than the share of the diagonal.
+        # Far from the origin, the spacing of float32 is larger than this share of the diagonal.
         self.nudge = max(_NUDGE * self.diagonal, 16 * float(np.spacing(np.abs(np.stack([low, high])).max())))
         self._building = threading.Lock()
 
     @cached_property
     def _single(self) -> EmbreeScene:
-        """What embreex asks ray by ray."""
+        """The Embree scene for single rays."""
         scene = EmbreeScene()
         TriangleMesh(scene, np.ascontiguousarray(self.position), np.ascontiguousarray(self.face))
         return scene
 
     @cached_property
     def _packed(self):
-        """What takes packets of rays, or None where embreex carries no library that does."""
+        """The Embree scene for packets of rays; None if the library that embreex ships has none."""
         from jaxprt.visibility import packets  # numba takes half a second to import
 
         return packets.Packets(self.position, self.face) if packets.available() else None
 
     @cached_property
     def _twin(self) -> np.ndarray:
-        """Corners of the face that is in the same place in opposite orientation, in the same order; else a face's own.
+        """For each face, the corners of the coincident face of opposite orientation, in the order of its own corners.
 
-        What rays meet there is the one or the other by chance.
+        A face without such a partner keeps its own corners. Which of the two a ray hits is arbitrary.
         """
         _, place = np.unique(self.position, axis=0, return_inverse=True)
         at = place.reshape(-1)[self.face]
         order = np.argsort(at, axis=1)
         rows, inverse = np.unique(np.take_along_axis(at, order, 1), axis=0, return_inverse=True)
-        # Odd orders of the corners are the one orientation, even ones the other.
+        # Odd permutations of the sorted corners have one orientation, even permutations the other.
         odd = (order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])
         corner = np.take_along_axis(self.face, order, 1)
         example = np.full((2, len(rows)), -1)
@@ -80,10 +80,10 @@ class Occluder:
     def facing(
         self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
     ) -> Integer[np.ndarray, "n 3"]:
-        """Corners of triangles that rays meet: where a face is there in both orientations, of the one that they face.
+        """Corners of the triangles that rays hit. Of two coincident faces it takes the one that faces the ray.
 
         Args:
-            triangle: Numbers of the triangles.
+            triangle: Indices of the triangles.
             direction: Directions of the rays.
         """
         corner = self.face[triangle]
@@ -98,15 +98,15 @@ class Occluder:
         point: Integer[np.ndarray, " n"],
         way: Integer[np.ndarray, " n"],
     ) -> Bool[np.ndarray, " n"]:
-        """Whether rays meet a triangle; releases the interpreter lock.
+        """Whether each ray hits a triangle. Releases the global interpreter lock.
 
-        Sixteen rays that follow each other are fastest where they start near each other in similar directions.
+        It is fastest if every sixteen consecutive rays have nearby origins and similar directions.
 
         Args:
-            origin: Points.
-            direction: Directions.
-            point: The point from which each ray starts.
-            way: The direction in which it goes.
+            origin: Origins in world units.
+            direction: Unit directions.
+            point: Index of each ray's origin in `origin`.
+            way: Index of each ray's direction in `direction`.
         """
         with self._building:
             packed = self._packed
@@ -117,7 +117,7 @@ class Occluder:
         return single.run(origin.take(point, axis=0), direction.take(way, axis=0), query="OCCLUDED") == 0
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
-        """First triangle on each ray, -1 for none, the distance to it, and the weights of its three vertices."""
+        """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates."""
         with self._building:
             single = self._single
         found = single.run(origin, direction, query="INTERSECT", output=True)
@@ -126,10 +126,11 @@ class Occluder:
 
 
 def check(mesh: Mesh, name: str) -> None:
-    """Refuses meshes that Embree would hang or lie on, and vectors that make no frame.
+    """Refuses meshes for which Embree would hang or return wrong results, and normals or tangents without a frame.
 
     Raises:
-        ValueError: No faces, faces that name missing vertices, or positions, normals or tangents that are not finite.
+        ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
+            finite.
     """
     if not mesh.face.size:
         raise ValueError(f"the {name} must have faces, got none")

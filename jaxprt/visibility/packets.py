@@ -1,7 +1,7 @@
-"""Any-hit rays in packets of sixteen, through the Embree library that embreex carries.
+"""Shadow rays in packets of sixteen, traced by the Embree library that embreex ships.
 
-embreex sends rays one at a time. Sixteen rays from one point, or nearly so, in neighboring directions visit the same
-nodes of Embree's tree; sent as a packet they take less than half the time, and the answers are the same bits.
+embreex traces rays one at a time. Sixteen rays with nearby origins and similar directions visit the same nodes of
+Embree's BVH. Traced as a packet they take less than half the time and give identical results.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ _INDEX, _VERTEX = 0, 1
 _UINT3, _FLOAT3 = 0x5003, 0x9003
 _COHERENT = 1 << 16
 _EVERY_FEATURE = 0xFFFFFFFF
-_NONE = 0xFFFFFFFF  # no geometry, no instance
+_NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
@@ -45,15 +45,15 @@ _PROTOTYPES = {
 
 
 class Packets:
-    """Triangles in Embree's form, with `rtcOccluded16`.
+    """An Embree scene of triangles, for `rtcOccluded16`.
 
     Args:
         position: Vertex positions.
-        face: Three vertices for each triangle.
+        face: Three vertex indices for each triangle.
 
     Raises:
-        MemoryError: Embree has no memory for them.
-        RuntimeError: Embree cannot be used in another way; use `available` first.
+        MemoryError: Embree runs out of memory.
+        RuntimeError: Embree reports another error. Check `available` first.
     """
 
     def __init__(self, position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"]):
@@ -90,20 +90,20 @@ class Packets:
         point: Integer[np.ndarray, " n"],
         way: Integer[np.ndarray, " n"],
     ) -> Bool[np.ndarray, " n"]:
-        """Whether each ray meets a triangle: `Occluder.blocked`, which has the same arguments."""
+        """Whether each ray hits a triangle. `Occluder.blocked` explains the arguments."""
         found = np.empty(len(point), np.bool_)
         _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
         return found
 
 
 def available() -> bool:
-    """Whether embreex carries a library of Embree 4 where it is looked for, with packets."""
+    """Whether embreex ships an Embree 4 library with packet tracing where this module looks for it."""
     return _library() is not None
 
 
 @cache
 def _library():
-    """Embree, the address of `rtcOccluded16`, and a device; None where there is none."""
+    """The Embree library, the address of `rtcOccluded16`, and a device; None if no library can be used."""
     for file in metadata.files("embreex") or ():
         if not Path(str(file)).name.startswith(("libembree4", "embree4")):
             continue
@@ -126,7 +126,7 @@ def _library():
 def _call(typing, address, valid, scene, ray, arguments):
     """Calls void (*)(const int*, RTCScene, RTCRay16*, RTCOccludedArguments*) at an address.
 
-    With the address as an argument, in place of a function of ctypes, the compiled code can be kept on disk.
+    The address is an argument, rather than a ctypes function, so that numba can cache the compiled code on disk.
     """
 
     def generate(context, builder, signature, values):
@@ -139,10 +139,10 @@ def _call(typing, address, valid, scene, ray, arguments):
     return types.none(*[types.intp] * 5), generate
 
 
-@no_type_check  # Checks of types at run time would wrap it, and numba could not keep it on disk.
+@no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
 @numba.njit(nogil=True, cache=True)
 def _blocked(address, scene, arguments, origin, direction, point, way, found):
-    # RTCRay16: twelve rows of sixteen, on a boundary of 64 bytes.
+    # RTCRay16: twelve rows of sixteen values, aligned to 64 bytes.
     memory = np.empty(13 * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
     ray = memory[first : first + 12 * 16].reshape(12, 16)

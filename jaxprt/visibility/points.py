@@ -1,4 +1,4 @@
-"""Visibility of points between the vertices: interpolated, or by rays of their own."""
+"""Visibility of surface points between vertices: interpolated from the vertices, or traced with rays of their own."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ from jaxprt.visibility.occluder import Occluder
 
 
 class PointVisibility(eqx.Module):
-    """Visibility of single texels at points: the mean of what the corners of their triangles see.
+    """Visibility of single texels at surface points, interpolated from the vertices of their triangles.
 
     Attributes:
         vertices: Visibility of the vertices.
-        points: The points.
+        points: The surface points.
     """
 
     vertices: Any
@@ -38,20 +38,20 @@ class PointVisibility(eqx.Module):
         return self.vertices.size
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t p"]:
-        """Share of some texels that is seen."""
+        """Visible fraction of some texels, from 0 to 1."""
         return self.points.carry(self.vertices.visible(texel), axis=1)
 
 
 def point_starts(mesh: Mesh, points: Points, occluder: Occluder) -> Float32[np.ndarray, "p 3"]:
-    """Points just off the triangles on which points lie, on the side of their shading normals.
+    """Origins of rays from surface points, slightly off the triangle on the side of the shading normal.
 
     Args:
         mesh: The mesh.
-        points: On its triangles.
-        occluder: What casts shadows.
+        points: Points on the mesh's triangles.
+        occluder: Geometry that casts shadows.
 
     Raises:
-        ValueError: The points are no points of triangles.
+        ValueError: The points do not have three corners.
     """
     if len(points.corner) != 3:
         raise ValueError(f"points must have three corners, got {len(points.corner)}")

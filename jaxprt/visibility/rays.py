@@ -1,7 +1,7 @@
 """Visibility of the distant sphere from mesh vertices.
 
-Everything here is NumPy on the host; what comes out is an array, so the rest of the package is tested with
-visibility made by hand.
+Everything here runs in NumPy on the host and returns arrays, so tests of other modules can use visibility that they
+construct themselves.
 """
 
 import math
@@ -20,23 +20,23 @@ from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder, check
 
-ALGORITHM = 1  # version of what is traced; a release that traces differently raises it
-ROUNDING = 3e-6  # of the norm: more than the last bits of single precision
-BLOCK = 64  # vertices: a fraction of a second of work, and one file of the store for each array
-LEVELS = 16  # visibility is counted in sixteenths: 4 x 4 rays to a texel
+ALGORITHM = 1  # version of the ray casting; raised by a release whose rays give other results
+ROUNDING = 3e-6  # relative to the norm: larger than the rounding error of single precision
+BLOCK = 64  # vertices in a block: a fraction of a second of work
+LEVELS = 16  # visibility is stored in sixteenths: 4 x 4 rays per texel
 _SIDE = 4
-_RAYS = 1 << 17  # rays in one call: what a core's cache holds
-_SINK = 0.02  # of the scene's diagonal, how deep a vertex may lie inside a simplified occluder
+_RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
+_SINK = 0.02  # largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal
 
 
 @dataclass(frozen=True)
 class RayCount:
-    """What was traced.
+    """Numbers of rays that were traced.
 
     Attributes:
         rays: All rays.
-        texels: Texels above a vertex's horizon, each of which took one ray.
-        supersampled: Those among them on a visibility boundary, which took 16 more.
+        texels: Texels above the horizons of vertices. Each took one ray.
+        supersampled: Texels on a visibility boundary. Each took 16 more rays.
     """
 
     rays: int
@@ -49,15 +49,16 @@ class RayCount:
 
 
 def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
-    """Points just off the surface from which each vertex's rays start.
+    """Origins of the rays of each vertex, slightly off the surface.
 
-    They lie on that side of every face around the vertex on which its shading normal is, so that a face never
-    shadows its own front, however far the shading normal leans. A vertex that lies inside a simplified occluder
-    starts where it leaves it. A vertex that touches another surface starts on the open side of that surface, so that
-    light does not leak in from beneath.
+    The origin lies on the side of all faces around the vertex to which its shading normal points. A face therefore
+    never shadows its own front, however far the shading normal leans. If a vertex lies inside a simplified occluder,
+    its rays start where they leave the occluder. If a vertex touches another surface, its rays start on the open side
+    of that surface, so that light does not leak in from below.
 
     Raises:
-        ValueError: As for `Occluder`, and for normals that are not finite.
+        ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
+            finite.
     """
     check(mesh, "mesh")
     position = np.asarray(mesh.position, np.float32)
@@ -76,20 +77,20 @@ def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
 def fractional(
     occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
 ) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
-    """Share of each cubemap texel that is seen from each point, in sixteenths; 0 below the horizon.
+    """Visible fraction of each cubemap texel from each point, in sixteenths; 0 below the horizon.
 
-    One ray goes through the center of every texel whose integral of the cosine is positive. Where a texel and its
-    eight neighbors, across the edges of faces and the horizon too, do not agree, 4 x 4 rays replace it: the samples
-    of a cubemap with four times the resolution, box-filtered.
+    One ray goes through the center of every texel above the horizon, that is, every texel whose integral of the cosine
+    is positive. If a texel and its eight neighbors (also across cube edges and the horizon) disagree, the texel is
+    supersampled with 4 x 4 rays. That equals box-filtering a cubemap of four times the resolution.
 
     Args:
-        occluder: What casts shadows.
-        start: Points where rays start, from `start_points`.
+        occluder: Geometry that casts shadows.
+        start: Origins of the rays, from `start_points`.
         normal: Unit normals.
         size: Edge of the cubemap's faces in texels.
 
     Returns:
-        Visibility times 16 on 6 size^2 texels, and the number of rays.
+        Visibility times 16 of the 6 size^2 texels, and the number of rays.
 
     Reference: Wang, Tran, Luebke 2004, section 3.3 (there all texels at 6 x 256 x 256).
     """
@@ -107,7 +108,7 @@ def fractional(
 def exhaustive(
     occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
 ) -> UInt8[np.ndarray, "v d"]:
-    """The same as `fractional` with 16 rays in every texel above the horizon: slow, to judge it by."""
+    """The result of `fractional`, but with 16 rays in every texel above the horizon: a slow reference for tests."""
     table = _tables(size)
     seen = np.zeros((len(start), 6 * size * size), np.uint8)
     above = normal.astype(np.float32) @ table.area.T > 0
@@ -118,10 +119,10 @@ def exhaustive(
 
 
 def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
-    """Numbers of the vertices to light: all of them for None, those that a mask marks, or those that are named.
+    """Indices of the vertices to light: all for None, the set entries of a mask, or the given indices.
 
     Raises:
-        ValueError: Neither a mask with one entry for each vertex nor numbers of vertices.
+        ValueError: `vertex` is neither a mask with one entry per vertex nor an array of vertex indices.
     """
     count = len(mesh.position)
     number = np.arange(count)
@@ -145,15 +146,15 @@ def place(mesh: Mesh, vertex: np.ndarray | None) -> Float[Array, "v 3"]:
 
 @dataclass(frozen=True)
 class VisibilityJob(blocks.Job):
-    """Blocks of vertices whose visibility becomes transport; systems say what is made of it. See `blocks.Job`.
+    """Job that computes transport from the visibility of blocks of vertices. Each system defines its own subclass.
 
     Attributes:
-        start: Points where rays start.
+        start: Origins of the rays of each vertex.
         frame: Rows are tangent, bitangent, normal.
-        occluder: What casts shadows, in NumPy arrays.
+        occluder: Geometry that casts shadows, in NumPy arrays.
         size: Edge of the cubemap's faces in texels.
-        mesh_key: Fingerprint of the faces and vertices that are given.
-        mesh_near: Sketches of their positions, normals and tangents.
+        mesh_key: Fingerprint of the faces and of the chosen vertices.
+        mesh_near: Sketches (see `jaxprt.files.arrays.sketch`) of positions, normals and tangents.
     """
 
     start: np.ndarray
@@ -165,15 +166,15 @@ class VisibilityJob(blocks.Job):
 
     @classmethod
     def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
-        """A job for some vertices of a mesh, all of them if None, which shadows itself if no occluder is named."""
+        """Makes a job for some vertices of a mesh, or all for None. If `occluder` is None, the mesh shadows itself."""
         shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
-        # Padded to a power of two, so that few shapes are compiled.
+        # Padding to a power of two keeps the number of compiled shapes small.
         padded = np.pad(vertex, (0, (1 << max(6, (len(vertex) - 1).bit_length())) - len(vertex)))
         normal, tangent = (np.asarray(each)[padded] for each in (mesh.normal, mesh.tangent))
         frame = np.asarray(directions.frame(normal, tangent), np.float32)[: len(vertex)]
-        # By what is given, not by what is traced or computed of it, which other kinds of processors round otherwise.
+        # The key depends on the inputs only: computed values are rounded differently on other processors.
         key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
         rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
@@ -181,21 +182,21 @@ class VisibilityJob(blocks.Job):
         return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
 
     def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
-        """The header of a system's job: what is traced, and by which versions of the algorithms."""
+        """The header of a system's job: the inputs, and the versions of the algorithms."""
         return {"system": system, "algorithm": dict(algorithm), "mesh": self.mesh_key, "size": self.size, **more}
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        """Sketches of what the result depends on."""
+        """Sketches of the arrays that the result depends on."""
         return self.mesh_near
 
     @cached_property
     def rays(self) -> Occluder:
-        """The occluder in Embree's form, built once in each worker."""
+        """The occluder as an Embree scene, built once in each worker process."""
         return Occluder(self.occluder)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields: Embree's form does not travel."""
+        """The fields only, because an Embree scene cannot be pickled."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
@@ -204,11 +205,11 @@ class VisibilityJob(blocks.Job):
         return len(self.start)
 
     def part(self, block: int) -> np.ndarray:
-        """Vertices of a block; the last one repeats its last vertex."""
+        """Indices of the vertices of a block; the last block is padded by repeating its last vertex."""
         return np.minimum(np.arange(block * BLOCK, (block + 1) * BLOCK), self.vertices - 1)
 
     def seen(self, block: int) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
-        """Visibility of a block by `fractional`."""
+        """Visibility of a block of vertices, from `fractional`."""
         part = self.part(block)
         return fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
 
@@ -217,8 +218,8 @@ class _Tables(NamedTuple):
     area: np.ndarray  # [d, 3] integral of direction over each texel
     center: np.ndarray  # [d, 3]
     fine: np.ndarray  # [d 16, 3]
-    border: np.ndarray  # [6, n + 2, n + 2] texel numbers of faces with their neighbors' rims
-    order: np.ndarray  # [d] texel numbers, tile after tile
+    border: np.ndarray  # [6, n + 2, n + 2] texel indices of faces, with a border from the neighboring faces
+    order: np.ndarray  # [d] texel indices, tile by tile
 
 
 @lru_cache(maxsize=4)
@@ -237,7 +238,7 @@ def _tables(size: int) -> _Tables:
 
 
 def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables) -> RayCount:
-    """Fills `seen` for one part of the points."""
+    """Fills `seen` for some of the points."""
     vertex, rank = np.nonzero(above.take(table.order, axis=1))
     texel = table.order.take(rank)
     clear = ~occluder.blocked(start, table.center, vertex, texel)
@@ -251,19 +252,19 @@ def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.nd
 
 
 def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
-    """Texels in whose 3 x 3 neighborhood some are clear and some are not, below the horizon included."""
+    """Texels whose 3 x 3 neighborhood has visible and blocked texels; texels below the horizon count as blocked."""
     padded = clear.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
     return (_dilate(padded) & _dilate(1 - padded)).astype(bool)
 
 
 def _dilate(padded: np.ndarray) -> np.ndarray:
-    """Maximum over 3 x 3 of binary images with a rim."""
+    """Maximum over 3 x 3 neighborhoods of binary images with a border of one texel."""
     rows = padded[..., :-2, :] | padded[..., 1:-1, :] | padded[..., 2:, :]
     return rows[..., :-2] | rows[..., 1:-1] | rows[..., 2:]
 
 
 def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
-    """Clear rays out of 16 in each of the (vertex, texel) pairs."""
+    """Number of unblocked rays out of 16 for each (vertex, texel) pair."""
     out = np.empty(len(vertex), np.uint8)
     step = _RAYS // LEVELS
     for first in range(0, len(vertex), step):
@@ -275,12 +276,12 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
 
 
 def _rows(position: np.ndarray) -> np.ndarray:
-    """Each position as one opaque item, so that positions compare as wholes; -0 is 0."""
+    """Each position as one opaque item, so that whole positions can be compared; -0 becomes 0."""
     return np.ascontiguousarray(position + np.float32(0)).view(np.dtype((np.void, 12))).ravel()
 
 
 def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Unit face normals by winding; zero for faces without area."""
+    """Unit face normals from the winding order; zero for degenerate faces."""
     a, b, c = (position[face[:, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -288,10 +289,10 @@ def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def _outward(mesh: Mesh) -> np.ndarray:
-    """Unit vectors on the side of all faces around a vertex on which its shading normal is.
+    """Unit vectors that point off the surface, to the side of each vertex's shading normal.
 
-    Around means at the same position: where vertices are split along a crease, the faces across it count too, or a
-    start would be pushed into them.
+    They average the normals of all faces at the same position. Where vertices are split along a crease, faces across
+    the crease count too; otherwise a ray could start inside of them.
     """
     position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
     facing = _face_normal(position, face)
@@ -302,14 +303,14 @@ def _outward(mesh: Mesh) -> np.ndarray:
             own[:, axis] += np.bincount(corner, facing[:, axis] * side, len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
     joint = np.stack([np.bincount(place, own[:, axis]) for axis in range(3)], 1)[place]
-    # The two sides of a sheet cancel; each then keeps to its own.
+    # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     total = np.where(np.sum(joint * own, 1, keepdims=True) > 1e-6 * np.sum(own * own, 1, keepdims=True), joint, own)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal).astype(np.float32)
 
 
 def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Starts for vertices of a mesh that the occluder only approximates."""
+    """Ray origins of vertices that are not vertices of the occluder, which then only approximates the mesh."""
     triangle, distance, _ = occluder.hit(position - np.float32(occluder.nudge) * out, out)
     facing = _face_normal(occluder.position, occluder.face)[triangle]
     leaving = (triangle >= 0) & (distance < _SINK * occluder.diagonal) & (np.sum(facing * out, 1) > 0)
@@ -318,10 +319,10 @@ def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray) -> np.nd
 
 
 def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Mirrors starts that the nudge pushed through a touching surface back to its open side.
+    """Moves ray origins that were pushed through a touching surface back to its open side, by reflection.
 
-    Looking back from beyond, a touching surface is seen from its back, the vertex's own faces from their front.
-    Probes beside the vertex see it even where it coincides with the vertex itself.
+    A ray traced back towards the vertex meets a touching surface from behind, and the vertex's own faces from the
+    front. Rays beside the vertex find a touching surface even where it passes through the vertex.
     """
     facing = _face_normal(occluder.position, occluder.face)
     nudge = np.float32(occluder.nudge)

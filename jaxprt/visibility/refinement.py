@@ -1,8 +1,9 @@
-"""Meshes as fine as their shadows: edges are halved where the light in their middle is not the mean of their ends.
+"""Refinement of meshes to the scale of their shadows.
 
-Light here is what a white diffuse surface reflects. Rays are traced in the middle of each edge, and at points inside of
-triangles that are large enough to hide whole shadows. A triangle's part in the error of a picture is its area times its
-mean squared difference; triangles with the largest parts are divided first.
+Edges are halved where the radiance at their midpoint differs from the mean of their endpoints. The radiance is that of
+a white diffuse surface. Rays are traced at the midpoint of each edge, and at points inside of triangles that are large
+enough to contain whole shadows. A triangle's share of the squared error of a picture is its area times its mean squared
+difference; triangles with the largest shares are divided first.
 """
 
 import bisect
@@ -22,15 +23,15 @@ from jaxprt.scene.subdivision import Division, Edges
 from jaxprt.visibility import blocks
 from jaxprt.visibility.diffuse import DiffuseTracer
 
-_DIRECTIONS = 1024  # to each light: penumbrae have steps of a thousandth of its power
-_SIZE, _DEGREE = 16, 6  # of light from unknown directions: texels along an edge, and the degree of its harmonics
-_FACES = 1 << 13  # triangles whose errors are summed at a time
-_HIDDEN = 4  # points inside of triangles for each shadow that alone makes the error
-_FINEST = 0.01  # There are no more points inside of triangles than for this error.
-_SHARE = 0.7  # of the squared error whose triangles are divided before rays are traced again
-_TOGETHER = 0.5  # Of a triangle, edges are cut whose squared difference is at least this share of the largest.
-_SHORTEST = 8  # length of the shortest edge that is cut, over the distance from the surface at which rays start
-_ROUNDING = 1e-5  # relative difference that rounding makes
+_DIRECTIONS = 1024  # per light: penumbrae have steps of a thousandth of its power
+_SIZE, _DEGREE = 16, 6  # texels along an edge and degree of harmonics, if no environments are given
+_FACES = 1 << 13  # triangles in a block whose errors are summed at once
+_HIDDEN = 4  # points inside of triangles per shadow that is just large enough to cause the whole error
+_FINEST = 0.01  # smaller errors do not increase the number of points inside of triangles
+_SHARE = 0.7  # share of the squared error whose triangles are divided before rays are traced again
+_TOGETHER = 0.5  # A triangle's edge is cut if its squared difference is at least this share of the triangle's largest.
+_SHORTEST = 8  # length of the shortest edge that is cut, relative to the offset of ray origins from the surface
+_ROUNDING = 1e-5  # relative difference that rounding may cause
 
 
 def refine(
@@ -42,35 +43,35 @@ def refine(
     occluder: Mesh | None = None,
     progress: bool = True,
 ) -> Mesh:
-    """Divides the triangles of a mesh where its shadows are finer than its vertices.
+    """Subdivides the triangles of a mesh where shadows are finer than the spacing of its vertices.
 
-    Radiance is computed at vertices and interpolated between them. Rays to the middle of each edge tell where that is
-    wrong, and edges are halved there. The surface does not change: no gaps open, also where vertices are split at a
-    seam, and images lie on it as before.
+    Radiance is computed at vertices and interpolated between them. Rays from the midpoint of each edge show where
+    interpolation is wrong, and edges are halved there. The surface does not change: no gaps open, also where vertices
+    are split at a seam, and texture coordinates stay valid.
 
     Args:
         mesh: The mesh.
-        error: The largest relative L2 error that interpolation may leave in the radiance of the surface, were it white
-            and diffuse: the root of the mean squared error over the surface's area, over the root of the mean squared
-            radiance. It is estimated from the points where rays were traced. Glossy surfaces need finer meshes.
-            With 0 the mesh is divided until it has as many vertices as allowed.
-        vertices: How many vertices the mesh may have afterwards. Where these are too few for the error, the largest
-            errors are removed first, and a warning tells what is left. A mesh that has more already is not divided.
-        environments: Lights under which the error must hold. If None, the mean over lights of natural spectrum from
-            all directions. The shadows of a sun need the light that the sun is in.
-        occluder: What casts shadows; the mesh itself if None.
+        error: Largest allowed relative L2 error of interpolation, for the radiance of a white diffuse surface: the
+            root mean squared error over the surface's area, divided by the root mean squared radiance. It is estimated
+            from the points where rays are traced. Glossy surfaces need finer meshes. With 0 the mesh is subdivided
+            until it has the largest allowed number of vertices.
+        vertices: Largest allowed number of vertices. If this is too few to reach `error`, the largest errors are
+            removed first, and a warning states the remaining error. A mesh that already has more is not subdivided.
+        environments: Lights under which the error must hold. If None, an average over lights with a natural spectrum
+            and all orientations. For the shadows of a sun, give the environment that contains it.
+        occluder: Geometry that casts shadows; the mesh itself if None.
         progress: Whether to show a progress bar.
 
     Returns:
-        The mesh with more vertices; those that it had come first.
+        The subdivided mesh. The original vertices come first.
 
     Raises:
-        TypeError: The environments are no list of lights.
-        ValueError: The error is negative or not finite, vertices are fewer than 1, there are no environments or one
-            is a batch, or the mesh or the occluder is none that `Occluder` takes.
+        TypeError: `environments` is not a sequence of `Environment`.
+        ValueError: `error` is negative or not finite, `vertices` is below 1, `environments` is empty or one of them is
+            a batch, or the mesh or the occluder is invalid: no faces, missing vertices, or values that are not finite.
 
-    Reference: Křivánek, Pattanaik, Žára 2004, "Adaptive mesh subdivision for precomputed radiance transfer", who
-    compare the ends of each edge instead.
+    Reference: Křivánek, Pattanaik, Žára 2004, "Adaptive mesh subdivision for precomputed radiance transfer". They
+    compare the endpoints of each edge instead.
     """
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
     return subdivision.subdivide(mesh, divisions(mesh, mesh if occluder is None else occluder, **options))
@@ -85,7 +86,7 @@ def divisions(
     environments: Sequence[Environment] | None,
     progress: bool,
 ) -> list[Division]:
-    """The divisions of triangles, one after another, that `refine` carries out: see there."""
+    """Successive subdivisions that `refine` applies to a mesh. It has the arguments of `refine`, all required."""
     if not 0 <= error < np.inf:
         raise ValueError(f"error must be at least 0 and finite, got {error}")
     if vertices < 1:
@@ -94,7 +95,7 @@ def divisions(
         samples = light_samples.natural(size=_SIZE, degree=_DEGREE)
     else:
         samples = light_samples.importance(environments, count=_DIRECTIONS)
-    # A shadow on a share of error^2 of the area makes the whole error.
+    # A single shadow on a share error^2 of the area is enough to cause the whole error.
     points = round(_HIDDEN * min(max(error, _FINEST) ** -2, vertices))
     result: list[Division] = []
     with (
@@ -126,14 +127,14 @@ def divisions(
 
 
 class _Surface:
-    """Triangles with the light at their vertices, in the middles of their edges, and at points inside of large ones.
+    """Triangles with the radiance at vertices, at midpoints of edges, and at points inside of large triangles.
 
     Attributes:
         position: Positions of the vertices.
-        normal: Their normals, of any length.
-        face: Vertices of each triangle.
-        light: Light at the vertices.
-        error: Mean over each triangle of the squared error of interpolation, for each light.
+        normal: Normals of the vertices, of any length.
+        face: Vertex indices of each triangle.
+        light: Radiance at the vertices.
+        error: Squared error of interpolation under each light, averaged over each triangle.
         shortest: Length of the shortest edge that is cut.
     """
 
@@ -143,32 +144,32 @@ class _Surface:
         self.shortest = _SHORTEST * tracer.nudge
         self._tracer, self._casts = tracer, tracer.casts
         self.light = tracer.at_vertices()
-        self._key = np.zeros(0, np.int64)  # of the edges whose middles are known, in ascending order
+        self._key = np.zeros(0, np.int64)  # keys of the edges whose midpoints are known, in ascending order
         self._middle = self.light[:0]
         area = self._area()
         share = points * area / max(area.sum(), np.finfo(np.float64).tiny)
-        # None on sheets, where only vertices that triangles share tell the two sides apart.
+        # No points on sheets: there only shared vertices tell the two sides apart.
         self._points = subdivision.scatter(np.where(tracer.double, 0, share).astype(np.int64))
         self._at_points = self._traced_points()
         self.error = np.zeros((len(self.face), self.light.shape[1]))
         self._measure(np.arange(len(self.face)))
 
     def scale(self) -> Float[np.ndarray, " l"]:
-        """Integral over the surface of the squared light."""
+        """Integral of the squared radiance over the surface."""
         return self._area() @ self._square()[self.face].mean(1)
 
     def squares(self) -> Float[np.ndarray, "f l"]:
-        """What each triangle adds to the squared relative error of the surface."""
+        """Contribution of each triangle to the squared relative error of the surface."""
         scale = self.scale()
         return self._area()[:, None] * self.error / np.where(scale > 0, scale, 1)
 
     def differences(self, face: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 l c"]:
-        """Light in the middles of edges beyond the mean of their ends."""
+        """Radiance at the midpoints of edges, minus the mean of their endpoints."""
         ends = _ends(face)
         return self._middle[np.searchsorted(self._key, _key(ends))] - self.light[ends].mean(2)
 
     def divide(self, division: Division) -> None:
-        """Divides triangles, and traces light on the smaller ones."""
+        """Divides triangles and traces rays on the new ones."""
         self.light = np.concatenate([self.light, self._middle[np.searchsorted(self._key, _key(division.parent))]])
         self.normal = np.concatenate([self.normal, subdivision.middle_normal(self.normal, division.parent)])
         self.position = np.concatenate([self.position, subdivision.middle(self.position, division.parent)])
@@ -185,15 +186,15 @@ class _Surface:
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
     def _measure(self, changed: Int[np.ndarray, " n"]) -> None:
-        """Finds the error of some triangles, and traces light where it is not known."""
+        """Computes the error of some triangles. Traces rays where the radiance is not known."""
         self._trace_middles(changed)
         for first in range(0, len(changed), _FACES):
             own = changed[first : first + _FACES]
             apart = self.differences(self.face[own]).astype(np.float64)
             square, both = np.sum(apart**2, (1, 3)), np.sum(np.sum(apart, 1) ** 2, -1)
-            # The mean over a triangle of the square of a quadratic function that is zero at the corners.
+            # Mean, over a triangle, of the square of a quadratic function that is zero at the corners.
             self.error[own] = 4 / 45 * (square + both)
-        # Where there are points, the middles count as three of them.
+        # Where there are points inside, the midpoints count as three more.
         again = np.zeros(len(self.face), bool)
         again[changed] = True
         here = again[self._points.triangle]
@@ -206,7 +207,7 @@ class _Surface:
         self.error[changed] = np.where(error > _ROUNDING**2 * level, error, 0)
 
     def _trace_middles(self, changed: Int[np.ndarray, " n"]) -> None:
-        """Traces light in the middles of some triangles' edges where it is not known."""
+        """Traces rays at those midpoints of some triangles' edges whose radiance is not known."""
         edge, middle = np.unique(_key(_ends(self.face[changed])), return_inverse=True)
         corner = np.concatenate([self.face[changed], len(self.position) + middle.reshape(-1, 3)], 1)
         smaller = corner[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]].reshape(-1, 3)
@@ -219,20 +220,20 @@ class _Surface:
         new = np.flatnonzero(~np.isin(edge, self._key))
         light = self._tracer.at(position, normal, smaller, casting, len(self.position) + new)
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
-        # Edges that have been cut are forgotten.
+        # Drop the edges that have been cut.
         keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
         order = keep[np.argsort(key[keep])]
         self._key, self._middle = key[order], light[order]
 
     def _traced_points(self) -> Float32[np.ndarray, "p l c"]:
-        """Light at the points inside of triangles."""
+        """Radiance at the points inside of triangles."""
         triangle, weight = self._points
         count, corner = len(self.position), self.face[triangle]
         place, normal = (
             np.einsum("pk,pkc->pc", weight, np.asarray(each, np.float64)[corner])
             for each in (self.position, self.normal)
         )
-        # Each is a vertex of a small triangle, so that its rays start as those of vertices do.
+        # Each point becomes a vertex of a small triangle, so that its ray origin is found like that of a vertex.
         small = (0.5 / np.sqrt(1 + np.bincount(triangle, minlength=1)))[triangle, None, None]
         beside = place[:, None] + small * (self.position[corner][:, :2] - place[:, None])
         position = np.concatenate([place, beside.reshape(-1, 3)]).astype(self.position.dtype)
@@ -245,11 +246,11 @@ class _Surface:
 
 
 def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, room: int) -> Bool[np.ndarray, " e"]:
-    """The edges to cut next: those of the triangles with the largest errors, as many as there is room for."""
+    """Edges to cut next: those of the triangles with the largest errors, within the allowed number of vertices."""
     total = squares.sum(0)
     unmet = total > error**2
     priority = np.where(edges.length[edges.longest] > surface.shortest, squares[:, unmet].max(1), 0)
-    # At the edge of a shadow, halving the edges removes half of the squared error.
+    # At a shadow boundary, halving the edges removes half of the squared error.
     wanted = min(_SHARE * total.max(), 2 * (total.max() - error**2))
     order = np.argsort(-priority, kind="stable")[: np.count_nonzero(priority)]
     order = order[: 1 + np.searchsorted(np.cumsum(priority[order]), wanted)]
@@ -271,10 +272,10 @@ def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, 
 
 
 def _ends(face: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3 2"]:
-    """The vertices at the ends of each triangle's edges, the lower number first."""
+    """Indices of the endpoints of each triangle's edges, the lower index first."""
     return np.sort(np.stack([face, np.roll(face, -1, 1)], -1), -1)
 
 
 def _key(ends: Int[np.ndarray, "*b 2"]) -> Int[np.ndarray, "*b"]:
-    """One number for the two ends of an edge."""
+    """One integer key for the two endpoints of an edge."""
     return ends[..., 0] << 32 | ends[..., 1]

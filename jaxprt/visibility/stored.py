@@ -1,8 +1,8 @@
-"""Visibility kept whole: what it takes to light vertices by single texels, exactly, with any BRDF.
+"""Stored visibility, for lighting vertices by single texels exactly, with any BRDF.
 
-A sun, or a few bright windows, need most of the terms and coefficients that other transport spends. Summed texel by
-texel with the BRDF itself they leave the others a smooth remainder. Other transport is made from this one without
-another ray.
+A sun or a few bright windows would need most of the terms and coefficients of a compressed transport. If their texels
+are summed one by one with the BRDF itself, the remaining light is smooth. The transport of other systems can be
+computed from stored visibility without tracing rays again.
 """
 
 import os
@@ -22,18 +22,19 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.visibility import blocks, rays
 
-# Versions of what makes the results; a release that changes them raises one.
+# Versions of the algorithms; a release that changes results raises one of them.
 ALGORITHM = {"visibility": rays.ALGORITHM, "direct": 1}
 _HALF = rays.BLOCK // 2
-_MIDDLE = 8  # sixteen of the seventeen levels fit four bits: 9 becomes 8
+_MIDDLE = 8  # four bits hold sixteen of the seventeen levels, so level 9 is stored as 8
 
 
 class StoredVisibility(eqx.Module):
-    """Visibility of every texel from every vertex, in four bits.
+    """Visibility of every texel from every vertex, in four bits each.
 
     Attributes:
-        level: Blocks of 64 vertices, two to a byte: the first half of a block in the low bits, the second in the high
-            ones. From a store, on CPUs, it is a map of the store's file: what is not read takes no memory.
+        level: Blocks of 64 vertices, two vertices to a byte: the first half of a block in the low bits, the second
+            half in the high bits. If it comes from a store, on CPUs, it is memory-mapped: only what is read takes
+            memory.
         position: Vertex positions in world units.
         frame: Rows are tangent, bitangent, normal.
     """
@@ -54,11 +55,11 @@ class StoredVisibility(eqx.Module):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the visibility."""
+        """Size of the visibility in bytes."""
         return self.level.nbytes
 
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
-        """Share of some texels that each vertex sees, 0 to 1; 0 below its horizon."""
+        """Visible fraction of some texels from each vertex, 0 to 1; 0 below its horizon."""
         level = _unpack(self.level[:, texel]).astype(jnp.result_type(float))
         return level[:, : len(self.position)] / rays.LEVELS
 
@@ -67,7 +68,7 @@ class StoredVisibility(eqx.Module):
         block, place = np.divmod(vertex, rays.BLOCK)
         level = np.empty((len(vertex), self.texels), np.uint8)
         held = np.asarray(self.level)
-        for number in np.unique(block):  # A block is contiguous, and one of its vertices alone is not.
+        for number in np.unique(block):  # Whole blocks are contiguous in memory, single vertices are not.
             own = np.flatnonzero(block == number)
             pair = np.ascontiguousarray(held[number].T)
             level[own] = np.where(
@@ -87,26 +88,26 @@ def precompute(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> StoredVisibility:
-    """Traces what each vertex sees, and keeps it.
+    """Traces the visibility of every texel from each vertex and stores it.
 
-    12 kB a vertex at 6 x 64 x 64.
+    It takes 12 kB per vertex at 6 x 64 x 64 texels.
 
     Args:
-        mesh: The vertices to light.
+        mesh: The mesh whose vertices are lit.
         size: Edge of the light's cubemap faces in texels, a power of two.
-        occluder: What casts shadows: the whole scene, or a simplified one; the mesh itself if None.
-        vertex: Numbers of the vertices to light, or a mask; the rest of the mesh still casts shadows.
-        path: Folder that keeps finished blocks; a call that was stopped, or killed, goes on from there.
-        executor: Where blocks are computed, any `concurrent.futures.Executor`; this machine's cores if None.
+        occluder: Geometry that casts shadows: the whole scene, or a simplified one; the mesh itself if None.
+        vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        path: Folder for finished blocks. A call that was stopped or killed continues from them.
+        executor: Any `concurrent.futures.Executor` to compute blocks; this machine's cores if None.
         progress: Whether to show a progress bar.
 
     Returns:
-        The visibility of every vertex. With a path it is mapped on CPUs: it takes memory only where it is read.
+        The visibility of every chosen vertex. With a path it is memory-mapped on CPUs: only what is read takes memory.
 
     Raises:
-        ValueError: A size that is no power of two, positions, normals or tangents that are not finite, no such
-            vertices, or a store at `path` made from something else.
-        BlockingIOError: The store is being written by another process.
+        ValueError: `size` is not a power of two, positions, normals or tangents are not finite, `vertex` refers to
+            missing vertices, or the store at `path` was made from other inputs.
+        BlockingIOError: Another process is writing to the store.
         RuntimeError: A worker of the executor died.
     """
     if size < 1 or size & (size - 1):
@@ -118,7 +119,7 @@ def precompute(
 
 
 def _unpack(pair: UInt8[Array, "g t w"]) -> UInt8[Array, "t v"]:
-    """Levels in sixteenths, two to each byte."""
+    """Unpacks levels in sixteenths from two levels per byte."""
     level = jnp.concatenate([pair & 15, pair >> 4], 2).swapaxes(0, 1)
     level = level.reshape(pair.shape[1], pair.shape[0] * rays.BLOCK)
     return level + (level > _MIDDLE)
@@ -126,7 +127,7 @@ def _unpack(pair: UInt8[Array, "g t w"]) -> UInt8[Array, "t v"]:
 
 @dataclass(frozen=True)
 class _Job(rays.VisibilityJob):
-    """Blocks of visibility; see `blocks.Job`."""
+    """Job that computes blocks of visibility."""
 
     @property
     def header(self) -> Mapping[str, Any]:

@@ -1,1 +1,1 @@
-"""Readers of files: meshes and scenes in glTF, OBJ with MTL, Mitsuba's dictionaries, and what trimesh reads."""
+"""Readers of file formats: glTF, OBJ with MTL, dictionaries of Mitsuba, and mesh formats that trimesh reads."""

@@ -1,4 +1,4 @@
-"""From what was read of a file to parts: one for each region, with the frames that its material needs."""
+"""Conversion of the geometry of a file to parts: one for each region, with the tangents that its material needs."""
 
 import pathlib
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from jaxprt.scene.scene import Part, numbered
 def split_parts(
     geometry: Geometry, names: Sequence[str], materials: Sequence[TexturedMaterial], path: pathlib.Path
 ) -> list[Part]:
-    """Parts of what was read from a file.
+    """Splits the geometry of a file into parts.
 
-    Where a material needs tangents that the file does not have, they lie along the texture's coordinate u. Texture
-    coordinates that the file does not have are 0.
+    If a material needs tangents and the file has none, they point along the texture coordinate u. Missing texture
+    coordinates are 0.
 
     Args:
-        geometry: All that was read; region i becomes part i.
-        names: Names of the regions; equal ones are numbered.
-        materials: Their materials.
+        geometry: The whole geometry. Region i becomes part i.
+        names: Names of the regions. Equal names are numbered.
+        materials: Materials of the regions.
         path: The file.
     """
     meshes = split(from_file(geometry, path))
@@ -43,7 +43,7 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
     own = geometry.region == region
 
     def rows(value: np.ndarray | None, plain: int) -> np.ndarray | None:
-        """The part's rows of what its vertices have beside the mesh, if they are not all plain."""
+        """The part's rows of a vertex attribute; None if all have the default value."""
         return None if value is None or (value[own] == plain).all() else value[own]
 
     second, side = rows(geometry.second, 0), rows(geometry.handedness, 1)
@@ -62,12 +62,12 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
 
 
 def _laid(mesh: Mesh, place: np.ndarray | Array, given: np.ndarray, side: np.ndarray | None) -> tuple[Mesh, np.ndarray]:
-    """The mesh with tangents along u where none are given, and the handedness of all vertices."""
+    """The mesh with tangents along u where the file has none, and the handedness of all vertices."""
     image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, jnp.asarray(place, jnp.float32))
     along = np.where(given[:, None], mesh.tangent, texture.dpdu(image))
     return brush(mesh, along), np.where(given, 1 if side is None else side, texture.handedness(image))
 
 
 def _array(value: np.ndarray | Array | None) -> Array | None:
-    """An array on the device in the precision of meshes."""
+    """An array on the device, in the precision of meshes."""
     return None if value is None else jax.device_put(np.asarray(value, np.float32))

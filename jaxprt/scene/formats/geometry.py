@@ -1,4 +1,4 @@
-"""Arrays of meshes in files, before they become a `Mesh`: put in their places and joined."""
+"""Geometry as read from files, before it becomes a `Mesh`: transformed and joined."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,18 +7,18 @@ import numpy as np
 
 
 class Geometry(NamedTuple):
-    """Vertices and triangles in NumPy arrays. None stands for what a file does not have.
+    """Vertices and triangles in NumPy arrays. Attributes that a file does not have are None.
 
     Attributes:
-        position: [v 3].
-        face: Vertex numbers [f 3].
-        normal: [v 3] of any length; NaN or zero where there is none.
-        tangent: [v 3] of any length; zero where there is none.
-        handedness: [v], 1 where the bitangent of normal maps is cross(normal, tangent), and -1 where it is opposite.
+        position: Vertex positions [v 3].
+        face: Vertex indices [f 3].
+        normal: Normals [v 3] of any length; NaN or zero where missing.
+        tangent: Tangents [v 3] of any length; zero where missing.
+        handedness: 1 where the bitangent of normal maps is cross(normal, tangent), and -1 where it is opposite [v].
         texture: Texture coordinates [v 2], v up.
-        second: A second set of texture coordinates.
-        color: Linear colors [v 3], which multiply the base color.
-        region: Number of the region of each vertex [v].
+        second: Second set of texture coordinates [v 2].
+        color: Linear vertex colors [v 3], which multiply the base color.
+        region: Index of the region of each vertex [v].
     """
 
     position: np.ndarray
@@ -32,7 +32,7 @@ class Geometry(NamedTuple):
     region: np.ndarray | None = None
 
 
-# What takes the place of what only some geometries have: shape per vertex, and value.
+# Defaults for attributes that only some geometries have: shape per vertex, and value.
 _MISSING = {
     "normal": ((3,), np.nan),
     "tangent": ((3,), 0.0),
@@ -45,9 +45,9 @@ _MISSING = {
 
 
 def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
-    """A geometry under an affine transform [4 4]; one that mirrors turns faces over, so that fronts stay outside.
+    """Applies an affine transform [4 4] to a geometry. If it mirrors, faces are flipped so that fronts stay outside.
 
-    Normals are transformed by the cofactor matrix, which is defined for transforms that flatten or collapse too.
+    Normals are transformed by the cofactor matrix, which is also defined for singular transforms.
     """
     if np.array_equal(matrix, np.eye(4)):
         return geometry
@@ -67,7 +67,7 @@ def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
 
 
 def joined(geometries: Sequence[Geometry]) -> Geometry:
-    """One geometry of one or more, in their order."""
+    """Joins one or more geometries into one, in order."""
     if len(geometries) == 1:
         return geometries[0]
     start = np.cumsum([0, *(len(each.position) for each in geometries)])

@@ -1,4 +1,4 @@
-"""Scenes in glTF files: parts with their materials, and cameras."""
+"""Scenes from glTF files: parts with their materials, and cameras."""
 
 import math
 import pathlib
@@ -19,12 +19,12 @@ _HONORED = {
     "KHR_texture_transform",
     "KHR_mesh_quantization",
 }
-_HEIGHT = 512  # Pixels of cameras' pictures.
-_WIDEST = 64  # What is wider is taken for damage.
+_HEIGHT = 512  # height of cameras' pictures in pixels
+_WIDEST = 64  # a larger aspect ratio is taken for damage
 
 
 def read(path: pathlib.Path) -> Scene:
-    """The default scene of a glTF file: see `load_scene`."""
+    """Reads the default scene of a glTF file, as `load_scene` documents."""
     with damage_named(path):
         document = Document(path)
         contents = gltf_geometry.read(document)
@@ -52,7 +52,7 @@ def _name(document: Document, index: int | None) -> str:
 
 
 def _declared(document: Document) -> set[str]:
-    """Extensions and features that the file says it uses."""
+    """Extensions and features that the file declares."""
     declared = {key for key in ("animations", "skins") if document.items(key)}
     for key in ("extensionsUsed", "extensionsRequired"):
         declared |= set(document.header.get(key, []))
@@ -60,7 +60,7 @@ def _declared(document: Document) -> set[str]:
 
 
 def _cameras(document: Document, center: np.ndarray) -> tuple[list[Camera], set[str]]:
-    """The perspective cameras of all nodes, and the names of what cannot be one."""
+    """The perspective cameras of all nodes, and the names of unsupported cameras."""
     found, skipped = [], set()
     for node, item, matrix in gltf_geometry.nodes(document):
         if "camera" not in item:
@@ -74,7 +74,7 @@ def _cameras(document: Document, center: np.ndarray) -> tuple[list[Camera], set[
 
 
 def _camera(document: Document, item: dict[str, Any], owner: str, matrix: np.ndarray, center: np.ndarray) -> Camera:
-    """A camera in its node's place; it looks at a point that is as far away as the center of the scene."""
+    """A camera, transformed by its node. Its target is as far away as the center of the scene."""
     angle = document.numbers(item["yfov"], (), f"yfov of {owner}")
     aspect = document.numbers(item.get("aspectRatio", 1.0), (), f"aspectRatio of {owner}")
     if not 0 < angle < math.pi or not 0 < aspect < _WIDEST:

@@ -1,4 +1,4 @@
-"""The container of glTF 2.0: the header in JSON, buffers, accessors, images; in GLB files and in folders.
+"""The container format of glTF 2.0: JSON header, buffers, accessors and images, in GLB files or separate files.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
@@ -17,12 +17,12 @@ import numpy as np
 
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_JSON, _BINARY = 0x4E4F534A, 0x004E4942  # Types of a GLB's chunks.
-_MOST = 2**28  # elements of an accessor
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
+_MOST = 2**28  # most elements of an accessor
 
 
 class Document:
-    """A glTF file whose objects are looked up by their numbers, with errors that name the file and the object.
+    """A glTF file. Its objects are looked up by index; errors name the file and the object.
 
     Attributes:
         path: The file.
@@ -30,7 +30,7 @@ class Document:
     """
 
     def __init__(self, path: pathlib.Path):
-        """Reads the header, and a GLB's binary chunk; other files are read when they are needed."""
+        """Reads the header and the binary chunk of a GLB. Other files are read when they are needed."""
         self.path = path
         self._buffer: dict[int, bytes] = {}
         content = path.read_bytes()
@@ -51,7 +51,7 @@ class Document:
         return ValueError(f"{self.path} {required}, got {got}")
 
     def items(self, kind: str) -> list:
-        """All objects of a kind, such as "meshes"; empty where there are none."""
+        """All objects of a kind, such as "meshes"; may be empty."""
         found = self.header.get(kind, [])
         if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
             raise self.error(f"must be an undamaged glTF file with a list of {kind}", str(type(found).__name__))
@@ -62,11 +62,11 @@ class Document:
 
         Args:
             kind: The kind, such as "meshes".
-            index: Its number, as found in the file.
-            owner: What names it, for the message.
+            index: Its index, as found in the file.
+            owner: The object that refers to it, for error messages.
 
         Raises:
-            ValueError: There is none of this number.
+            ValueError: There is no object with this index.
         """
         found = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
@@ -74,10 +74,10 @@ class Document:
         return found[index]
 
     def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-        """Finite numbers of the header, in float64.
+        """Checks numbers of the header and converts them to float64.
 
         Raises:
-            ValueError: They are of another shape, or not finite.
+            ValueError: The numbers have another shape or are not finite.
         """
         try:
             array = np.asarray(value)
@@ -90,7 +90,7 @@ class Document:
         return np.asarray(value, np.float64)
 
     def view(self, index: Any, owner: str) -> tuple[memoryview, int]:
-        """The bytes of a buffer view, and its stride; 0 where elements follow each other."""
+        """The bytes of a buffer view, and its stride; 0 if elements are contiguous."""
         item = self.item("bufferViews", index, owner)
         content = self._content(item.get("buffer"), f"buffer view {index}")
         start, length = item.get("byteOffset", 0), item["byteLength"]
@@ -103,13 +103,13 @@ class Document:
         """The elements of an accessor (section 3.6.2).
 
         Args:
-            index: Its number.
-            owner: What names it, for messages.
-            widths: Numbers that an element may have.
-            whole: They are to be whole numbers, as indices are.
+            index: Its index.
+            owner: The object that refers to it, for error messages.
+            widths: Allowed numbers of components of an element.
+            whole: Whether the elements must be integers, such as indices.
 
         Returns:
-            An array [count, width]; in float64 unless `whole`, with normalized integers as shares of 1 or -1 to 1.
+            An array [count, width], in float64 unless `whole`. Normalized integers are mapped to [0, 1] or [-1, 1].
 
         Raises:
             ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type.
@@ -134,7 +134,7 @@ class Document:
         return value.astype(np.float64)
 
     def image(self, index: Any, owner: str) -> bytes:
-        """The bytes of an image file, inside the file or beside it."""
+        """The bytes of an image, embedded or in a separate file."""
         item = self.item("images", index, owner)
         if "bufferView" in item:
             return bytes(self.view(item["bufferView"], f"image {index}")[0])
@@ -175,7 +175,7 @@ class Document:
         return self._buffer[index]
 
     def _resource(self, uri: Any, owner: str) -> bytes:
-        """What a URI names: data inside it, or a file beside the glTF file."""
+        """The data of a URI: embedded in it, or in a file relative to the glTF file."""
         if not isinstance(uri, str) or not uri:
             raise self.error(f"must name a file or hold data in {owner}", repr(uri))
         if uri.startswith("data:"):
@@ -193,7 +193,7 @@ class Document:
         return path.read_bytes()
 
     def _strided(self, item: dict[str, Any], name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
-        """Elements of a buffer view, copied out of it."""
+        """A copy of the elements of a buffer view."""
         content, stride = self.view(item["bufferView"], name)
         offset, size = item.get("byteOffset", 0), dtype.itemsize * shape[1]
         stride = stride or size
@@ -206,7 +206,7 @@ class Document:
         return np.ndarray(shape, dtype, content, offset, (stride, dtype.itemsize)).copy()
 
     def _sparse(self, item: dict[str, Any], name: str, value: np.ndarray) -> np.ndarray:
-        """Elements some of which are replaced (section 3.6.2.3)."""
+        """Elements with the replacements of a sparse accessor (section 3.6.2.3)."""
         count, kind = item["count"], item["indices"]["componentType"]
         if not isinstance(count, int) or not 0 < count <= len(value) or kind not in (5121, 5123, 5125):
             got = f"{count!r} of component type {kind!r}"
@@ -220,7 +220,7 @@ class Document:
 
 @contextlib.contextmanager
 def damage_named(path: pathlib.Path) -> Iterator[None]:
-    """Turns errors that damaged headers lead to into one that names the file."""
+    """Converts errors caused by damaged headers into an error that names the file."""
     try:
         yield
     except KeyError as error:

@@ -1,4 +1,4 @@
-"""Geometry of glTF files: nodes in their places, and the triangles of their meshes.
+"""Geometry of glTF files: nodes with their transforms, and the triangles of their meshes.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
@@ -15,12 +15,12 @@ _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mes
 
 
 class Placed(NamedTuple):
-    """A node in the world.
+    """A node with its transform to world coordinates.
 
     Attributes:
-        node: Its number.
-        item: The JSON object.
-        matrix: Transform to the world [4 4].
+        node: Index of the node.
+        item: The JSON object of the node.
+        matrix: Transform from the node to world coordinates [4 4].
     """
 
     node: int
@@ -32,10 +32,10 @@ class Contents(NamedTuple):
     """The triangles of a file's default scene.
 
     Attributes:
-        geometry: All of them, with regions numbered from 0.
-        material: Number of the material of each region, None for primitives without one; empty for regions by nodes.
-        lacking: Pairs of a material's number and a set of texture coordinates that some of its primitives do not have.
-        ignored: Names of what is in the scene and is not read.
+        geometry: All triangles, with regions numbered from 0.
+        material: Index of each region's material, None for primitives without one; empty if regions are nodes.
+        lacking: Pairs of a material's index and a set of texture coordinates that some of its primitives lack.
+        ignored: Names of features of the scene that are not read.
     """
 
     geometry: Geometry
@@ -45,14 +45,14 @@ class Contents(NamedTuple):
 
 
 def read(document: Document, *, groups: bool = False) -> Contents:
-    """All triangles of the default scene in the world; instances of a mesh are repeated.
+    """Reads all triangles of the default scene in world coordinates. Instances of a mesh are repeated.
 
-    Vertices that no triangle of their primitive uses are left out; the others keep the file's order.
+    Vertices that no triangle of their primitive uses are removed. The others keep the order of the file.
 
     Args:
         document: The file.
-        groups: Number the regions by nodes, in the order in which they come; else by materials, in ascending
-            order of those that are used, and primitives without material last.
+        groups: Whether regions are nodes, in order of occurrence. Otherwise they are the used materials in ascending
+            order, with primitives without material last.
 
     Raises:
         ValueError: The file is damaged, its geometry is compressed, or it has no triangles.
@@ -115,7 +115,7 @@ def nodes(document: Document) -> list[Placed]:
 
 
 def _roots(document: Document) -> list[tuple[Any, str]]:
-    """Root nodes of the default scene; of the first scene where none is the default, of all nodes without scenes."""
+    """Root nodes of the default scene, or else of the first scene; without scenes, of all nodes."""
     if document.items("scenes"):
         index = document.header.get("scene", 0)
         scene = document.item("scenes", index, "the default scene")
@@ -125,7 +125,7 @@ def _roots(document: Document) -> list[tuple[Any, str]]:
 
 
 def _transform(document: Document, item: dict[str, Any], name: str) -> np.ndarray:
-    """A node's matrix, or its translation, rotation and scale (section 3.5.2)."""
+    """A node's transform, from its matrix or its translation, rotation and scale (section 3.5.2)."""
     if "matrix" in item:
         return document.numbers(item["matrix"], (16,), f"the matrix of {name}").reshape(4, 4).T
     rotation, scale, translation = (
@@ -156,7 +156,7 @@ def _check_readable(document: Document) -> None:
 def _primitives(
     document: Document, mesh: dict[str, Any], owner: str, ignored: set[str]
 ) -> list[tuple[int | None, Geometry]]:
-    """Material and geometry of each primitive of a mesh that has triangles."""
+    """Material and geometry of each primitive of a mesh, as far as it consists of triangles."""
     found = []
     for number, item in enumerate(mesh["primitives"]):
         name = f"primitive {number} of {owner}"
@@ -191,12 +191,12 @@ def _geometry(document: Document, item: dict[str, Any], name: str, ignored: set[
     normal, tangent = read_attribute("NORMAL", 3), read_attribute("TANGENT", 4)
     color = read_attribute("COLOR_0", 3, 4)
     place = [read_attribute(f"TEXCOORD_{number}", 2) for number in (0, 1)]
-    # Images have v down in glTF. What is not finite stands for no place at all.
+    # In glTF v points down. Coordinates that are not finite count as missing.
     texture, second = (
         None if each is None else np.where(np.isfinite(each), [[0, 1]] + each * [[1, -1]], 0) for each in place
     )
     if normal is None:
-        tangent = None  # Section 3.7.2.1: without normals they are ignored.
+        tangent = None  # section 3.7.2.1: ignored without normals
     whole = Geometry(
         position,
         _faces(document, item, count, name),
@@ -211,7 +211,7 @@ def _geometry(document: Document, item: dict[str, Any], name: str, ignored: set[
 
 
 def _faces(document: Document, item: dict[str, Any], count: int, name: str) -> np.ndarray:
-    """Vertex numbers of the triangles of a primitive."""
+    """Vertex indices of the triangles of a primitive."""
     index = np.arange(count)
     if "indices" in item:
         index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)[:, 0].astype(np.int64)
@@ -233,7 +233,7 @@ def _faces(document: Document, item: dict[str, Any], count: int, name: str) -> n
 
 
 def _used(geometry: Geometry) -> Geometry:
-    """A geometry without vertices that no triangle uses: primitives may share one array of vertices."""
+    """A geometry without unused vertices, because primitives may share one array of vertices."""
     used = np.zeros(len(geometry.position), bool)
     used[geometry.face] = True
     if used.all():

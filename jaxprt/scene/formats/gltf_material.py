@@ -17,10 +17,10 @@ _NEAREST = 9728
 
 
 class MaterialReader:
-    """Makes materials of a file; textures that several share are decoded and kept once.
+    """Reads the materials of a file. Shared textures are decoded and stored only once.
 
     Attributes:
-        ignored: Names of what the materials that were made have and is not honored.
+        ignored: Names of unsupported features of the materials that have been read.
     """
 
     def __init__(self, document: Document):
@@ -30,11 +30,10 @@ class MaterialReader:
         self._channels: dict[tuple[Any, bool, tuple[int, ...]], jax.Array] = {}
 
     def material(self, index: int | None) -> TexturedMaterial:
-        """The material of a number; the default one of the specification for None.
+        """The material with an index; for None the default material of the specification.
 
         Raises:
-            ValueError: The material is damaged: numbers that are not finite or out of range, textures that are no
-                pictures.
+            ValueError: A number is not finite or out of range, or a texture is not an image.
             FileNotFoundError: The file of an image does not exist.
         """
         if index is None:
@@ -79,7 +78,7 @@ class MaterialReader:
         return self._document.numbers(item.get(key, default), np.shape(default), f"{key} of {owner}")
 
     def _note(self, item: dict[str, Any]) -> None:
-        """Notes what a material has and this package does not."""
+        """Records unsupported features of a material."""
         if item.get("alphaMode", "OPAQUE") != "OPAQUE":
             self.ignored.add(f"alpha mode {item['alphaMode']}")
         if item.get("doubleSided", False):
@@ -91,7 +90,7 @@ class MaterialReader:
     def _texture(
         self, info: dict[str, Any] | None, channels: tuple[int, ...], owner: str, *, decoded: bool = False
     ) -> Texture | None:
-        """Some channels of a texture; None where there is none that can be read."""
+        """Some channels of a texture; None if there is no texture that can be read."""
         if info is None:
             return None
         item = self._document.item("textures", info["index"], owner)
@@ -120,11 +119,11 @@ class MaterialReader:
         return self._channels[key]
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
-        """KHR_texture_transform, from texture coordinates with v up to v up.
+        """The affine transform of KHR_texture_transform, for texture coordinates with v up.
 
-        The matrix, for v down, is [cos sin; -sin cos] times the scale: "counter-clockwise" is meant as seen on the
-        image. So have three.js and Blender's importer it; GLSL in the extension's text, read by columns, turns the
-        other way.
+        For v down, the matrix is [cos sin; -sin cos] times the scale, so that "counter-clockwise" holds as seen on the
+        image. three.js and Blender's importer agree. The GLSL code in the extension's text, read by columns, rotates
+        the other way.
         """
         (x, y), (across, down) = (
             self._number(moved, key, default, owner) for key, default in (("offset", (0.0, 0.0)), ("scale", (1.0, 1.0)))
@@ -137,7 +136,7 @@ class MaterialReader:
 
 
 def colored(image: np.ndarray) -> np.ndarray:
-    """An image with four channels, of one with 1 (gray), 2 (gray, alpha), 3 or 4."""
+    """Converts an image with 1 (gray), 2 (gray, alpha), 3 or 4 channels to four channels."""
     gray = image.shape[-1] < 3
     colors = np.broadcast_to(image[..., :1], (*image.shape[:2], 3)) if gray else image[..., :3]
     alpha = image[..., -1:] if image.shape[-1] % 2 == 0 else np.ones_like(image[..., :1])

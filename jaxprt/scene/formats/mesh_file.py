@@ -1,4 +1,4 @@
-"""Meshes in files: what trimesh reads of each format, with the damage that it passes over refused, and glTF."""
+"""Mesh files: glTF, and other formats by trimesh, with checks for damage that trimesh does not report."""
 
 import io
 import pathlib
@@ -12,11 +12,11 @@ from jaxprt.scene.formats import gltf_file, gltf_geometry
 from jaxprt.scene.formats.geometry import Geometry, joined
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
-_COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # Names may hold a #, as in Blender's "Material_#25".
+_COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Blender's "Material_#25"
 
 
 def read(path: pathlib.Path, *, groups: bool) -> Geometry:
-    """The triangles of a file in the world, with regions."""
+    """Reads the triangles of a file in world coordinates, with regions."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {suffix!r}")
@@ -29,8 +29,8 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
 
 
 def _load(path: pathlib.Path, suffix: str, groups: bool) -> Any:
-    """The file as trimesh has it, or an error that names it."""
-    import trimesh  # Here, since it takes a second, with most of SciPy.
+    """Loads a file by trimesh. Errors name the file."""
+    import trimesh  # imported here, because it takes a second, with most of SciPy
 
     options: dict[str, Any] = {}
     source = path
@@ -48,8 +48,8 @@ def _load(path: pathlib.Path, suffix: str, groups: bool) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return trimesh.load_scene(source, file_type=suffix[1:], process=False, **options)
-    except Exception as error:  # trimesh's parsers raise what they stumble over.
-        text = isinstance(error, ModuleNotFoundError)  # It guesses encodings with a package that is not needed.
+    except Exception as error:  # trimesh's parsers raise errors of any kind
+        text = isinstance(error, ModuleNotFoundError)  # trimesh guesses encodings with an optional package
         detail = "it is not text" if text else f"{type(error).__name__}: {error}"
         raise ValueError(
             f"{path} must be an undamaged {suffix[1:].upper()} file, got one that cannot be read: {detail}"
@@ -57,7 +57,7 @@ def _load(path: pathlib.Path, suffix: str, groups: bool) -> Any:
 
 
 def _check_rows(content: bytes, suffix: str) -> None:
-    """Refuses PLY and OFF text that ends before the rows which its header counts."""
+    """Refuses PLY and OFF text files with fewer rows than their header states."""
     if suffix == ".ply":
         header, _, body = content.partition(b"end_header")
         element = re.findall(rb"^element\s+\S+\s+(\d+)([^\0]*?)(?=^element|\Z)", header, re.MULTILINE)
@@ -81,7 +81,7 @@ def _check_rows(content: bytes, suffix: str) -> None:
 
 
 def _obj_text(path: pathlib.Path) -> str:
-    """An OBJ with absolute indices: trimesh counts relative ones from the end of the file, not from their line."""
+    """The text of an OBJ file with absolute indices, because trimesh resolves relative ones at the end of the file."""
     content = path.read_bytes()
     if b"\0" in content:
         raise ValueError(f"{path} must be an undamaged OBJ file, got one that is not text")
@@ -89,7 +89,7 @@ def _obj_text(path: pathlib.Path) -> str:
     lines = [statement(line) for line in text.splitlines()]
     count = {"v": 0, "vt": 0, "vn": 0}
     absolute = lines.copy()
-    faces = []  # Line number, number of corners, lowest and highest vertex, and texture coordinate if any.
+    faces = []  # line, corners, lowest and highest vertex and texture coordinate
     for number, line in enumerate(lines):
         kind, _, rest = line.partition(" ")
         if kind in count:
@@ -126,7 +126,7 @@ def _obj_text(path: pathlib.Path) -> str:
 
 
 def statement(line: str) -> str:
-    """A line of an OBJ or MTL file without its comment, which starts with a # that stands alone, or the line."""
+    """A line of an OBJ or MTL file without its comment. A comment starts with a # that stands alone or first."""
     return _COMMENT.sub("", line.strip()).strip()
 
 
@@ -135,28 +135,28 @@ def _whole(index: str) -> int:
 
 
 def _absolute(index: str, count: int) -> str:
-    """An index counted back from the latest element, counted from the first one instead."""
+    """Converts an index relative to the latest element to an absolute index."""
     return str(count + 1 + int(index)) if re.fullmatch(r"-\d+", index) else index
 
 
 def _concatenate(scene: Any, suffix: str, name: str) -> Geometry:
-    """All geometries of a scene, one region each."""
+    """Joins all geometries of a trimesh scene, with one region each."""
     import trimesh
 
     parts = []
     nodes = list(scene.graph.nodes_geometry)
-    for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh takes an OBJ's materials last first.
+    for node in reversed(nodes) if suffix == ".obj" else nodes:  # trimesh reverses the materials of an OBJ file
         geometry = scene.geometry[scene.graph[node][1]]
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
         position, face = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
         if position.ndim != 2 or position.shape[1] != 3:
             raise ValueError(f"{name} must have three coordinates per vertex, got the shape {position.shape}")
-        # Asked for by name, normals that the file lacks would be computed.
+        # Accessing missing normals by attribute would compute them.
         normal = geometry._cache.cache.get("vertex_normals", np.full(position.shape, np.nan))
         texture, given = None, getattr(geometry.visual, "uv", None)
         if given is not None and len(given) == len(position):
-            # OBJs may have one, and v is 0 then, or a third, which no image needs.
+            # OBJ files may have one coordinate, with v = 0, or a third, which is not used.
             own = np.asarray(given, np.float64)[:, :2]
             texture = np.zeros((len(position), 2))
             texture[:, : own.shape[1]] = np.where(np.isfinite(own), own, 0)

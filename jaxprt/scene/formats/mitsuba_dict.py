@@ -1,4 +1,4 @@
-"""Scenes in the dictionaries of Mitsuba 3, which `mitsuba.load_dict` takes; Mitsuba itself is not needed.
+"""Scenes from dictionaries in the form of `mitsuba.load_dict` (Mitsuba 3). Mitsuba itself is not needed.
 
 References in comments are to the plugin reference of Mitsuba 3, https://mitsuba.readthedocs.io.
 """
@@ -23,8 +23,8 @@ from jaxprt.scene.formats.mitsuba_material import MaterialMaker, rgb
 from jaxprt.scene.mesh import grid_face
 from jaxprt.scene.scene import Part, Scene
 
-_CELLS, _RINGS = 32, 64  # How finely rectangles and sides of cubes, and spheres, are divided: light is at vertices.
-# Sides of a cube: normal, and where u and v point.
+_CELLS, _RINGS = 32, 64  # subdivision of flat sides and of spheres, because light is computed at vertices
+# Sides of a cube: normal, and directions of u and v.
 _SIDES = (
     ((0, -1, 0), (0, 0, 1), (1, 0, 0)),
     ((0, 1, 0), (-1, 0, 0), (0, 0, -1)),
@@ -37,13 +37,13 @@ _MESHES = {"obj": ".obj", "ply": ".ply"}
 _SHAPES = {*_MESHES, "rectangle", "cube", "sphere"}
 _SENSORS = {"perspective", "thinlens"}
 _EMITTERS = {"envmap", "constant"}
-# Plugins that say how a picture is computed, not of what.
+# Plugins that control how a picture is computed, not what it shows.
 _SILENT = {"path", "direct", "volpath", "volpathmis", "ptracer", "aov", "prb", "prb_basic", "direct_projective"}
 _SILENT |= {"prb_projective", "independent", "multijitter", "orthogonal", "stratified", "ldsampler", "moment", "depth"}
 
 
 def read(scene: Mapping[str, Any]) -> Scene:
-    """The scene of a dictionary: see `load_scene`."""
+    """Reads the scene of a dictionary, as `load_scene` documents."""
     if scene.get("type") != "scene":
         raise ValueError(f"a dictionary of Mitsuba must have the type 'scene', got {scene.get('type')!r}")
     ignored: set[str] = set()
@@ -69,10 +69,10 @@ def read(scene: Mapping[str, Any]) -> Scene:
 
 
 def transform(value: Any, name: str) -> np.ndarray:
-    """A transform [4 4] of an array, nested lists or an object with a `matrix`; the identity for None.
+    """A transform [4 4] from an array, nested lists or an object with a `matrix`; the identity for None.
 
     Raises:
-        ValueError: It is another thing, or not finite.
+        ValueError: The value has another form or is not finite.
     """
     if value is None:
         return np.eye(4)
@@ -91,7 +91,7 @@ def _part(name: str, item: Mapping[str, Any], materials: MaterialMaker) -> Part:
         if path.suffix.lower() != _MESHES[kind]:
             raise ValueError(f"the filename of {name} must end in {_MESHES[kind]}, got {str(path)!r}")
         geometry = mesh_file.read(path, groups=False)
-        # OBJ has v up and images have v down; Mitsuba turns the coordinates of OBJs over, but not those of PLYs.
+        # OBJ files have v up, images v down. Mitsuba flips v for OBJ files, but not for PLY files.
         if not item.get("flip_tex_coords", kind == "obj") and geometry.texture is not None:
             geometry = geometry._replace(texture=[[0, 1]] + geometry.texture * [[1, -1]])
         if item.get("face_normals", False):
@@ -107,7 +107,7 @@ def _part(name: str, item: Mapping[str, Any], materials: MaterialMaker) -> Part:
 
 
 def _flat(geometry: Geometry) -> Geometry:
-    """The triangles apart from each other, with their own normals."""
+    """Separate triangles with flat normals."""
     corner = geometry.position[geometry.face]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     texture = None if geometry.texture is None else geometry.texture[geometry.face.ravel()]
@@ -116,20 +116,20 @@ def _flat(geometry: Geometry) -> Geometry:
 
 
 def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coordinates u and v [n 1] of a grid, and faces whose front is where u x v points."""
+    """Coordinates u and v [n 1] of a grid, and faces whose front is the side to which u x v points."""
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     return u.reshape(-1, 1), v.reshape(-1, 1), grid_face(rows=rows + 1, columns=columns + 1)[:, ::-1]
 
 
 def _rectangle(item: Mapping[str, Any]) -> Geometry:
-    """From -1 to 1 in the plane z = 0, facing +z; Mitsuba has the image's first row at its lower edge."""
+    """A rectangle from -1 to 1 in the plane z = 0, facing +z. As in Mitsuba, the image's first row is at the bottom."""
     u, v, face = _grid(_CELLS, _CELLS)
     position = np.concatenate([2 * u - 1, 2 * v - 1, 0 * u], 1)
     return Geometry(position, face, np.tile([0.0, 0, 1], (len(u), 1)), texture=np.concatenate([u, 1 - v], 1))
 
 
 def _cube(item: Mapping[str, Any]) -> Geometry:
-    """From -1 to 1 along all axes."""
+    """A cube from -1 to 1 along all axes."""
     u, v, face = _grid(_CELLS, _CELLS)
     position, normal, texture, faces = [], [], [], []
     for number, (front, across, along) in enumerate(np.array(_SIDES, float)):
@@ -142,7 +142,7 @@ def _cube(item: Mapping[str, Any]) -> Geometry:
 
 
 def _sphere(item: Mapping[str, Any]) -> Geometry:
-    """Around a center, with the pole of its image on +z."""
+    """A sphere around a center. The pole of its texture coordinates is at +z."""
     u, v, face = _grid(_RINGS, 2 * _RINGS)
     sine = np.sin(np.pi * v)
     normal = np.concatenate([np.cos(2 * np.pi * u) * sine, np.sin(2 * np.pi * u) * sine, np.cos(np.pi * v)], 1)
@@ -154,7 +154,7 @@ def _sphere(item: Mapping[str, Any]) -> Geometry:
 
 
 def _camera(name: str, item: Mapping[str, Any], ignored: set[str]) -> Camera:
-    """A perspective sensor, which looks along its +z."""
+    """A camera from a perspective sensor, which looks along its +z axis."""
     if item["type"] == "thinlens":
         ignored.add(f"the aperture of {name}")
     ignored |= {f"{key} of {name}" for key in item if key.startswith("principal_point_offset") and item[key]}
@@ -177,7 +177,7 @@ def _camera(name: str, item: Mapping[str, Any], ignored: set[str]) -> Camera:
 
 
 def _environment(name: str, item: Mapping[str, Any]) -> Environment:
-    """Distant light."""
+    """Distant light from an emitter."""
     if item["type"] == "constant":
         color = rgb(item.get("radiance", 1.0), f"radiance of {name}")
         return Environment(jnp.asarray(np.broadcast_to(color, (6, 1, 1, 3)), jnp.float32))

@@ -1,8 +1,9 @@
-"""Metallic-roughness materials equal or near to BSDFs of Mitsuba 3.
+"""Conversion of BSDFs of Mitsuba 3 to equal or similar metallic-roughness materials.
 
-Equal: `diffuse`; `conductor` and `roughconductor` (GGX) but for Schlick's approximation of Fresnel's equations. Near:
-`principled` without its further lobes, whose diffuse part is not Lambert's, and `plastic` and `roughplastic`, whose
-light is scattered more than once below the surface.
+`diffuse` is converted exactly. `conductor` and `roughconductor` (GGX) differ only by Schlick's approximation of
+Fresnel's equations. `principled` (without its further lobes) is approximated, because its diffuse part is not
+Lambertian. `plastic` and `roughplastic` are approximated, because Mitsuba includes multiple scattering below the
+surface.
 """
 
 import math
@@ -15,17 +16,17 @@ import numpy as np
 from jaxprt.files import images
 from jaxprt.scene.material import Texture, TexturedMaterial
 
-FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # Between v up and v down.
-_LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # Rec. 709, as Mitsuba's textures weigh channels.
+FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # converts between v up and v down
+_LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # Rec. 709 weights of Mitsuba's textures
 _WRAPPERS = {"twosided", "mask", "bumpmap", "normalmap"}
 _MAKERS = {"diffuse", "principled", "conductor", "roughconductor", "plastic", "roughplastic"}
 
 
 def rgb(value: Any, name: str) -> np.ndarray:
-    """A color [3] of a number, three of them, or a dictionary of the type rgb, srgb, uniform or spectrum.
+    """A color [3] from a number, three numbers, or a dictionary of type rgb, srgb, uniform or spectrum.
 
     Raises:
-        ValueError: It is another thing, or not finite.
+        ValueError: The value has another form or is not finite.
     """
     if isinstance(value, Mapping):
         inner = value.get("value", value.get("color"))
@@ -39,21 +40,21 @@ def rgb(value: Any, name: str) -> np.ndarray:
 
 
 class MaterialMaker:
-    """Makes materials of BSDFs in the dictionary of a scene, and notes what they cannot have."""
+    """Converts BSDFs in the dictionary of a scene to materials. Records unsupported parameters."""
 
     def __init__(self, scene: Mapping[str, Any], ignored: set[str]):
         self._scene, self._ignored = scene, ignored
 
     @staticmethod
     def knows(kind: str) -> bool:
-        """Whether a type of plugin is a BSDF or a texture that is only looked at where a shape names it."""
+        """Whether a plugin type is a BSDF or texture, which is read only if a shape refers to it."""
         return kind in _MAKERS | _WRAPPERS | {"bitmap", "rgb", "ref"}
 
     def of_shape(self, name: str, item: Mapping[str, Any]) -> TexturedMaterial:
-        """The material of a shape, with the light that it emits; Mitsuba's gray of 0.5 where it has none.
+        """The material of a shape, including its emission. Without a BSDF it is Mitsuba's default gray of 0.5.
 
         Raises:
-            ValueError: The BSDF is of a type that has no equal here, or refers to one that is missing.
+            ValueError: The BSDF has an unsupported type, or a reference is missing.
         """
         field: dict[str, Any] = {"base_color": 0.5, "metallic": 0.0, "specular": 0.0}
         for key, each in item.items():
@@ -71,7 +72,7 @@ class MaterialMaker:
             raise ValueError(f"{name}: {error}") from error
 
     def _resolved(self, item: Any, name: str) -> Mapping[str, Any] | None:
-        """A nested dictionary, or the one of the scene that it refers to."""
+        """A nested dictionary, or the dictionary of the scene that it refers to."""
         if not isinstance(item, Mapping):
             return None
         if item.get("type") != "ref":
@@ -82,7 +83,7 @@ class MaterialMaker:
         return found
 
     def _field(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
-        """Factors and textures of a BSDF."""
+        """Factors and textures of the material for a BSDF."""
         kind = str(item.get("type"))
         if kind in _WRAPPERS:
             backs = kind == "twosided"
@@ -107,7 +108,7 @@ class MaterialMaker:
         return {"metallic": 0.0, "specular": 0.0} | self._color(item, "reflectance", 0.5, name)
 
     def _principled(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
-        """Roughnesses alpha along and across the tangent are equal to Mitsuba's, anisotropy included."""
+        """Converts `principled`. Alpha along and across the tangent equals Mitsuba's, including anisotropy."""
         self._rest(item, name, {"base_color", "metallic", "roughness", "specular", "eta", "anisotropic"})
         field = self._color(item, "base_color", 0.5, name)
         field |= self._scalar(item, "metallic", 0.0, name) | self._scalar(item, "roughness", 0.5, name)
@@ -140,7 +141,7 @@ class MaterialMaker:
         if item.get("distribution", "beckmann") != "ggx":
             self._ignored.add(f"distribution beckmann of {name}")
         alpha = [self._alpha(item.get(key, item.get("alpha", 0.1)), name) for key in ("alpha_u", "alpha_v")]
-        if alpha[0] < alpha[1]:  # The direction of anisotropy is that of the larger alpha.
+        if alpha[0] < alpha[1]:  # the direction of anisotropy is that of the larger alpha
             return field | {"metallic": 1.0, "rotation": math.pi / 2} | _stretched(alpha[1], alpha[0])
         return field | {"metallic": 1.0} | _stretched(*alpha)
 
@@ -153,7 +154,7 @@ class MaterialMaker:
         return field | {"metallic": 0.0, "roughness": math.sqrt(alpha), "ior": ratio[0] / ratio[1]}
 
     def _rest(self, item: Mapping[str, Any], name: str, known: set[str]) -> None:
-        """Notes parameters that have no equal, unless they are zero."""
+        """Records unsupported parameters, unless they are zero."""
         for key in item.keys() - known - {"type", "id"}:
             value = item[key]
             if isinstance(value, Mapping | str) or np.any(np.asarray(value) != 0):
@@ -180,7 +181,7 @@ class MaterialMaker:
         return {key: float(rgb(item.get(key, default) if value is None else value, f"{key} of {name}")[0])}
 
     def _texture(self, item: Mapping[str, Any], name: str, *, colors: bool) -> Texture:
-        """A bitmap; values that are not colors are its luminance."""
+        """A texture from a bitmap. Unless `colors`, its luminance is used."""
         if "filename" not in item:
             raise ValueError(f"{name} must have a filename, got {', '.join(item)}")
         with open(item["filename"], "rb") as file:
@@ -205,9 +206,9 @@ class MaterialMaker:
 
 
 def _stretched(along: float, across: float) -> dict[str, float]:
-    """Roughness and anisotropy of the alphas along and across its direction, the first not below the second.
+    """Roughness and anisotropy from alpha along and across the direction of anisotropy; along >= across.
 
-    KHR_materials_anisotropy has alpha_t = mix(alpha, 1, anisotropy^2) along and alpha_b = alpha across.
+    KHR_materials_anisotropy defines alpha_t = mix(alpha, 1, anisotropy^2) along and alpha_b = alpha across.
     """
     along = min(along, 1.0)
     square = (along - across) / (1 - across) if across < 1 else 0.0

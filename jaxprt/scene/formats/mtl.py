@@ -1,4 +1,4 @@
-"""Materials of OBJ files (Wavefront MTL), with the metallic-roughness statements that exporters add."""
+"""Materials of OBJ files (Wavefront MTL), including the metallic-roughness statements of newer exporters."""
 
 import math
 import pathlib
@@ -16,7 +16,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
 _NUMBERS = {"Ns", "Ni", "Pr", "Pm", "illum"}
-# Where a map goes: field, channels, whether it holds colors in sRGB.
+# Target of each map: field, channels, and whether it holds sRGB colors.
 _MAPS = {
     "map_Kd": ("base_color_texture", (0, 1, 2), True),
     "map_Ke": ("emissive_texture", (0, 1, 2), True),
@@ -24,24 +24,24 @@ _MAPS = {
     "map_Pm": ("metallic_texture", (0,), False),
     "norm": ("normal_texture", (0, 1, 2), False),
 }
-_ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # Numbers that options of maps may have; all others have one word.
-_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # Ambient light is computed; the rest is of transparent things.
+_ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # most values of map options; all other options have one
+_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # ambient light is computed; the others concern transparency
 _OPAQUE = {"d": 1.0, "Tr": 0.0}
 _BLENDER = re.compile(
     r"# Blender (v?)(\d+)\.(\d+)"
-)  # How an OBJ file of Blender begins; with v that of its older exporter.
+)  # first line of OBJ files by Blender; the v is from its older exporter
 
 
 def matte() -> TexturedMaterial:
-    """What faces without material are made of: a gray that reflects alike in all directions."""
+    """The default material of faces without material: a matte gray."""
     return TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0)
 
 
 def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
-    """Names and materials of the regions of an OBJ file, in the order of their first faces, as `mesh_file` has them.
+    """Names and materials of the regions of an OBJ file, in the order of their first faces.
 
-    What is missing (MTL files, materials, images) or not honored is named in one warning; a matte gray takes the
-    place of materials that are missing.
+    A single warning names everything that is missing (MTL files, materials, images) or not supported. Missing materials
+    are replaced by a matte gray.
 
     Args:
         path: The OBJ file.
@@ -72,9 +72,9 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
 
 
 def _exponent(line: str) -> float | None:
-    """The exponent Ns that Blender gives to a roughness of 0, by the first line of its OBJ file; None for others.
+    """The exponent Ns that this version of Blender writes for a roughness of 0, from the first line of the OBJ file.
 
-    Before 2.80 Blender's materials were Phong's.
+    None for other programs, and for Blender before 2.80, which had Phong materials.
     """
     found = _BLENDER.match(line)
     if found is None or (version := (int(found[2]), int(found[3]))) < (2, 80):
@@ -83,28 +83,28 @@ def _exponent(line: str) -> float | None:
 
 
 def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str, TexturedMaterial], set[str]]:
-    """The materials of an MTL file.
+    """Reads the materials of an MTL file.
 
-    Kd is the base color; map_Kd multiplies it. Where there is Pr or Pm (roughness and metalness), these and Ni make
-    the rest. Else the material is Phong's: a dielectric whose reflectance at normal incidence is Ks, none for illum 0
-    and 1 or without Ks, and whose roughness is that of the microfacet distribution nearest to the lobe of exponent Ns:
-    alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007, "Microfacet models for refraction through
-    rough surfaces", section 5.2).
+    Kd is the base color, multiplied by map_Kd. If there is Pr or Pm (roughness and metalness), these and Ni determine
+    the rest. Otherwise the material is a Phong material, which is converted to a dielectric. Its reflectance at normal
+    incidence is Ks, or zero for illum 0 and 1 or without Ks. Its roughness is that of the microfacet distribution
+    closest to the lobe of exponent Ns: alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007,
+    "Microfacet models for refraction through rough surfaces", section 5.2).
 
-    Blender 2.80 and newer instead writes its principled material as Ns = `blender` (1 - roughness)^2, Ks = twelve and a
-    half times the reflectance at normal incidence, and metalness as Ka where illum is 3 or 6. Textures of it replace
-    their factors, and map_Bump is a normal map. The factors beside Pr and Pm are read this way too.
+    Blender 2.80 and newer writes its principled material differently: Ns = `blender` (1 - roughness)^2, Ks = 12.5 times
+    the reflectance at normal incidence, and metalness as Ka if illum is 3 or 6. Its textures replace the factors, and
+    map_Bump is a normal map. Factors that accompany Pr and Pm are read in this way too.
 
     Args:
         path: The file.
-        blender: The exponent that Blender gives to a roughness of 0, where it wrote the file that names this one; None
-            for other files. Files whose first line does not name Blender are read as others.
+        blender: Exponent that Blender writes for a roughness of 0, if the first line of the OBJ file names Blender;
+            None for files of other programs.
 
     Returns:
-        Materials by name, and what is not honored: statements by name, and images that are missing or damaged.
+        Materials by name; and names of unsupported statements and of missing or damaged images.
 
     Raises:
-        ValueError: A number is damaged or out of its range; says where.
+        ValueError: A number is damaged or out of range. The message states where.
     """
     material: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
@@ -127,7 +127,7 @@ def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str,
 def _material(
     statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str], blender: float | None
 ) -> TexturedMaterial:
-    """The material of the statements after one newmtl."""
+    """The material from the statements after one newmtl."""
     if blender is not None:
         statements = {"norm" if key == "map_Bump" else key: words for key, words in statements.items()}
     keys = [*_COLORS, *_NUMBERS, *([] if blender is None else ["Ka"])]
@@ -147,7 +147,7 @@ def _material(
     if blender is not None:
         field |= _principled(value, field.keys(), blender)
         return _checked(field, path, name)
-    # An exponent n of Phong's lobe is about alpha = sqrt(2 / (n + 2)); roughness is the root of alpha.
+    # A Phong lobe of exponent n corresponds to alpha = sqrt(2 / (n + 2)); roughness is the square root of alpha.
     roughness = (2 / (max(0.0, value.get("Ns", 0.0)) + 2)) ** 0.25
     if (value.keys() | statements.keys()) & {"Pr", "Pm", "map_Pr", "map_Pm"}:
         field["roughness"] = value.get("Pr", 1.0 if "roughness_texture" in field else roughness)
@@ -155,15 +155,15 @@ def _material(
         field["ior"] = max(1.0, value.get("Ni", 1.5))
     elif "Ks" not in value or value.get("illum", 2) < 2:
         field |= {"metallic": 0.0, "roughness": roughness, "specular": 0.0}
-    else:  # At the default index of refraction 4 % times the color are reflected.
+    else:  # with the default index of refraction the reflectance is 4 % times the color
         field |= {"metallic": 0.0, "roughness": roughness, "specular_color": value["Ks"] / 0.04}
     return _checked(field, path, name)
 
 
 def _principled(value: dict[str, Any], given: Collection[str], exponent: float) -> dict[str, Any]:
-    """Factors of Blender's principled material, from what Blender's exporter makes of them.
+    """Factors of Blender's principled material, from the values that Blender's exporter writes.
 
-    This is the inverse that its importer uses: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
+    Blender's importer uses the same inverse: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
     """
     shine = min(max(value.get("Ns", 0.0) / exponent, 0.0), 1.0)
     metallic = min(max(value.get("Ka", 0.0), 0.0), 1.0) if value.get("illum", 2) in (3, 6) else 0.0
@@ -172,7 +172,7 @@ def _principled(value: dict[str, Any], given: Collection[str], exponent: float) 
         "roughness": value.get("Pr", 1 - math.sqrt(shine)),
         "metallic": value.get("Pm", metallic),
         "specular": float(np.max(specular) > 0),
-        "specular_color": 2 * specular,  # At 0.5 Blender reflects 4 %, as at 1 here.
+        "specular_color": 2 * specular,  # Blender reflects 4 % at 0.5, this package at 1
     }
     return factor | {
         key: 1.0 for key in ("base_color", "roughness", "metallic", "emissive") if f"{key}_texture" in given
@@ -180,7 +180,7 @@ def _principled(value: dict[str, Any], given: Collection[str], exponent: float) 
 
 
 def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
-    """The material, or an error that names it."""
+    """Makes the material. Errors name the file and the material."""
     try:
         return TexturedMaterial(**field)
     except ValueError as error:
@@ -188,7 +188,7 @@ def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMa
 
 
 def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name: str) -> Any:
-    """The number or color of a statement; one number stands for a gray."""
+    """The number or color of a statement. A single number stands for a gray."""
     words = statements[key]
     try:
         if not words or words[0] in ("spectral", "xyz"):
@@ -205,7 +205,7 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
 
 
 def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Path, ignored: set[str]) -> None:
-    """Adds the texture of a statement, or what is wrong with it to what is ignored."""
+    """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`."""
     name, channels, decoded = _MAPS[key]
     options, words = _options(words)
     file = path.parent / " ".join(words).replace("\\", "/")
@@ -231,7 +231,7 @@ def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Pa
 
 
 def _options(words: list[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """Options of a map before the name of its file, and the words of the name."""
+    """The options of a map, and the words of its file name, which follow them."""
     options: dict[str, list[str]] = {}
     place = 0
     while place < len(words) - 1 and words[place].startswith("-"):
@@ -253,5 +253,5 @@ def _is_number(word: str) -> bool:
 
 
 def _pair(words: list[str], plain: float) -> list[float]:
-    """Two numbers of an option of up to three."""
+    """The first two numbers of an option of up to three."""
     return [*(float(word) for word in words[:2]), plain, plain][:2]

@@ -1,4 +1,4 @@
-"""Scenes in files of all formats."""
+"""Loading of scenes from files of all supported formats."""
 
 import pathlib
 from collections.abc import Mapping
@@ -10,27 +10,28 @@ from jaxprt.scene.scene import Scene
 
 
 def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
-    """Loads a scene with its materials: a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
+    """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
-    Geometry is read as by `load_mesh`. There is one part for each material that is used, named after it; equal names
-    are numbered. Textures repeat what several materials share only once.
+    Geometry is read like `load_mesh` reads it. Each material in use becomes one part, named after the material; equal
+    names are numbered. Textures that materials share are stored only once.
 
-    A glTF file has metallic-roughness materials with textures, normal maps, vertex colors, two sets of texture
-    coordinates, and perspective cameras in their nodes' places, with pictures 512 pixels high. The extensions
-    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform and KHR_mesh_quantization
-    are honored. What else the file has (alpha modes, transmission, skins, animations, lights, orthographic cameras,
-    and so on) is named in one warning. Primitives without material have the default one of the specification, a white
+    Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
+    texture coordinates, and perspective cameras, whose pictures are 512 pixels high. It supports the extensions
+    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform and KHR_mesh_quantization. A
+    single warning names all other features of the file (alpha modes, transmission, skins, animations, lights,
+    orthographic cameras, and so on). Primitives without material get the default material of the specification, a white
     rough metal.
 
-    An OBJ file has the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and of the metallic-roughness
-    statements Pr, Pm, map_Pr, map_Pm and Ni; see `mtl.read` for how Phong's, and those of Blender, become
-    metallic-roughness ones. MTL files, materials and images that are missing are named in one warning, together with
-    what is not honored. Other files have no materials: one matte gray part, named after the file, as of an OBJ file
-    that names none.
+    Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
+    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `mtl.read` explains how Phong materials and those of
+    Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
 
-    A dictionary is as for `mitsuba.load_dict`, with arrays [4 4] or objects that have a `matrix` as transforms. It has
-    the shapes obj, ply, rectangle, cube and sphere, the last three divided finely; the BSDFs that `mitsuba_material`
-    names, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective sensors.
+    Files of other formats, and OBJ files without materials, become one matte gray part that is named after the file.
+
+    A dictionary has the form of `mitsuba.load_dict`. Transforms are arrays [4 4] or objects with a `matrix`. Supported
+    are the shapes obj, ply, rectangle, cube and sphere (the last three are finely subdivided); the BSDFs that
+    `mitsuba_material` lists, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective
+    sensors.
 
     Args:
         path: The file, or the dictionary.
@@ -39,9 +40,9 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
         The scene.
 
     Raises:
-        FileNotFoundError: There is no such file, or it needs another one that does not exist.
-        ValueError: The file is of no known kind, damaged, or has no triangles; an image is no picture; a factor is
-            not finite or out of its range; a BSDF of a dictionary has no equal here.
+        FileNotFoundError: The file, or a file that it refers to, does not exist.
+        ValueError: The file is of an unknown kind, damaged, or has no triangles; an image cannot be read; a factor is
+            not finite or out of range; or a BSDF of a dictionary is not supported.
     """
     if isinstance(path, Mapping):
         return mitsuba_dict.read(path)
