@@ -143,13 +143,14 @@ def exact_picture(
     environments: Sequence[Environment],
     camera: Camera,
     *,
+    most: int | None = None,
     progress: bool = False,
     between: Between = None,
 ) -> ExactPicture:
     """The picture by the exact sum at each of its shading points, with rays of their own.
 
     Parts that are ideally diffuse have the sum at their vertices, interpolated, as systems' pictures have; unless
-    these are more than points, or fewer than one for each 8 x 8 pixels. Where other parts have more than 16,384
+    these are more than points, or fewer than one for each 8 x 8 pixels. Where other parts have more than `most`
     points, the picture has half the pixels along its edges, or a third, and so on.
 
     Args:
@@ -157,14 +158,15 @@ def exact_picture(
         shadings: What its parts are to systems.
         environments: Lights of one size.
         camera: From where.
+        most: Largest number of points of parts that are not ideally diffuse; 16,384 if None.
         progress: Whether to show progress bars.
         between: As in `exact_pixels`.
     """
     shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
-    if count > _MOST:
-        step = math.ceil(math.sqrt(count / _MOST))
+    if count > (most := most or _MOST):
+        step = math.ceil(math.sqrt(count / most))
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
         camera = dataclasses.replace(camera, **size)
         shown = _Shown.of(scene, camera)
