@@ -146,6 +146,7 @@ def exact_picture(
     environments: Sequence[Environment],
     camera: Camera,
     *,
+    most: int | None = None,
     progress: bool = False,
     between: Between = None,
 ) -> ExactPicture:
@@ -153,21 +154,22 @@ def exact_picture(
 
     Lambertian parts are summed at their vertices and interpolated, as in the pictures of systems. This is not done if
     they have more vertices than points, or more than 64 points for each vertex. If the other parts have more than
-    16,384 points, the width and height of the picture are divided by 2, 3 or more.
+    `most` points, the width and height of the picture are divided by 2, 3 or more.
 
     Args:
         scene: The scene.
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
         camera: The camera.
+        most: Largest number of points of parts that are not ideally diffuse; 16,384 if None.
         progress: Whether to show progress bars.
         between: Function that is called between steps of the work, as in `exact_pixels`.
     """
     shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
-    if count > _MOST:
-        step = math.ceil(math.sqrt(count / _MOST))
+    if count > (most := most or _MOST):
+        step = math.ceil(math.sqrt(count / most))
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
         camera = dataclasses.replace(camera, **size)
         shown = _Shown.of(scene, camera)

@@ -12,7 +12,7 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, exact, regions
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, regions
 from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
@@ -245,12 +245,11 @@ def test_the_exact_picture_of_a_texture_in_a_white_light_is_the_texture(width):
     np.testing.assert_allclose(found.color[1], 2 * found.color[0], rtol=1e-4)
 
 
-def test_the_exact_picture_has_rays_from_its_own_points(monkeypatch):
-    monkeypatch.setattr(exact, "_MOST", 150)  # of 640 pixels
+def test_the_exact_picture_has_rays_from_its_own_points():
     glossy = scene(floor=SHARP)
     shadings = [channels.of_part(part) for part in glossy.parts]
     camera = dataclasses.replace(CAMERA, width=32, height=20)
-    found = exact_picture(glossy, shadings, [light()], camera)
+    found = exact_picture(glossy, shadings, [light()], camera, most=150)  # of 640 pixels
     height, width = found.color.shape[1:3]
     assert (found.camera.width, found.camera.height) == (width, height)
     assert width in (10, 16)
