@@ -218,7 +218,7 @@ class _DiffuseBounceJob(visibility.rays.VisibilityJob):
     """Job that computes what one bounce adds to transfer vectors, in blocks of vertices."""
 
     rows: np.ndarray  # [v, l, i] albedo times the transfer of the previous bounce
-    albedo: np.ndarray  # of each region
+    albedo: np.ndarray  # [r, l] albedo of each region
 
     @property
     def header(self) -> Mapping[str, Any]:

@@ -15,9 +15,9 @@ from jaxprt.sphere import directions, hemisphere
 RINGS, SECTORS = 64, 96  # of the quadrature whose nodes are the samples of EM
 FINEST = 2e5  # largest concentration, a width of an eighth of a degree
 _WIDEST = 2.0  # smallest concentration relative to a single lobe's; wider lobes would average light and shadow
-_TAIL = 4  # One of this many lobes may be wider, to fit the BRDF's tails:
+_TAIL = 4  # One of this many lobes may be wider, to fit the BRDF's tails;
 _RATIO = 4.0  # each has this factor less concentration than the one before it,
-_BROADEST = 8.0  # down to this concentration, a width of twenty degrees.
+_BROADEST = 8.0  # down to this concentration, a width of twenty degrees
 _SHARP = 50.0  # concentration above which a lobe counts as a planar normal distribution
 _CORE = 0.6  # share of the mass, nearest to the mirror direction, that sets the initial spread of lobes
 _BATCH = 8  # number of views fitted at once
