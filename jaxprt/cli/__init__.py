@@ -1,1 +1,1 @@
-"""The command line, and what it reports and animates."""
+"""The command line: its commands, reports and animations."""

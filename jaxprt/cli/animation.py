@@ -1,4 +1,4 @@
-"""Relights a scene whose materials change, by the dynamic system, and draws light, view and materials in motion."""
+"""Relights scenes with changing materials by the dynamic system, and writes animations of light, view and materials."""
 
 import itertools
 import timeit
@@ -22,20 +22,21 @@ from jaxprt.systems.bounces import BouncesSystem
 from jaxprt.systems.dynamic import DynamicSystem, Material
 
 LOBES = 4
-# Of the set, beside those of the scene. Lobes between these are at most twice as far off as at them.
+# Roughnesses of the family, in addition to those of the scene. Lobes interpolated between them have at most twice the
+# error that lobes have at them.
 ROUGHNESS = (0.05, 0.075, 0.11, 0.16, 0.23, 0.34, 0.5)
-_MIDDLE = 0.25  # Smoother materials get rougher in an animation, rougher ones smoother.
-_ORBIT = np.radians(40)  # what the camera goes around in an animation
+_MIDDLE = 0.25  # in animations smoother materials become rougher, and rougher ones smoother
+_ORBIT = np.radians(40)  # angle by which the camera moves in an animation
 
 
 class Ready(NamedTuple):
-    """A scene made ready for the dynamic system.
+    """A scene precomputed for the dynamic system.
 
     Attributes:
-        direct: Direct light.
-        reflected: Reflected light; None without bounces.
-        family: The set that adjustable regions share.
-        cost: What it took.
+        direct: System for direct light.
+        reflected: System for interreflected light; None without bounces.
+        family: The family of BRDFs that adjustable regions share.
+        cost: Time and memory of the precomputation.
     """
 
     direct: DynamicSystem
@@ -45,15 +46,15 @@ class Ready(NamedTuple):
 
     @property
     def system(self) -> protocol.System:
-        """All light."""
+        """System for direct and interreflected light together."""
         return self.direct if self.reflected is None else protocol.total(self.direct, self.reflected)
 
 
 def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> Ready:
-    """Makes a scene ready: parts of Cook-Torrance's model can change, all others have their BRDF for good.
+    """Precomputes a scene. Parts with the Cook-Torrance model can change; the BRDFs of other parts are fixed.
 
     Raises:
-        ValueError: No part has Cook-Torrance's model, or one has textures.
+        ValueError: No part has the Cook-Torrance model, or one has textures.
     """
     materials = []
     for part in view.scene.parts:
@@ -65,7 +66,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
         raise ValueError("the dynamic system needs a part that can change: give --brdf or --material cook-torrance")
     start = timeit.default_timer()
     rough = sorted({*ROUGHNESS, *(float(each.roughness) for each in changing)})
-    # The model is linear in F0, and columns interpolate along F0 alone, so that two values of it are enough.
+    # The model is linear in F0, and so is interpolation between columns, so two values of F0 are enough.
     family = navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), rough))))
     members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=LOBES))
     fixed = {
@@ -93,7 +94,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
 
 
 def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material | None]:
-    """Materials of a scene; as the turn goes from 0 to 1 they go through roughnesses and colors, and back."""
+    """Materials of a scene. As `turn` goes from 0 to 1, they cycle through roughnesses and colors."""
     result: list[Material | None] = []
     for number, part in enumerate(view.scene.parts):
         model = part.material
@@ -111,12 +112,12 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
 
 
 def made(ready: Ready, view: View) -> Made:
-    """The scene as the report takes it."""
+    """The scene in the form that the report needs."""
     return Made(ready.direct, ready.system, view.scene.mesh, materials(ready, view), {"scene": ready.cost})
 
 
 def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bool = True) -> list[Path]:
-    """Writes pictures in which the first light turns once about, the camera swings, and materials change.
+    """Writes pictures in which the first light rotates once, the camera swings, and materials change.
 
     Returns:
         The files, one for each frame.
@@ -137,6 +138,6 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
 
 
 def _swung(camera: Camera, angle: float) -> Camera:
-    """A camera moved around what it looks at, about the vertical."""
+    """A camera that is rotated around its target, about the vertical."""
     offset = jnp.matmul(about(angle), camera.eye - camera.target, precision="highest")
     return Camera(camera.target + offset, camera.target, camera.up, camera.field_of_view, camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""Writes scenes and lights for other programs: `jaxprt export`."""
+"""The command `jaxprt export`: writes scenes and lights for other programs."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ from jaxprt.view import export, export_baked
 _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
 
 
-@click.command(cls=options.Command, short_help="Pages, baked glTF, and light probes for other programs.")
+@click.command(cls=options.Command, short_help="Export web pages, baked glTF, and light probes.")
 @options.scene
 @options.light
 @option(
@@ -28,7 +28,7 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     multiple=True,
     required=True,
     metavar="FILE",
-    help="What to write, by its suffix: *.html, *.glb or *.json. May be given several times.",
+    help="File to write: *.html, *.glb or *.json. May be given several times.",
 )
 @options.systems(("lobe", "harmonic"), default="lobe", words="Of the page and the baked scene.  [default: lobe]")
 @option(
@@ -36,7 +36,7 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     group="System",
     type=options.Bounces(),
     default="0",
-    help='How often parts reflect light onto each other, or "all", in *.glb; pages have none.  [default: 0]',
+    help='Number of bounces between parts, or "all", in *.glb files. Pages have no bounces.  [default: 0]',
 )
 @options.few_sizes
 @option(
@@ -53,22 +53,22 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     group="Output",
     type=options.Several(click.Choice(TOOLS, case_sensitive=False)),
     default=",".join(TOOLS),
-    help="Tools that *.json is for.  [default: all]",
+    help="Tools for which *.json has light probes.  [default: all]",
 )
 @option(
     "--store",
     group="Output",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder that keeps what was precomputed, for later runs.",
+    help="Folder that keeps precomputed data for later runs.",
 )
 @options.as_json
 def command(**given: Any) -> None:
     """Write a scene or its lights for other programs.
 
     \b
-    *.html  a page that relights the scene in any browser, without Python and without a network
-    *.glb   the scene as glTF with the radiance of the first light in the colors of its vertices
-    *.json  light probes: the first nine harmonics of each light, in the scaling and axes of other tools
+    *.html  a page that relights the scene in any browser, without Python and offline
+    *.glb   the scene as glTF, with the radiance under the first light as vertex colors
+    *.json  light probes: nine spherical harmonics of each light, in the scaling and axes of other tools
 
     \b
     Examples:
@@ -85,7 +85,7 @@ def command(**given: Any) -> None:
 
 
 def _check(chosen: SimpleNamespace) -> None:
-    """Refuses files that cannot be written before anything is computed."""
+    """Refuses files that cannot be written, before anything is computed."""
     for path in chosen.output:
         if path.suffix.lower() not in _KINDS:
             raise click.UsageError(f"--output must end in {', '.join(_KINDS)}, got {path}")
@@ -98,7 +98,7 @@ def _check(chosen: SimpleNamespace) -> None:
 
 
 def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
-    """Writes all files; what each is."""
+    """Writes all files. Returns a description of each."""
     lights, ready, rows = inputs.lights(chosen), None, []
     for path in chosen.output:
         kind = _KINDS[path.suffix.lower()]
@@ -122,7 +122,7 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
 
 
 def probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -> dict[str, Any]:
-    """Writes light probes; what the file is."""
+    """Writes light probes. Returns a description of the file."""
     found = {
         tool: {name: np.asarray(light_probe(light, tool=tool), float).tolist() for name, light in lights.items()}
         for tool in tools

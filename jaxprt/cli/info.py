@@ -1,4 +1,4 @@
-"""Says what files hold: `jaxprt info`."""
+"""The command `jaxprt info`: describes the content of files."""
 
 import json
 import math
@@ -19,13 +19,13 @@ from jaxprt.scene import TexturedMaterial, load_environment, load_scene
 from jaxprt.scene.mesh import bounds
 from jaxprt.sphere import cubemap
 
-_BRIGHTEST = (1, 10, 100)  # texels whose share of the light is told
+_BRIGHTEST = (1, 10, 100)  # numbers of brightest texels whose share of the light is reported
 _MERL = np.array([90, 90, 180], "<i4").tobytes()
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
-_NAMES = 6  # of the materials in a file that text lists
+_NAMES = 6  # most names of a file's materials that the text lists
 
 
-@click.command(cls=options.Command, short_help="What meshes, environments, BRDFs and stores hold.")
+@click.command(cls=options.Command, short_help="Describe meshes, scenes, environments, BRDFs and stores.")
 @click.argument("files", metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1, required=True)
 @option(
     "--light-size",
@@ -38,7 +38,7 @@ _NAMES = 6  # of the materials in a file that text lists
 )
 @options.as_json
 def command(**given: Any) -> None:
-    """Say what files hold: meshes and scenes, environments, BRDFs, and folders that jaxprt wrote.
+    """Describe the content of files: meshes and scenes, environments, BRDFs, and folders written by jaxprt.
 
     \b
     Examples:
@@ -52,10 +52,10 @@ def command(**given: Any) -> None:
 
 
 def about(path: Path, light_size: int) -> dict[str, Any]:
-    """What a file or folder holds, as JSON.
+    """Describes the content of a file or folder, as JSON.
 
     Raises:
-        ValueError: It is of no known kind, or damaged.
+        ValueError: The file is of an unknown kind or damaged.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -123,7 +123,7 @@ def _light(path: Path, size: int) -> dict[str, Any]:
 
 
 def _brdf(path: Path) -> dict[str, Any]:
-    """A file of BRDFs, told by its content."""
+    """Describes a file of BRDFs, whose format is recognized from its content."""
     with path.open("rb") as file:
         start = file.read(4096)
     if start.startswith(_MERL):
@@ -164,7 +164,7 @@ def _named(form: str, path: Path, names: list[str]) -> dict[str, Any]:
 
 
 def _folder(path: Path) -> dict[str, Any]:
-    """A saved object, a store of blocks, or a folder that has some of either."""
+    """Describes a saved object, a store of blocks, or a folder that contains such objects or stores."""
     nbytes = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
     if (path / "object.json").exists():
         header = _json(path / "object.json")
@@ -199,7 +199,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _text(found: dict[str, Any], indent: str = "") -> str:
-    """What was found, in words."""
+    """The description as text."""
     rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(found["kind"], _folder_rows)(
         found
     )
@@ -229,7 +229,7 @@ def _scene_rows(found: dict[str, Any]) -> list[str]:
 
 
 def _matters(name: str, value: Any) -> bool:
-    """Whether a number of a material is not the default one of glTF."""
+    """Whether a parameter of a material differs from its default in glTF."""
     default = {key: each for key, each in materials.describe(TexturedMaterial()).items() if key != "model"}
     return name not in default or not np.array_equal(value, default[name])
 

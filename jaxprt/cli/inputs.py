@@ -1,4 +1,4 @@
-"""What commands are given: files told apart, scenes, lights and cameras made of them."""
+"""Inputs of commands: classifies files, and makes scenes, lights and cameras from them."""
 
 import dataclasses
 import itertools
@@ -20,7 +20,7 @@ from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
 from jaxprt.scene.scene import numbered
 
-# Turns that bring an axis of the file to +y.
+# Rotations that bring an axis of the file to +y.
 UPRIGHT = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -33,7 +33,7 @@ _PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness
 
 
 def kind(path: Path) -> str:
-    """Whether a file is a "mesh" or a "light", by its suffix or else by its first bytes; "" for neither."""
+    """The kind of a file, "mesh" or "light", from its suffix or else from its first bytes; "" for neither."""
     suffix = path.suffix.lower()
     if suffix in LIGHTS:
         return "light"
@@ -46,10 +46,10 @@ def kind(path: Path) -> str:
 
 
 def told_apart(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Meshes and environments among files.
+    """Separates files into meshes and environments.
 
     Raises:
-        ValueError: A file is neither.
+        ValueError: A file is neither a mesh nor an environment.
     """
     found = [(kind(path), path) for path in files]
     for each, path in found:
@@ -60,14 +60,14 @@ def told_apart(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
-    """The scene of the files, upright, with the materials that are asked for; the embedded one without meshes.
+    """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
 
     Args:
-        options: With `files`, `up`, `ground`, `brdf` and `material`.
-        playable: Whether parts without a material of their own are plastic, and others have materials that can change.
+        options: Object with `files`, `up`, `ground`, `brdf` and `material`.
+        playable: Whether to make materials changeable for the viewer. Parts without a material become plastic.
 
     Raises:
-        ValueError: A file is none of a scene, a ground is asked for without a mesh, or there is no such part.
+        ValueError: A file is not a scene, a ground is requested without a mesh, or a part does not exist.
     """
     paths, _ = told_apart(options.files)
     if not paths and options.ground:
@@ -81,7 +81,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
 
 
 def embedded(brdf: Any = None, *, playable: bool = False) -> Scene:
-    """Chess pieces on a board."""
+    """The embedded scene: chess pieces on a board."""
     pieces, light, dark = meshes.split(builtin.chess())
     matte = _matte if playable else Lambert
     return Scene(
@@ -94,14 +94,14 @@ def embedded(brdf: Any = None, *, playable: bool = False) -> Scene:
 
 
 def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environment]:
-    """Lights by the names of their files, or the two embedded ones, turned.
+    """Rotated lights by the names of their files, or the two embedded lights.
 
     Args:
-        options: With `files`, `turn` and `light_size`.
-        size: Texels along the edge of their faces where none is asked for.
+        options: Object with `files`, `turn` and `light_size`.
+        size: Texels along a face's edge if `light_size` is None.
 
     Raises:
-        ValueError: The size is no power of two, or a file is no environment.
+        ValueError: The size is not a power of two, or a file is not an environment.
     """
     _, paths = told_apart(options.files)
     size = options.light_size or size
@@ -119,7 +119,7 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
 
 
 def unique(names: Sequence[str]) -> list[str]:
-    """Names with numbers where they are the same."""
+    """Makes names unique by appending numbers."""
     result: list[str] = []
     for name in names:
         every = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
@@ -128,23 +128,23 @@ def unique(names: Sequence[str]) -> list[str]:
 
 
 def turned(light: Environment, degrees: float) -> Environment:
-    """A light turned about the vertical, counterclockwise as seen from above."""
+    """A light rotated about the vertical, counterclockwise as seen from above."""
     if degrees % 360 == 0:
         return light
     return rotate(light, about(float(np.radians(degrees))))
 
 
 def about(angle: float) -> Any:
-    """The turn about the vertical by an angle in radians, from +z towards +x."""
+    """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
     c, s = np.cos(angle), np.sin(angle)
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
 
 def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
-    """The scene, its lights, and a camera around what is not ground."""
+    """The scene, its lights, and a camera that sees everything except the ground."""
     looked, lit = scene(options), lights(options, size=size)
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
-    # The board of the embedded scene, and the ground, may reach beyond the picture.
+    # The board of the embedded scene and the ground may extend beyond the picture.
     alone = not told_apart(options.files)[0]
     shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
     edge = {"width": options.size, "height": options.size}
@@ -152,7 +152,7 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
 
 
 def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
-    """The files' scenes as one, upright, on a ground if one is asked for."""
+    """The scenes of all files as one upright scene, with a ground if requested."""
     turn, every = np.array(UPRIGHT[options.up]), [load_scene(path) for path in paths]
     parts = [part for each in every for part in each.parts]
     names = numbered([part.name for part in parts])
@@ -160,7 +160,7 @@ def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> 
         parts = [eqx.tree_at(lambda each: each.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
     if playable:
         parts = [_playable(part) for part in parts]
-    if options.brdf is not None:  # colors of vertices are of the material that the file has
+    if options.brdf is not None:  # vertex colors belong to the file's material
         parts = [Part(part.name, part.mesh, options.brdf) for part in parts]
     parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
     if options.ground:
@@ -171,7 +171,7 @@ def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> 
 
 
 def _number(names: Sequence[str], name: str) -> int:
-    """The number of the part of a name, or of a number."""
+    """The index of a part that is given by its name or index."""
     if name in names:
         return names.index(name)
     if name.isdecimal() and int(name) < len(names):
@@ -181,7 +181,7 @@ def _number(names: Sequence[str], name: str) -> int:
 
 
 def _playable(part: Part) -> Part:
-    """A part without a material of its own is plastic, so that there is something to play with."""
+    """Makes a part without a material plastic, so that its material can be changed in the viewer."""
     return dataclasses.replace(part, material=_PLASTIC) if eqx.tree_equal(part.material, _matte(0.5)) else part
 
 

@@ -18,29 +18,29 @@ _INTERRUPTED = 130
 
 
 class Refused(click.ClickException):
-    """What was given is wrong: the message says what was required and what came."""
+    """Error for wrong input. The message states what was required and what was given."""
 
     exit_code = 2
 
 
 class Program(click.Group):
-    """The commands. Errors end them with words and a status, in place of a traceback."""
+    """Group of all commands. Errors end a command with a message and an exit status instead of a traceback."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The commands, in the order of their use."""
+        """The commands in the order in which they are usually used."""
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Runs a command.
 
         Raises:
-            click.ClickException: It failed, with status 2 for what it was given, 1 for all else.
-            click.exceptions.Exit: It was interrupted: 130.
+            click.ClickException: The command failed; exit status 2 for wrong input, 1 for other failures.
+            click.exceptions.Exit: The command was interrupted; exit status 130.
         """
         warnings.showwarning = lambda message, *_, **__: click.echo(f"Warning: {message}", err=True)
         try:
             return super().invoke(ctx)
-        except BrokenPipeError:  # of `| head`
+        except BrokenPipeError:  # for example from `| head`
             raise
         except KeyboardInterrupt:
             click.echo("jaxprt: stopped; the same command goes on from here", err=True)
@@ -48,7 +48,7 @@ class Program(click.Group):
         except (ValueError, TypeError, FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
             raise Refused(options.said(error)) from error
         except (OSError, RuntimeError, MemoryError) as error:
-            if isinstance(error, click.exceptions.Exit | click.Abort):  # which are RuntimeErrors
+            if isinstance(error, click.exceptions.Exit | click.Abort):  # subclasses of RuntimeError
                 raise
             raise click.ClickException(options.said(error)) from error
 
@@ -67,19 +67,19 @@ Materials, for --brdf and --material:
 )
 @click.version_option(jaxprt.__version__, "-V", "--version", prog_name="jaxprt")
 def program() -> None:
-    """Relight 3-D scenes by precomputed radiance transfer, with the error beside the time.
+    """Relight 3-D scenes by precomputed radiance transfer, and measure errors and times.
 
-    Each command takes FILEs: meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR), in any
-    order; the embedded scene and lights without. `jaxprt COMMAND --help` has examples.
+    Commands take FILEs in any order: meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR).
+    Without files they use an embedded scene and embedded lights. `jaxprt COMMAND --help` shows examples.
 
-    Exit status: 0, or 1 for failures, 2 for what was given wrongly, 130 after Ctrl-C.
+    Exit status: 0 for success, 1 for failures, 2 for wrong input, 130 after Ctrl-C.
     """
 
 
-@click.command(cls=options.Command, short_help="The script for completion in bash, zsh or fish.")
+@click.command(cls=options.Command, short_help="Print the script for completion in bash, zsh or fish.")
 @click.argument("shell", type=click.Choice(list(_SHELLS)))
 def completion(shell: str) -> None:
-    """Print the script by which a shell completes commands, options, materials and files.
+    """Print the script with which a shell completes commands, options, materials and files.
 
     \b
     Examples:
@@ -106,7 +106,7 @@ for _name, _command in {
 
 
 def run() -> None:
-    """Runs the command line, and ends the process."""
+    """Runs the command line and ends the process."""
     play.keep_programs()
     status = _INTERRUPTED
     try:
@@ -119,7 +119,7 @@ def run() -> None:
 
 
 def _end(status: Any) -> None:
-    """Ends the process without stopping threads that answer a viewer: in compiled code they cannot be stopped."""
+    """Ends the process without waiting for threads of a viewer, which cannot be stopped in compiled code."""
     if any(each.daemon and not isinstance(each, tqdm.TMonitor) for each in threading.enumerate()):
         for stream in (sys.stdout, sys.stderr):
             stream.flush()

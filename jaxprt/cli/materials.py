@@ -1,4 +1,4 @@
-"""Materials as the command line names them: a model with its numbers, or a file of measurements.
+"""Materials on the command line: a model with its parameters, or a file of measurements.
 
 ward:diffuse=.1/.05/.02,specular=.3,along=.1,across=.3        colors have / between them
 lafortune:diffuse=.1,cx=-1:-.8,cy=-1:-.8,cz=.9:.5,exponent=20:5    values of several lobes or axes have :
@@ -32,7 +32,7 @@ MODELS: dict[str, type] = {
     "ggx-interface": brdf.GGXInterface,
     "metallic-roughness": TexturedMaterial,
 }
-# What reads each kind of file, and which further words it takes: True for those that it needs.
+# Loader of each kind of file, and its further options: True for required ones.
 FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
     "merl": (brdf.load_merl, {}),
     "npf": (brdf.load_npf, {"material": True, "names": False}),
@@ -40,14 +40,14 @@ FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
     "ngan": (brdf.load_ngan, {"material": True}),
     "scattered": (brdf.load_scattered, {"smoothing": False}),
 }
-_ALIASES = {"alpha_x": "along", "alpha_y": "across"}  # of Ward's models, as renderers call them
+_ALIASES = {"alpha_x": "along", "alpha_y": "across"}  # names of renderers for parameters of Ward's models
 
 
 def parse(text: str) -> Callable | TexturedMaterial:
-    """The material that a text names.
+    """Parses the text form of a material.
 
     Raises:
-        ValueError: There is no such model, parameter or file, or a number is none or out of its range.
+        ValueError: A model, parameter or file does not exist, or a value is not a number or out of range.
         OSError: A file cannot be read.
     """
     name, _, rest = text.partition(":")
@@ -74,7 +74,7 @@ def parse(text: str) -> Callable | TexturedMaterial:
 
 
 def parameters(name: str) -> dict[str, float | None]:
-    """Numbers that a model takes, with their defaults; None for those that must be given."""
+    """Parameters of a model with their defaults; None for required ones."""
     result = {}
     for field in inspect.signature(MODELS[name]).parameters.values():
         if not field.name.endswith("_texture"):
@@ -83,10 +83,10 @@ def parameters(name: str) -> dict[str, float | None]:
 
 
 def of_part(text: str) -> tuple[str, str]:
-    """The part and the material of PART=MATERIAL.
+    """Splits PART=MATERIAL into the part and the material.
 
     Raises:
-        ValueError: It is not of this form.
+        ValueError: The text does not have this form.
     """
     part, equals, material = text.partition("=")
     if not (part and equals and material):
@@ -95,7 +95,7 @@ def of_part(text: str) -> tuple[str, str]:
 
 
 def describe(material: Any) -> dict[str, Any]:
-    """A material as JSON: its model, and what it has of numbers and textures."""
+    """A material as JSON: its model, parameters and textures."""
     result: dict[str, Any] = {"model": type(material).__name__}
     fields = dataclasses.fields(material) if dataclasses.is_dataclass(material) else ()
     for field in fields:
@@ -121,19 +121,19 @@ def _measured(name: str, words: list[str]) -> Callable:
             raise ValueError(f"{name} takes {form(name)}, got {word!r}")
         given[key] = _number(name, key, value) if key == "smoothing" else value
     if any(needed and key not in given for key, needed in takes.items()):
-        # A name that no file has: the loader's message lists some that it does.
+        # A name that no file has, so that the loader's error message lists existing ones.
         given["material"] = ""
     return load(Path(words[0]), **given)
 
 
 def form(name: str) -> str:
-    """How the material of a file is written."""
+    """The text form of a material from a file."""
     more = [f",{key}=.." if needed else f"[,{key}=..]" for key, needed in FILES[name][1].items()]
     return f"{name}:FILE{''.join(more)}"
 
 
 def _numbers(name: str, key: str, text: str) -> Any:
-    """A number, a color r/g/b, or several of either with : between them."""
+    """Parses a number, a color r/g/b, or several of them separated by colons."""
     rows = [[_number(name, key, each) for each in row.split("/")] for row in text.split(":")]
     if {len(row) for row in rows} not in ({1}, {3}):
         raise ValueError(f"{key} of {name} must be numbers, or colors as .1/.2/.3, got {text!r}")

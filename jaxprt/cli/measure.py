@@ -1,4 +1,4 @@
-"""Measures scenes, and fits of BRDFs: `jaxprt measure`."""
+"""The command `jaxprt measure`: measures scenes, and fits of BRDFs."""
 
 import sys
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ _RINGS, _SECTORS = 24, 36
 _VERTICES = 300
 
 
-@click.command(cls=options.Command, short_help="Errors, times and bytes of a scene or of a BRDF's fit.")
+@click.command(cls=options.Command, short_help="Measure errors, times and sizes of a scene or of a BRDF's fit.")
 @options.scene
 @options.light
 @options.systems(_SYSTEMS, default=None, words="One or several.  [default: lobe]")
@@ -31,7 +31,7 @@ _VERTICES = 300
     metavar="E",
     default=0.05,
     show_default=True,
-    help="Relative error that the planned system must meet.",
+    help="Largest relative error of the planned system.",
 )
 @options.bounces
 @options.recipe
@@ -40,15 +40,15 @@ _VERTICES = 300
     type=options.Material(),
     group="Fit",
     metavar="MATERIAL",
-    help="Measure how well lobe, harmonic and separable hold this BRDF by their sizes, on a sphere, without meshes.",
+    help="Measure how accurately each system represents this BRDF at several sizes, on a sphere instead of meshes.",
 )
-@options.folder("Folder that keeps what was precomputed, for later runs.")
+@options.folder("Folder that keeps precomputed data for later runs.")
 @options.as_json
 def command(**given: Any) -> None:
-    """Measure errors, times and bytes of a scene by each system, or of the fit of a BRDF.
+    """Measure errors, times and bytes of a scene for each system, or of the fit of a BRDF.
 
-    Errors are relative L2 errors of direct light against the exact sum: of pixels of pictures from three sides, and of
-    vertices from eight. Times and bytes are those of all light.
+    Errors are relative L2 errors of direct light against the exact sum, for pixels from three views and for vertices
+    from eight views. Times and bytes include bounces.
 
     \b
     Examples:
@@ -64,7 +64,7 @@ def command(**given: Any) -> None:
 
 
 def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
-    """The reports of a scene by each system."""
+    """The report of a scene for each system."""
     scene, lights = inputs.scene(chosen), inputs.lights(chosen)
     systems = chosen.system or ("lobe",)
     sizes.check(chosen, systems, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
@@ -80,7 +80,7 @@ def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
 
 
 def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNamespace, path: Any) -> RelitScene:
-    """The scene, made ready by a recipe, or by a plan for None."""
+    """The scene, precomputed by a recipe, or by a plan if the recipe is None."""
     more: dict[str, Any] = {"system": recipe, "size": next(iter(lights.values())).radiance.shape[-2]}
     if recipe is None:
         more = {"error": chosen.error, "environments": list(lights.values())}
@@ -113,7 +113,7 @@ def described(found: Report, lights: list[str]) -> dict[str, Any]:
 
 
 def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
-    """Errors, times and bytes of a BRDF on a sphere, by each system's sizes."""
+    """Errors, times and bytes of a BRDF on a sphere, for the sizes of each system."""
     if inputs.told_apart(chosen.files)[0]:
         raise click.UsageError("--fit takes environments alone, got a mesh: give it --brdf in place of --fit")
     systems = chosen.system or tuple(report.TABLES)

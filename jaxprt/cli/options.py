@@ -1,4 +1,4 @@
-"""Options that several commands share, in groups, and how their results are told."""
+"""Options that several commands share, in groups, and the output of results."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ _PATH: Any = click.Path(path_type=Path)
 
 
 class Command(click.Command):
-    """A command whose help has its options in groups."""
+    """A command whose help lists options in groups."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes a section for each group, in the order of the options."""
@@ -32,28 +32,28 @@ class Command(click.Command):
 
 
 class Option(click.Option):
-    """An option of a group."""
+    """An option that belongs to a group."""
 
     def __init__(self, *names: Any, group: str = "Options", **more: Any):
-        """Takes the group beside what click takes."""
+        """Takes the group in addition to click's arguments."""
         super().__init__(*names, **more)
         self.group = group
 
 
 class Finite(click.ParamType):
-    """A number in a range, which NaN and infinity are not."""
+    """A finite number in a range."""
 
     name = "number"
 
     def __init__(self, least: float | None = None, most: float | None = None, *, open: bool = False):
-        """Takes the ends of the range, which `open` leaves out."""
+        """Takes the ends of the range. With `open` the ends are excluded."""
         self._range = click.FloatRange(least, most, min_open=open, max_open=open)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number.
+        """Parses the number.
 
         Raises:
-            click.UsageError: It is none, or out of the range.
+            click.UsageError: The value is not a number or out of range.
         """
         number = self._range.convert(value, param, ctx)
         if not math.isfinite(number):
@@ -62,25 +62,25 @@ class Finite(click.ParamType):
 
 
 class Several(click.ParamType):
-    """Values with commas between them."""
+    """Values separated by commas."""
 
     def __init__(self, each: click.ParamType):
         """Takes the type of each value."""
         self.each, self.name = each, each.name
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
-        """What help and usage call the values."""
+        """The name of the values in help and usage."""
         choices = getattr(self.each, "choices", None)
         return f"[{'|'.join(choices)}],.." if choices else "N,.."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple:
-        """The values, each once."""
+        """Parses the values and removes duplicates."""
         if isinstance(value, tuple):
             return value
         return tuple(dict.fromkeys(self.each(each.strip(), param, ctx) for each in str(value).split(",")))
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """Completes the last of the values."""
+        """Completes the last value."""
         before, comma, last = incomplete.rpartition(",")
         return [
             CompletionItem(f"{before}{comma}{each.value}", each.type, each.help)
@@ -89,15 +89,15 @@ class Several(click.ParamType):
 
 
 class Bounces(click.ParamType):
-    """How many times light is reflected: a whole number, or "all"."""
+    """The number of bounces: an integer, or "all"."""
 
     name = "N|all"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        """The number, or the word.
+        """Parses the number or "all".
 
         Raises:
-            click.UsageError: It is neither.
+            click.UsageError: The value is neither.
         """
         if value != "all" and not str(value).isdecimal():
             self.fail(f'must be a whole number of at least 0, or "all", got {value!r}', param, ctx)
@@ -105,15 +105,15 @@ class Bounces(click.ParamType):
 
 
 class Material(click.ParamType):
-    """A material by its name and numbers, or by a file."""
+    """A material, given by a model and its parameters, or by a file."""
 
     name = "material"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The material.
+        """Parses the material.
 
         Raises:
-            click.UsageError: There is none of this kind.
+            click.UsageError: The text is not a material.
         """
         try:
             return materials.parse(value) if isinstance(value, str) else value
@@ -137,10 +137,10 @@ class OfPart(Material):
     name = "part=material"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The part and its material.
+        """Parses the part and its material.
 
         Raises:
-            click.UsageError: It is not of this form, or there is no such material.
+            click.UsageError: The text does not have this form, or its material is wrong.
         """
         if not isinstance(value, str):
             return value
@@ -152,19 +152,19 @@ class OfPart(Material):
 
 
 def said(error: Exception) -> str:
-    """What an error says, without numbers of the operating system."""
+    """The message of an error, without error numbers of the operating system."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(error)
 
 
 def option(*names: str, group: str, **more: Any) -> Callable:
-    """A decorator that adds an option of a group."""
+    """A decorator that adds an option to a command, in a group."""
     return click.option(*names, cls=Option, group=group, **more)
 
 
 def together(*decorators: Callable) -> Callable:
-    """Several decorators as one, the first on top."""
+    """Combines several decorators. The first is outermost."""
 
     def decorate(function: Callable) -> Callable:
         for each in reversed(decorators):
@@ -190,7 +190,7 @@ scene = together(
         group="Scene",
         type=Material(),
         metavar="MATERIAL",
-        help="For all meshes, in place of the files' materials, such as ward:along=.1,across=.3 or merl:FILE.",
+        help="Material of all meshes instead of the files' own, such as ward:along=.1,across=.3 or merl:FILE.",
     ),
     option(
         "--material",
@@ -198,7 +198,7 @@ scene = together(
         type=OfPart(),
         multiple=True,
         metavar="PART=MATERIAL",
-        help="For one part, by its name or by its number from 0.",
+        help="Material of one part, given by its name or its number from 0.",
     ),
 )
 light = together(
@@ -208,7 +208,7 @@ light = together(
         type=Several(Finite()),
         default="0",
         metavar="DEGREES,..",
-        help="Turn the lights about the vertical, counterclockwise as seen from above; each light at each angle.",
+        help="Rotate each light by each angle about the vertical, counterclockwise as seen from above.",
     ),
     option(
         "--light-size",
@@ -226,7 +226,7 @@ camera = together(
         default=20.0,
         metavar="DEGREES",
         show_default=True,
-        help="Degrees from +z towards +x.",
+        help="Azimuth of the camera, from +z towards +x.",
     ),
     option(
         "--elevation",
@@ -235,7 +235,7 @@ camera = together(
         default=15.0,
         metavar="DEGREES",
         show_default=True,
-        help="Degrees above the horizon, from -90 to 90.",
+        help="Elevation of the camera above the horizon, from -90 to 90.",
     ),
     option(
         "--size",
@@ -244,7 +244,7 @@ camera = together(
         metavar="N",
         default=512,
         show_default=True,
-        help="Edge of the pictures in pixels.",
+        help="Width and height of the pictures in pixels.",
     ),
 )
 few_sizes = together(
@@ -253,14 +253,14 @@ few_sizes = together(
         group="Sizes",
         type=Several(click.IntRange(1, 64)),
         metavar="N,..",
-        help="Lobes of each BRDF of lobe; several systems if several.  [default: 12]",
+        help="Lobes per BRDF (lobe). Several numbers make several systems.  [default: 12]",
     ),
     option(
         "--texels",
         group="Sizes",
         type=click.IntRange(0),
         metavar="N",
-        help="Brightest texels that lobe and clusters sum (16).",
+        help="Brightest texels that are summed one by one (lobe, clusters).  [default: 16]",
     ),
     option(
         "--order",
@@ -269,7 +269,7 @@ few_sizes = together(
         metavar="N",
         default=5,
         show_default=True,
-        help="Bands of harmonic; its coefficients are the square.",
+        help="Bands of spherical harmonics (harmonic); N^2 coefficients.",
     ),
     option(
         "--window",
@@ -277,7 +277,7 @@ few_sizes = together(
         type=click.Choice(list(sizes.LAPLACIAN)),
         default="laplacian",
         show_default=True,
-        help="Of harmonic, against ringing on glossy parts.",
+        help="Window against ringing on glossy parts (harmonic).",
     ),
 )
 _more_sizes = together(
@@ -286,51 +286,49 @@ _more_sizes = together(
         group="Sizes",
         type=click.IntRange(1),
         metavar="N",
-        help="BRDF terms of separable (default 4) and clusters (32).",
+        help="BRDF terms.  [default: 4 for separable, 32 for clusters]",
     ),
     option(
         "--keep",
         group="Sizes",
         type=click.IntRange(1),
         metavar="N",
-        help="Wavelet coefficients of each vertex and term of separable (96), or each cluster of clusters (768).",
+        help="Wavelet coefficients.  [default: 96 per vertex and term for separable, 768 per cluster for clusters]",
     ),
     option(
         "--components",
         group="Sizes",
         type=click.IntRange(1),
         metavar="N",
-        help="Principal components along the vertices of each cluster of clusters (16).",
+        help="Principal components along the vertices of each cluster (clusters).  [default: 16]",
     ),
     option(
         "--modes",
         group="Sizes",
         type=click.IntRange(1),
         metavar="N",
-        help="Principal components along the light of each cluster of clusters (80).",
+        help="Principal components along the light of each cluster (clusters).  [default: 80]",
     ),
 )
 recipe = together(few_sizes, _more_sizes)
-bounces = option(
-    "--bounces", group="System", type=Bounces(), help='How often parts reflect light onto each other, or "all".'
-)
+bounces = option("--bounces", group="System", type=Bounces(), help='Number of bounces between parts, or "all".')
 as_json = option("--json", "as_json", group="Output", is_flag=True, help="Print the result as JSON on stdout.")
 
 
 def systems(names: Sequence[str], *, default: str | None, words: str) -> Callable:
-    """The option that names systems."""
+    """The option --system."""
     return option("--system", group="System", type=Several(click.Choice(list(names))), default=default, help=words)
 
 
 def folder(words: str, *, default: str | None = None) -> Callable:
-    """The option that names a folder to make."""
+    """The option --output for a folder."""
     shown: Any = default is not None
     return option("--output", group="Output", type=_PATH, default=default, show_default=shown, help=words)
 
 
 @contextlib.contextmanager
 def telling(result: bool) -> Iterator[None]:
-    """Sends all that is said meanwhile to stderr where stdout is for the result as JSON."""
+    """Redirects other output to stderr if stdout is reserved for the result as JSON."""
     if not result:
         yield
         return
@@ -339,12 +337,12 @@ def telling(result: bool) -> Iterator[None]:
 
 
 def tell(result: Any, text: str, *, as_json: bool) -> None:
-    """Prints a result: as JSON, or as text."""
+    """Prints a result as JSON or as text."""
     click.echo(json.dumps(finite(result), indent=2, allow_nan=False) if as_json else text)
 
 
 def finite(value: Any) -> Any:
-    """A value as JSON has it: null for numbers that are not finite."""
+    """A value that JSON can represent. Numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(key): finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Plans scenes: `jaxprt plan`."""
+"""The command `jaxprt plan`: chooses systems and sizes for a scene."""
 
 import sys
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from jaxprt.files import objects
 from jaxprt.relit.planning import Plan, key_of, plan
 
 
-@click.command(cls=options.Command, short_help="The smallest system that meets an error.")
+@click.command(cls=options.Command, short_help="Find the smallest system that meets an error.")
 @options.scene
 @options.light
 @option(
@@ -22,7 +22,7 @@ from jaxprt.relit.planning import Plan, key_of, plan
     metavar="E",
     default=0.05,
     show_default=True,
-    help="Relative L2 error of the radiance of each part.",
+    help="Largest relative L2 error of the radiance of each part.",
 )
 @option(
     "--rate",
@@ -31,15 +31,15 @@ from jaxprt.relit.planning import Plan, key_of, plan
     metavar="FPS",
     default=30.0,
     show_default=True,
-    help="Frames per second with new light and new view, without drawing.",
+    help="Least frames per second with a new light and a new view in each frame, without rasterization.",
 )
-@options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and what was measured.")
+@options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and the measurements.")
 @options.as_json
 def command(**given: Any) -> None:
-    """Choose for each part of a scene the system and the sizes that meet an error with the fewest bytes.
+    """Choose the system and sizes that meet an error with the fewest bytes, for each part of a scene.
 
-    The table has a row for each candidate that was measured on a sample of the vertices: error, time of a frame, bytes,
-    time of precomputation. A star marks the choice.
+    The table has a row for each candidate: its error, time per frame, bytes, and precomputation time, measured on a
+    sample of the vertices. A star marks the choice.
 
     \b
     Examples:

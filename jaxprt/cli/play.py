@@ -1,4 +1,4 @@
-"""Shows scenes to play with in the browser: `jaxprt view`."""
+"""The command `jaxprt view`: shows scenes in the interactive viewer in a browser."""
 
 import errno
 import os
@@ -21,30 +21,30 @@ from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, Scene
 from jaxprt.view import serve
 
-ROUGHNESS = (0.25, 0.8)  # that materials can have; smoother ones take more time for each look
+ROUGHNESS = (0.25, 0.8)  # range of materials' roughness; smoother materials take more time per look
 LOBES = 6
 _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads still compute
 
 
-@click.command(cls=options.Command, short_help="Play with a scene in the browser.")
+@click.command(cls=options.Command, short_help="Show a scene in the interactive viewer in a browser.")
 @options.scene
 @options.light
-@options.systems(("lobe", "harmonic"), default="lobe", words="One, or both, which a key changes.  [default: lobe]")
+@options.systems(("lobe", "harmonic"), default="lobe", words="One, or both to switch by a key.  [default: lobe]")
 @option(
     "--bounces",
     group="System",
     type=options.Bounces(),
     default="0",
-    help='How often parts reflect light onto each other, or "all".  [default: 0]',
+    help='Number of bounces between parts, or "all".  [default: 0]',
 )
 @options.few_sizes
-@options.folder("Folder that keeps what was precomputed, for later runs.")
+@options.folder("Folder that keeps precomputed data for later runs.")
 @option(
     "--port",
     group="Viewer",
     type=click.IntRange(0, 65535),
     default=0,
-    help="Of this machine.  [default: a free one]",
+    help="Port of this machine.  [default: a free one]",
 )
 @option(
     "--no-browser",
@@ -53,13 +53,13 @@ _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads s
     is_flag=True,
     flag_value=False,
     default=True,
-    help="Only print the address.",
+    help="Print the address without opening a browser.",
 )
 def command(**given: Any) -> None:
-    """Play with a scene in the browser.
+    """Show a scene in the interactive viewer in a browser.
 
-    FILEs are meshes and scenes, and environments, in any order; the embedded scene and lights without. Parts without
-    a material of their own are of red plastic. Ctrl-C ends the viewer.
+    FILEs are meshes, scenes and environments in any order. Without files there is an embedded scene with embedded
+    lights. Parts without a material become red plastic. Ctrl-C ends the viewer.
 
     \b
     Examples:
@@ -82,19 +82,19 @@ def command(**given: Any) -> None:
 
 
 def chosen(arguments: Sequence[str]) -> SimpleNamespace:
-    """The options that arguments stand for."""
+    """Parses arguments into options."""
     return SimpleNamespace(**command.make_context("view", list(arguments)).params)
 
 
 def check_port(port: int) -> None:
-    """Refuses a port that is taken before anything is computed.
+    """Refuses a port that cannot be used, before anything is computed.
 
     Raises:
-        ValueError: It is taken, or may not be.
+        ValueError: The port is in use or not permitted.
     """
     if port:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as attempt:
-            attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers take it
+            attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # the same option that servers set
             try:
                 attempt.bind(("127.0.0.1", port))
             except OSError as error:
@@ -115,7 +115,7 @@ def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: in
 
 
 def keep_programs() -> None:
-    """Lets JAX keep compiled programs for the user's later runs, unless the environment says where or whether."""
+    """Enables JAX's cache of compiled programs for later runs, unless environment variables configure it."""
     if any(name.startswith(("JAX_COMPILATION_CACHE", "JAX_ENABLE_COMPILATION_CACHE")) for name in os.environ):
         return
     kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxprt" / "programs"
@@ -126,14 +126,14 @@ def keep_programs() -> None:
 
 
 def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
-    """The scene of the options, made ready by each system, and its lights."""
+    """The scene of the options, precomputed by each system, and its lights."""
     scene, lights = inputs.scene(given, playable=True), inputs.lights(given)
     made = {}
     for system in given.system:
         recipes = sizes.recipes(system, given, lobes=LOBES)
         for recipe in recipes.values():
             shown = f"{recipe.lobes} lobes" if system == "lobe" else "harmonics"  # pyright: ignore
-            path = None if given.output is None else given.output / system  # what lobes of any number share
+            path = None if given.output is None else given.output / system  # shared by systems with any number of lobes
             made[shown] = prepared(scene, lights, recipe, given.bounces, path)
     return made, lights
 
@@ -141,7 +141,7 @@ def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Envi
 def prepared(
     scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None
 ) -> RelitScene:
-    """The scene, made ready by one recipe, for materials of many roughnesses."""
+    """The scene, precomputed by one recipe, for materials of any roughness in a range."""
     return precompute(
         scene,
         system=recipe,

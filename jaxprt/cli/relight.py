@@ -1,4 +1,4 @@
-"""Relights scenes and measures the pictures: `jaxprt relight`."""
+"""The command `jaxprt relight`: relights scenes and measures the pictures."""
 
 import json
 import os
@@ -24,24 +24,24 @@ SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
 _ERROR = 0.05
 
 
-@click.command(cls=options.Command, short_help="Pictures of a scene in lights, with their errors.")
+@click.command(cls=options.Command, short_help="Render a scene under lights, and measure errors.")
 @options.scene
 @options.light
 @options.camera
-@options.systems(SYSTEMS, default=None, words="One or several, which stand side by side. [default: planned]")
+@options.systems(SYSTEMS, default=None, words="One or several systems to compare.  [default: planned]")
 @option(
     "--error",
     group="System",
     type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
-    help="Relative error that the planned system must meet.  [default: 0.05]",
+    help="Largest relative error of the planned system.  [default: 0.05]",
 )
 @option(
     "--plan",
     "saved",
     group="System",
     type=click.Path(exists=True, path_type=Path, file_okay=False),
-    help="Folder of `jaxprt plan`: relight by its plan.",
+    help="Use the plan in this folder, written by `jaxprt plan`.",
 )
 @options.bounces
 @options.recipe
@@ -50,26 +50,26 @@ _ERROR = 0.05
     group="Output",
     type=click.IntRange(2),
     metavar="N",
-    help="Write N pictures while light, view and materials change (dynamic).",
+    help="Write N pictures with changing light, view and materials (dynamic).",
 )
 @option(
     "--table",
     group="Output",
     type=click.IntRange(1),
     metavar="N",
-    help="Add errors of each system by its sizes, on N vertices of the first part.",
+    help="Report errors of each system at several sizes, on N vertices of the first part.",
 )
 @option("--part", group="Output", metavar="K/N", help="Only precompute the K-th of N parts into a shared --output.")
-@options.folder("For pictures, report.json and what was precomputed.", default="output")
+@options.folder("Folder for pictures, report.json and precomputed data.", default="output")
 @options.as_json
 def command(**given: Any) -> None:
-    """Relight a scene in one or several lights, and measure the pictures.
+    """Relight a scene under one or several lights, and measure the pictures.
 
-    FILEs are meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR), in any order. Without
-    meshes there are chess pieces, without environments daylight and a studio.
+    FILEs are meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR), in any order. The default
+    scene is a set of chess pieces; the default lights are daylight and a studio.
 
-    The output folder gets a picture for each light and system, the exact picture, differences, and report.json.
-    What is precomputed is kept there: the same command goes on where it was stopped.
+    The output folder receives a picture for each light and system, the exact picture, differences, and report.json.
+    It also keeps precomputed data, so the same command continues after an interruption.
 
     \b
     Examples:
@@ -91,7 +91,7 @@ def command(**given: Any) -> None:
 
 
 def _run(chosen: SimpleNamespace) -> dict[str, Any]:
-    """Draws and measures everything; where only a part is computed, what other parts owe."""
+    """Draws and measures everything. If only a part is computed, reports what other parts must still do."""
     systems, part = _systems(chosen), _part(chosen.part)
     plan = saved(chosen.saved) if chosen.saved is not None else None
     view = inputs.view(chosen, size=64 if plan is None else plan.size)
@@ -123,13 +123,13 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
         tabled = [system for system in systems if system in report.TABLES]
         found["table"] = [row for system in tabled for row in report.table(system, view, vertex, right)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB
+    found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS reports bytes, Linux KiB
     (chosen.output / "report.json").write_text(json.dumps(options.finite(found), indent=2) + "\n")
     return found
 
 
 def _draw(found: dict[str, Any], view: View, made: dict[str, Made], output: Path) -> None:
-    """Writes all pictures, and adds their errors to the report."""
+    """Writes all pictures and adds their errors to the report."""
     drawn = report.draw(view, made)
     truth = report.exact(view, drawn)
     found["exact"] = {
@@ -147,7 +147,7 @@ def _draw(found: dict[str, Any], view: View, made: dict[str, Made], output: Path
 
 
 def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
-    """The systems that are asked for, if the other options fit them."""
+    """The requested systems. Refuses other options that do not fit them."""
     embedded = not inputs.told_apart(chosen.files)[0]
     plain = ("separable", "harmonic", "lobe") if embedded and chosen.error is chosen.saved is None else ("planned",)
     systems = chosen.system or plain
@@ -166,7 +166,7 @@ def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
 
 
 def _part(text: str | None) -> blocks.Part | None:
-    """The part K/N of all blocks that is asked for; None for all of them."""
+    """Parses the part K/N of all blocks to compute; None for all blocks."""
     number, _, count = ("1/1" if text is None else text).partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise click.UsageError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
@@ -174,10 +174,10 @@ def _part(text: str | None) -> blocks.Part | None:
 
 
 def saved(folder: Path) -> Plan:
-    """The plan in a folder that `jaxprt plan` or a planned run wrote.
+    """Loads the plan in a folder that `jaxprt plan` or a planned run has written.
 
     Raises:
-        ValueError: There is none.
+        ValueError: The folder has no plan.
     """
     inside = folder / "plan"
     path = inside if inside.is_dir() else folder
@@ -191,10 +191,10 @@ def saved(folder: Path) -> Plan:
 
 
 def make_folder(path: Path) -> None:
-    """Makes the folder of the output, or says what is wrong with it before anything is computed.
+    """Creates the output folder, before anything is computed.
 
     Raises:
-        ValueError: The folder cannot be made or written to.
+        ValueError: The folder cannot be created or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -207,7 +207,7 @@ def make_folder(path: Path) -> None:
 def _share(
     view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Part
 ) -> list[str]:
-    """Computes one part of the blocks; what is left to do."""
+    """Computes one part of the blocks. Returns what remains to be done."""
     left = []
     for system in systems:
         try:
@@ -220,7 +220,7 @@ def _share(
 def _made(
     system: str, view: View, chosen: SimpleNamespace, plan: Plan | None, part: blocks.Part | None = None
 ) -> dict[str, Made]:
-    """The scene, made ready by one system, or by several sizes of it."""
+    """The scene, precomputed by one system, or by several sizes of it."""
     output, more = chosen.output, {"executor": part}
     if system == "planned" and plan is not None:
         bounces = plan.bounces if chosen.bounces is None else chosen.bounces
@@ -229,7 +229,7 @@ def _made(
         error = _ERROR if chosen.error is None else chosen.error
         return {system: report.plan(view, output / system, error=error, bounces=chosen.bounces, **more)}
     made = sizes.recipes(system, chosen)
-    # What lobes of any number share is in one folder.
+    # Data that does not depend on the number of lobes is shared in one folder.
     return {
         name: report.make(view, recipe, output / system, bounces=chosen.bounces, **more)
         for name, recipe in made.items()
@@ -237,7 +237,7 @@ def _made(
 
 
 def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
-    """What is relit, where and by what: the head of the report."""
+    """The head of the report: scene, lights, machine and versions."""
     paths, lights = inputs.told_apart(chosen.files)
     names = inputs.unique([path.stem for path in lights])
     return {
@@ -265,7 +265,7 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
 
 
 def _warn_of_backs(view: View) -> None:
-    """Tells on stderr where the normals of most triangles in the picture point away, as in an inside-out mesh."""
+    """Warns on stderr if the normals of most visible triangles point away, as in an inside-out mesh."""
     mesh, triangle = view.scene.parts[0].mesh, report.visible(view)
     corner = np.asarray(mesh.face)[triangle[triangle < len(mesh.face)]]
     normal, position = (np.asarray(field)[corner].mean(1) for field in (mesh.normal, mesh.position))
@@ -276,7 +276,7 @@ def _warn_of_backs(view: View) -> None:
 
 
 def _text(found: dict[str, Any], path: Path) -> str:
-    """The report in words."""
+    """The report as text."""
     exact, rows = found["exact"], []
     for name, light in found["lights"].items():
         least = light["exact_pixels_error"]

@@ -1,4 +1,4 @@
-"""Holds a scene that systems have made ready beside the exact sum: pictures, errors, times and sizes."""
+"""Compares precomputed scenes with the exact sum: pictures, errors, times and sizes."""
 
 import dataclasses
 import itertools
@@ -36,14 +36,14 @@ TABLE_DEGREES = (2, 4, 6, 9)
 TABLE_LAPLACIAN = (1.0, 0.4)
 TABLE_LOBES = (4, 12, 24)
 TABLE_TEXELS = (0, 16, 64)
-PIXELS = 1000  # by which pictures are measured
-VERTICES = 300  # of each part, by which radiance of vertices is
-_AMPLIFY = 4.0  # brightness of the difference picture beside the others
-_KEPT = 1 << 20  # pixels of the largest picture whose view is kept: a gigabyte
+PIXELS = 1000  # pixels at which pictures are measured
+VERTICES = 300  # vertices of each part at which radiance is measured
+_AMPLIFY = 4.0  # brightness of the difference picture relative to the others
+_KEPT = 1 << 20  # pixels of the largest picture whose view is cached, about a gigabyte
 
 
 class View(NamedTuple):
-    """What the command relights, in which lights, and from where.
+    """The scene that a command relights, the lights, and the camera.
 
     Attributes:
         scene: The scene.
@@ -57,15 +57,15 @@ class View(NamedTuple):
 
 
 class Made(NamedTuple):
-    """A scene that one system has made ready.
+    """A scene that one system has precomputed.
 
     Attributes:
-        direct: The system of all vertices under direct light alone, as exact pictures have it: a `RelitScene`, or one
+        direct: System of all vertices for direct light, to compare with exact pictures: a `RelitScene`, or a system
             that takes points of the regions of the mesh.
-        system: The same with bounces, or `direct` without any.
+        system: The same including bounces; equal to `direct` if there are none.
         mesh: The mesh of all parts.
-        materials: What they are relit with.
-        cost: What they took, for the report.
+        materials: Materials used for relighting.
+        cost: Costs of the precomputation, for the report.
     """
 
     direct: System
@@ -75,11 +75,11 @@ class Made(NamedTuple):
     cost: dict[str, Any]
 
     def color(self, light: Environment, eye: Array) -> Array:
-        """Radiance of direct light of all vertices."""
+        """Radiance of all vertices under direct light."""
         return protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
 
     def view(self, camera: Camera, *, reflected: bool = False) -> PictureView | RegionsView:
-        """All of a picture but its light: direct light, or with bounces."""
+        """The part of a picture that does not depend on the light, for direct light or with bounces."""
         system = self.system if reflected else self.direct
         if isinstance(system, relit.RelitScene):
             return system.picture_view(camera)
@@ -87,7 +87,7 @@ class Made(NamedTuple):
         return regions.of_regions(system, self.mesh, camera, materials=self.materials, keep=keep)
 
     def pictures(self, lights: list[Environment], camera: Camera, *, reflected: bool = False) -> list[Array]:
-        """Pictures of direct light, or with bounces, in several lights."""
+        """Pictures under several lights, for direct light or with bounces."""
         system = self.system if reflected else self.direct
         if isinstance(system, relit.RelitScene) and camera.width * camera.height > _KEPT:
             return [system.picture(each, camera) for each in lights]
@@ -96,14 +96,14 @@ class Made(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """Exact radiance of direct light, under each of the lights.
+    """Exact radiance under direct light, for each light.
 
     Attributes:
-        pixels: Some pixels of the picture, to measure by.
-        picture: A picture to look at.
-        vertex: For each part, the numbers of some vertices that the picture shows.
-        radiance: The radiance that they send to the eye.
-        seconds: The time that each of these took.
+        pixels: Exact values of some pixels, for measuring.
+        picture: An exact picture, for display.
+        vertex: For each part, the indices of some visible vertices.
+        radiance: Exact radiance of these vertices towards the eye.
+        seconds: Time to compute each of these.
     """
 
     pixels: ExactPixels
@@ -116,10 +116,11 @@ class Truth(NamedTuple):
 def plan(
     view: View, output: Path, *, error: float, bounces: int | str | None, executor: Executor | None = None
 ) -> Made:
-    """Makes a scene ready by a plan, which is kept with all else: the same command goes on with the same one.
+    """Precomputes a scene by a plan. The plan is stored too, so that the same command continues with the same plan.
 
     Raises:
-        ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
+        ValueError: `jaxprt.precompute` refuses its arguments, or the folder holds other data. The message then states
+            what to do.
     """
     lights = list(view.lights.values())
     made = _made(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
@@ -136,10 +137,11 @@ def make(
     bounces: int | str | None,
     executor: Executor | None = None,
 ) -> Made:
-    """Makes a scene ready by one recipe, or one for each part; what is finished is kept in a folder.
+    """Precomputes a scene by one recipe, or by one recipe for each part. Finished work is kept in a folder.
 
     Raises:
-        ValueError: As `jaxprt.precompute`; for a folder that holds something else, with what to do.
+        ValueError: `jaxprt.precompute` refuses its arguments, or the folder holds other data. The message then states
+            what to do.
     """
     size = next(iter(view.lights.values())).radiance.shape[-2]
     made = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
@@ -161,12 +163,12 @@ def _made(view: View, output: Path, **options: Any) -> Made:
 
 
 def draw(view: View, made: dict[str, Made]) -> dict[str, list[Array]]:
-    """Pictures of direct light by each system, in all lights."""
+    """Pictures under direct light by each system, for all lights."""
     return {system: each.pictures(list(view.lights.values()), view.camera) for system, each in made.items()}
 
 
 def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
-    """Exact pixels, pictures and vertices of a view; pixels mostly where the pictures that are drawn may be wrong."""
+    """Exact pixels, pictures and vertices of a view. Pixels are sampled mostly where drawn pictures may be wrong."""
     shadings, lights = [of_part(part) for part in view.scene.parts], list(view.lights.values())
     seconds, start = {}, timeit.default_timer()
     options = {"pixels": PIXELS, "importance": _importance(itertools.chain(*drawn.values())), "progress": True}
@@ -182,7 +184,7 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
 
 
 def _importance(drawn: Iterable[Array]) -> np.ndarray:
-    """How likely pixels are wrong: pictures are where they are bright, and more so where they are uneven."""
+    """Sampling density of pixels: larger where pictures are bright, and larger still where they vary."""
     total: Any = 0
     for picture in drawn:
         gray = np.asarray(picture, np.float64).mean(-1)
@@ -192,7 +194,7 @@ def _importance(drawn: Iterable[Array]) -> np.ndarray:
 
 
 def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
-    """Radiance by the exact sum of some vertices of the first parts, [light v c]."""
+    """Exact radiance of some vertices of the first parts, [light v c]."""
     lights = Environment(jnp.stack([each.radiance for each in view.lights.values()]))
     options = {"eye": view.camera.eye, "occluder": view.scene.mesh, "progress": True}
     result = []
@@ -205,13 +207,13 @@ def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def visible(view: View) -> np.ndarray:
-    """Numbers of the triangles in the picture."""
+    """Indices of the triangles in the picture."""
     triangle = np.unique(np.asarray(image.rasterize(view.scene.mesh, view.camera, samples=4).triangle))
     return triangle[triangle >= 0]
 
 
 def seen(view: View) -> list[np.ndarray]:
-    """Per part, the vertices of the triangles in the picture."""
+    """For each part, the vertices of the triangles in the picture."""
     vertex = np.unique(np.asarray(view.scene.mesh.face)[visible(view)])
     first = np.cumsum([0, *_counts(view.scene)])
     return [vertex[(vertex >= a) & (vertex < b)] - a for a, b in itertools.pairwise(first)]
@@ -224,14 +226,14 @@ def _counts(scene: Scene) -> list[int]:
 def compare(
     view: View, made: dict[str, Made], drawn: dict[str, list[Array]], truth: Truth, output: Path
 ) -> dict[str, dict[str, Any]]:
-    """Writes the pictures, and returns each system's errors under each light.
+    """Writes the pictures and returns each system's errors under each light.
 
     Args:
         view: The scene, its lights and the camera.
         made: The systems.
-        drawn: Their pictures.
+        drawn: The pictures by each system.
         truth: Exact radiance of the view.
-        output: Folder of the pictures.
+        output: Folder for the pictures.
     """
     lights, mesh, camera = list(view.lights.values()), view.scene.mesh, truth.picture.camera
     surface = image.render(mesh, jnp.ones((len(mesh.position), 1)), camera, background=None)
@@ -256,7 +258,7 @@ def compare(
 
 
 def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> dict[str, Any]:
-    """Relative L2 errors of a picture and of vertices, and how many vertices are negative somewhere."""
+    """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
     number, color = list(view.lights).index(name), made.color(view.lights[name], view.camera.eye)
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
     rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
@@ -272,7 +274,7 @@ def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> 
 
 
 def reflect(view: View, system: str, made: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
-    """Writes the pictures with reflected light too; returns what fraction of each one's light that is."""
+    """Writes pictures that include interreflection. Returns its fraction of each picture's light."""
     lights, camera, mesh = list(view.lights.values()), view.camera, view.scene.mesh
     direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
     pixels = image.shading_points(image.rasterize(mesh, camera, samples=4), mesh, camera)
@@ -285,7 +287,7 @@ def reflect(view: View, system: str, made: Made, stops: dict[str, float], output
 
 
 def _enlarged(picture: Array, camera: Camera) -> Array:
-    """A picture with as many pixels as a camera has: the nearest of its own."""
+    """A picture scaled to a camera's number of pixels by nearest neighbors."""
     row, column = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), picture.shape, strict=False))
     return picture[row][:, column]
 
@@ -297,7 +299,7 @@ def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -
 
 
 def times(view: View, made: Made) -> dict[str, float]:
-    """Median seconds of a picture: in a new light from a kept view, and from a new view with all that is to do."""
+    """Median seconds per picture: with a new light from a cached view, and with a new view from the start."""
     light, camera = next(iter(view.lights.values())), view.camera
     edge = math.isqrt(_KEPT)
     camera = dataclasses.replace(camera, width=min(camera.width, edge), height=min(camera.height, edge))
@@ -325,7 +327,7 @@ def sample(view: View, count: int) -> np.ndarray:
 
 
 def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[dict[str, Any]]:
-    """Errors of one system by its sizes, on some vertices of the first part."""
+    """Errors of one system at several sizes, on some vertices of the first part."""
     shading = of_part(view.scene.parts[0])
     size = next(iter(view.lights.values())).radiance.shape[-2]
     target = Target(view.scene.mesh, size=size, vertex=vertex, progress=False)
@@ -337,7 +339,7 @@ def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[
 
 
 def row_text(row: dict[str, Any]) -> str:
-    """A row of a table in words."""
+    """A row of a table as text."""
     return "  ".join(
         f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
     )
@@ -358,7 +360,7 @@ def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> 
 
 
 def _separable(shading: Shading, target: Target):
-    """Systems by terms and kept coefficients."""
+    """Systems with several numbers of terms and kept coefficients."""
     full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, target)
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
         if terms <= full.brdf.terms:
@@ -367,7 +369,7 @@ def _separable(shading: Shading, target: Target):
 
 
 def _harmonic(shading: Shading, target: Target):
-    """Systems by degree, with a window and without."""
+    """Systems of several degrees, with and without a window."""
     degree = max(TABLE_DEGREES)
     options = {"degree": degree, **target.traced(), "progress": False}
     full = harmonic.precompute(shading.mesh, **options)
@@ -380,7 +382,7 @@ def _harmonic(shading: Shading, target: Target):
 
 
 def _lobe(shading: Shading, target: Target):
-    """Systems by lobes and single texels."""
+    """Systems with several numbers of lobes and single texels."""
     options = {"size": target.size, **target.traced(), "progress": False}
     seen = visibility.precompute(shading.mesh, **options)
     target = Target(target.occluder, size=target.size, vertex=target.vertex, known=Known(seen), progress=False)

@@ -1,4 +1,4 @@
-"""Systems by their names and sizes."""
+"""Recipes of systems from their names and the options for sizes."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -6,9 +6,9 @@ from types import SimpleNamespace
 from jaxprt.relit import Clusters, Harmonics, Lobes, Terms
 from jaxprt.relit.recipes import Recipe
 
-LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # share of the squared Laplacian that each window leaves
+LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # fraction of the squared Laplacian that each window preserves
 NAMES = ("lobe", "harmonic", "separable", "clusters")
-_COUNT = 12  # lobes
+_COUNT = 12  # default number of lobes
 _TAKEN = {
     "lobes": ("lobe",),
     "texels": ("lobe", "clusters"),
@@ -20,10 +20,10 @@ _TAKEN = {
 
 
 def check(options: SimpleNamespace, systems: Sequence[str], texels: int) -> None:
-    """Refuses sizes that no system takes, or that the light does not have.
+    """Refuses size options that none of the systems uses, or that exceed the size of the light.
 
     Raises:
-        ValueError: A size is of another system, or there are more wavelet coefficients than texels.
+        ValueError: A size belongs to another system, or there are more wavelet coefficients than texels.
     """
     for name, takers in _TAKEN.items():
         if getattr(options, name) is not None and not set(takers) & set(systems):
@@ -33,7 +33,7 @@ def check(options: SimpleNamespace, systems: Sequence[str], texels: int) -> None
 
 
 def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> dict[str, Recipe]:
-    """The recipes that a system's name and the options stand for, by names for folders and files."""
+    """The recipes for a system and the options, by names that are used for folders and files."""
     if system == "lobe":
         counts = options.lobes or (lobes,)
         more = {} if options.texels is None else {"texels": options.texels}
