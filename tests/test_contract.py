@@ -210,6 +210,7 @@ HOST = {
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",
     "scene.environment.environment_from_image": "checks values",
+    "scene.environment.layout_of": "reads the shape of an image file",
     "scene.environment.resample": "NumPy in float64, where data enters",
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",

@@ -16,6 +16,7 @@ from jaxprt.cli import inputs, materials, options
 from jaxprt.cli.options import option
 from jaxprt.files import read_image
 from jaxprt.scene import TexturedMaterial, load_environment, load_scene
+from jaxprt.scene.environment import layout_of
 from jaxprt.scene.mesh import bounds
 from jaxprt.sphere import cubemap
 
@@ -47,8 +48,15 @@ def command(**given: Any) -> None:
       jaxprt info kept out/ --json
     """  # noqa: D301
     chosen = SimpleNamespace(**given)
-    found = [about(path, chosen.light_size) for path in chosen.files]
+    found, refused = [], []
+    for path in chosen.files:
+        try:
+            found.append(about(path, chosen.light_size))
+        except (ValueError, OSError) as error:
+            refused.append(options.said(error))
     options.tell(found, "\n".join(map(_text, found)), as_json=chosen.as_json)
+    if refused:
+        raise ValueError("\n".join(refused))
 
 
 def about(path: Path, light_size: int) -> dict[str, Any]:
@@ -113,7 +121,7 @@ def _light(path: Path, size: int) -> dict[str, Any]:
         "kind": "environment",
         "pixels": [image.shape[1], image.shape[0]],
         "channels": image.shape[2],
-        "layout": attributes.get("envmap", "by its shape"),
+        "layout": layout_of(image, attributes, str(path)),
         "radiance": {"least": float(colors.min()), "most": float(colors.max())},
         "negative_pixels": int((colors < 0).any(-1).sum()),
         "mean_radiance": (np.einsum("fijc,fij->c", light, solid) / (4 * math.pi)).tolist(),
@@ -145,10 +153,7 @@ def _brdf(path: Path) -> dict[str, Any]:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         names = [found[1] for found in (re.match(r"([\w-]+) *= *Aggregate", each) for each in lines) if found]
         found = _named("ngan", path, names)
-        try:
-            return {**found, "model": type(brdf.load_ngan(path, names[0])).__name__}
-        except ValueError as error:
-            return {**found, "use": None, "model": str(error)}
+        return {**found, "model": type(brdf.load_ngan(path, names[0])).__name__}
     if path.suffix.lower() == ".brdf":
         samples = len(brdf.scattered.read_scattered(path)[0])
         return {"kind": "brdf", "form": "scattered", "samples": samples, "use": f"scattered:{path}"}

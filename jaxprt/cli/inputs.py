@@ -72,7 +72,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     paths, _ = told_apart(options.files)
     if not paths and options.ground:
         raise ValueError("--ground needs a mesh: the embedded scene has a board")
-    made = _loaded(paths, options, playable) if paths else embedded(options.brdf, playable=playable)
+    made = _loaded(paths, options, playable) if paths else embedded(brdf=options.brdf, playable=playable)
     parts = list(made.parts)
     for name, material in options.material:
         number = _number([part.name for part in parts], name)
@@ -80,7 +80,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     return Scene(parts, cameras=made.cameras)
 
 
-def embedded(brdf: Any = None, *, playable: bool = False) -> Scene:
+def embedded(*, brdf: Any = None, playable: bool = False) -> Scene:
     """The embedded scene: chess pieces on a board."""
     pieces, light, dark = meshes.split(builtin.chess())
     matte = _matte if playable else Lambert

@@ -187,7 +187,7 @@ def plan(
             best = min(considered, key=lambda each: each.error)
             raise ValueError(
                 f"error must be at least {best.error * MARGIN:.3g} for part {part.name!r}, which "
-                f"{best.recipe} reaches; got {error}"
+                f"{best.recipe} reaches; got {error}. Ask for a larger error, or name a system"
             )
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)

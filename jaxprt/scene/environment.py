@@ -3,6 +3,7 @@
 import functools
 import pathlib
 import warnings
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -80,8 +81,7 @@ def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | 
         ValueError: The file is damaged, not an image, of an unknown layout, or holds NaN or infinity.
     """
     image, attributes = images.read_image(path)
-    if layout is None and "envmap" in attributes:
-        layout = {"latlong": "openexr-latlong", "cube": "openexr-cube"}[attributes["envmap"]]
+    layout = layout or layout_of(image, attributes, str(path))
     return environment_from_image(image, size=size, layout=layout, name=str(path))
 
 
@@ -107,7 +107,7 @@ def environment_from_image(
         ValueError: The image has an unknown layout or number of channels, or holds NaN or infinity.
     """
     image = np.asarray(image)
-    layout = layout or _layout_of(image, name)
+    layout = layout or layout_of(image, {}, name)
     _check_layout(image, layout, name)
     return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
 
@@ -220,7 +220,14 @@ def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Arr
     return cubemap.lookup(light.radiance, direction)
 
 
-def _layout_of(image: np.ndarray, name: str) -> str:
+def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) -> str:
+    """The layout that an image file states in its EXR attribute ``envmap``, or else that its shape implies.
+
+    Raises:
+        ValueError: The image has the shape of no layout.
+    """
+    if "envmap" in attributes:
+        return {"latlong": "openexr-latlong", "cube": "openexr-cube"}[str(attributes["envmap"])]
     height, width = image.shape[:2]
     if width == 2 * height or height == width == 1:
         return "latlong"

@@ -98,7 +98,8 @@ def import_transfer(
     Args:
         path: Name of a .npz, .npy or .ply file; the top of this module lists its arrays.
         mesh: The mesh in the axes of jaxprt, with its vertices in the order of the file.
-        convention: SH convention of the file. If None, it is read from the file, which must then state it.
+        convention: SH convention of the file. None if the file states it; a convention that differs from the one that
+            the file states is refused.
         what: Contents of the file: "vectors", "vectors of corners" or "matrices". If None, it is read from the file;
             the default is "vectors".
 
@@ -115,12 +116,14 @@ def import_transfer(
     )
     if "coefficient" not in held:
         raise ValueError(f"{source} must hold an array `coefficient`, got {', '.join(sorted(held)) or 'none'}")
-    if convention is None:
-        if "convention" not in held:
-            raise ValueError(
-                f"{source} does not say its convention: give convention=jaxprt.sphere.conventions.Convention(..)"
-            )
-        convention = _said(source, str(held["convention"]))
+    stated = _said(source, str(held["convention"])) if "convention" in held else convention
+    if stated is None:
+        raise ValueError(
+            f"{source} does not say its convention: give convention=jaxprt.sphere.conventions.Convention(..)"
+        )
+    if convention not in (None, stated):
+        raise ValueError(f"the convention must be that of {source} or None, got {convention}: the file says {stated}")
+    convention = stated
     what = str(held.get("what", "vectors")) if what is None else what
     value = np.asarray(held["coefficient"], np.float32)
     require.finite(f"the coefficients of {source}", value)

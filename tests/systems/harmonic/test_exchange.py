@@ -117,6 +117,8 @@ def test_what_does_not_fit_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"coefficients of .* must be finite, got 1 of"):
         harmonic.import_transfer(path, MESH, convention=ours, what="vectors of corners")
     harmonic.export_transfer(tmp_path / "t.npz", vectors(), MESH)
+    with pytest.raises(ValueError, match=r"convention must be that of .*, got .*=True.*: the file says .*=False"):
+        harmonic.import_transfer(tmp_path / "t.npz", MESH, convention=Convention(condon_shortley=True))
     moved = dataclasses.replace(MESH, position=MESH.position.at[3, 0].add(1.0))
     with pytest.raises(ValueError, match=r"positions of .* in our axes, got 1 of \d+ that are not, first 3"):
         harmonic.import_transfer(tmp_path / "t.npz", moved)
