@@ -154,9 +154,9 @@ def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told_and_a_s
     before = stats(page)
     drag(page)
     until(lambda: stats(page)["shown"] == stats(page)["seq"] > before["seq"])
-    after = stats(page)
-    assert after["got"] == after["sent"] > before["got"]
-    assert after["errors"] == 0
+    # A slow machine counts as a far kernel, which is asked a second time for what the eye cannot see.
+    until(lambda: stats(page)["got"] == stats(page)["sent"] > before["got"])
+    assert stats(page)["errors"] == 0
     until(lambda: stats(page)["stills"] > before["stills"])
 
     page.get_by_role("menuitem", name="Kernel", exact=True).click()
