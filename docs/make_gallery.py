@@ -96,7 +96,7 @@ def systems() -> None:
         relit = prt.precompute(scene, system=recipe, bounces=bounces, progress=False)
         pictures[name] = relit.picture(environment, eye)
         if bounces == 0 and name.startswith("lobe"):
-            pictures["exact (reference)"] = exact_picture(relit.scene, relit.shading, [environment], eye)[0]
+            pictures["exact (reference)"] = exact_picture(relit.scene, relit.shading, [environment], eye).color[0]
     stops = prt.image.automatic_exposure(pictures["exact (reference)"])  # alike, to compare them
     shown = {
         name: np.round(255 * np.asarray(prt.image.display(prt.image.expose(each, stops=stops)))).astype(np.uint8)

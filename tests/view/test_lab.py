@@ -158,6 +158,7 @@ def test_a_drag_in_jupyterlab_is_answered_and_a_restarted_kernel_is_told_and_a_s
     until(lambda: stats(page)["got"] == stats(page)["sent"] > before["got"])
     assert stats(page)["errors"] == 0
     until(lambda: stats(page)["stills"] > before["stills"])
+    after = stats(page)
 
     page.get_by_role("menuitem", name="Kernel", exact=True).click()
     page.locator(".lm-Menu-itemLabel", has_text="Restart Kernel…").first.click()
