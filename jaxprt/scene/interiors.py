@@ -118,9 +118,8 @@ def ring(*, spacing: float = 1.0) -> Mesh:
         spacing: Spacing of the vertices, relative to the default.
 
     Returns:
-        A mesh of 10,969 vertices in two regions: 0 the closed ring, and 1 the top and side of the table. Another
-            spacing
-        changes the number of vertices.
+        A mesh of 10,969 vertices in two regions: 0 the closed ring, and 1 the top and side of the table. Other
+        spacings change the number of vertices.
 
     Raises:
         ValueError: The spacing is not from 0.25 to 4.

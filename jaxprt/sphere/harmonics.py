@@ -4,16 +4,9 @@ The basis is orthonormal, without the Condon-Shortley phase, with polar axis z. 
 degree is the largest l; there are (degree+1)^2 functions up to a degree. The first nine, for a unit direction (x, y,
 z), are:
 
-    index   l   m   function
-      0     0   0   sqrt(1 / 4 pi)
-      1     1  -1   sqrt(3 / 4 pi) y
-      2     1   0   sqrt(3 / 4 pi) z
-      3     1   1   sqrt(3 / 4 pi) x
-      4     2  -2   sqrt(15 / 4 pi) x y
-      5     2  -1   sqrt(15 / 4 pi) y z
-      6     2   0   sqrt(5 / 16 pi) (3 z^2 - 1)
-      7     2   1   sqrt(15 / 4 pi) x z
-      8     2   2   sqrt(15 / 16 pi) (x^2 - y^2)
+    l = 0   sqrt(1 / 4 pi)
+    l = 1   sqrt(3 / 4 pi) times y, z, x
+    l = 2   sqrt(15 / 4 pi) times x y, y z, (3 z^2 - 1) / sqrt(12), x z, (x^2 - y^2) / 2
 
 A zonal kernel k is a function of the angle to an axis. It is given by one factor per band l, by which convolution with
 the kernel multiplies the band: 2 pi times the integral of k(t) P_l(t) over the cosine t. Windows against ringing are
@@ -35,7 +28,6 @@ from jaxprt.compile import jit
 from jaxprt.sphere import cubemap
 
 _NEWTON_STEPS = 12  # ten steps converged for all of thousands of spectra, with shares from 0.9 to 1e-6
-
 _UNROLLED = 8  # above this degree the recurrence is a loop; compiling 50 unrolled steps took twenty seconds
 
 
