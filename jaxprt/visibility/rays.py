@@ -338,7 +338,8 @@ def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, ou
             continue
         back = facing[triangle[found]]
         corner = occluder.position[occluder.face[triangle[found]]]
-        own = (corner == position[found, None]).all(2).any(1)
+        # The two sides of a seam may differ by rounding.
+        own = (np.abs(corner - position[found, None]) <= nudge / 8).all(2).any(1)
         touching = ~own & (np.sum(back * out[found], 1) < 0)
         found, back, corner = found[touching], back[touching], corner[touching]
         height = np.sum((corner[:, 0] - start[found]) * back, 1, keepdims=True)

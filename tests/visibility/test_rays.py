@@ -351,3 +351,16 @@ def test_without_packets_visibility_is_the_same(monkeypatch):
     expected = trace(torus())
     monkeypatch.setattr("jaxprt.visibility.packets.available", lambda: False)
     np.testing.assert_array_equal(trace(torus()), expected)
+
+
+def test_vertices_on_a_seam_that_rounding_splits_see_out():
+    u, v = np.meshgrid(np.linspace(0, 1, 33), np.linspace(0.05, 0.95, 17))
+    turn, height = 2 * np.pi * u - np.pi, np.pi * (v - 0.5)
+    normal = np.stack([np.cos(height) * np.sin(turn), np.sin(height), np.cos(height) * np.cos(turn)], -1)
+    assert (normal[:, 0] != normal[:, -1]).any()  # sin(pi) and sin(-pi) are not 0
+    number = np.arange(33 * 17).reshape(17, 33)
+    a, b, c, d = (each.ravel() for each in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    for face in (np.stack([[*a, *a], [*b, *c], [*c, *d]], 1), np.stack([[*a, *a], [*c, *d], [*b, *c]], 1)):
+        mesh = make_mesh(normal.reshape(-1, 3), face, normal=normal.reshape(-1, 3))
+        start = start_points(mesh, Occluder(mesh))
+        assert (np.linalg.norm(start, axis=1) > 1).all()
