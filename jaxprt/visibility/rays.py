@@ -339,7 +339,7 @@ def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, ou
         back = facing[triangle[found]]
         corner = occluder.position[occluder.face[triangle[found]]]
         # The two sides of a seam may differ by rounding.
-        own = (np.abs(corner - position[found, None]) <= nudge / 8).all(2).any(1)
+        own = np.abs(corner - position[found, None]).max(2).min(1, initial=np.inf) <= nudge / 8
         touching = ~own & (np.sum(back * out[found], 1) < 0)
         found, back, corner = found[touching], back[touching], corner[touching]
         height = np.sum((corner[:, 0] - start[found]) * back, 1, keepdims=True)
