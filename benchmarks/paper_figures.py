@@ -42,7 +42,7 @@ def picture(
     Args:
         made: The scene.
         camera: From where.
-        light: Its own light if None.
+        light: Light of the picture; the light of the recipe if None.
         materials: Those of all regions; its own if None.
         system: A part of its system, such as direct light alone; the whole if None.
     """

@@ -21,7 +21,7 @@ class Published(NamedTuple):
     """A row of the paper's Table 1.
 
     Attributes:
-        name: Its name, with the figure.
+        name: Name of the scene and number of its figure.
         adjustable: Number of BRDFs that change.
         vertices: Number of vertices.
         megabytes: Storage.
@@ -49,14 +49,15 @@ class Recipe(NamedTuple):
     """How a scene is made.
 
     Attributes:
-        mesh: Makes its mesh.
+        mesh: Function (quick) -> mesh.
         space: "CT" or "BP": the set of BRDFs that its free regions move in.
-        free: Its free regions, each with diffuse color, specular weight and place in the set.
+        free: Diffuse color, specular weight and place in the set of each region whose BRDF changes, by number.
         fixed: Albedos of the other regions, by number.
-        light: Name of its light: a file of the data folder, or "daylight".
+        light: Name of the light: a file of the data folder, or "daylight".
         camera: Eye and target over the diagonal of the scene, from its middle, and the angle of view.
         published: The paper's row; None where there is none.
-        options: Of the bounces, where they are not the usual ones; and "direct", the edge of the faces of direct light.
+        options: Options of `bounces.precompute` that differ from the benchmark's defaults. "direct" is the edge of the
+            cubemap faces of direct light, in texels.
     """
 
     mesh: Callable[[bool], Mesh]
@@ -137,7 +138,9 @@ RECIPES = {
         {"direct": 64, "edge": 16, "modes": 96},
     ),
     "chess": Recipe(
-        lambda quick: interiors.corner(_scan("", 0, quick), cells=4) if quick else interiors.chess_sides(),
+        lambda quick: (
+            interiors.corner(builtin.sphere(rings=6, sectors=9), cells=4) if quick else interiors.chess_sides()
+        ),
         "CT",
         {0: ([0.35, 0.05, 0.04], 0.6, [0.1, 0.2]), 1: ([0.6, 0.55, 0.4], 0.6, [0.1, 0.2])},
         {2: [0.65, 0.55, 0.4], 3: [0.12, 0.08, 0.06]},

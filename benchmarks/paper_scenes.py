@@ -63,9 +63,9 @@ class Made(NamedTuple):
     """A scene that is ready to be relit.
 
     Attributes:
-        name: Its name.
+        name: Name of the scene.
         recipe: How it was made.
-        mesh: Its mesh.
+        mesh: Mesh of the scene.
         system: Direct light and bounces.
         navigation: From coordinates to weights of the set.
         seconds: What precomputation took, over all runs.
@@ -120,7 +120,7 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
         name: One of `RECIPES`.
         quick: A small scene of the same regions.
         store: Folder that keeps what is finished.
-        options: Of the bounces, in place of the recipe's.
+        options: Options of `bounces.precompute` that replace those of the recipe.
     """
     recipe = RECIPES[name]
     mesh = recipe.mesh(quick)

@@ -146,7 +146,7 @@ def exact_picture(
     environments: Sequence[Environment],
     camera: Camera,
     *,
-    most: int | None = None,
+    most: int = _MOST,
     progress: bool = False,
     between: Between = None,
 ) -> ExactPicture:
@@ -161,14 +161,19 @@ def exact_picture(
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
         camera: The camera.
-        most: Largest number of points of parts that are not ideally diffuse; 16,384 if None.
+        most: Largest number of points of parts that are not Lambertian, at least 1.
         progress: Whether to show progress bars.
         between: Function that is called between steps of the work, as in `exact_pixels`.
+
+    Raises:
+        ValueError: `most` is below 1.
     """
+    if most < 1:
+        raise ValueError(f"most must be at least 1 point, got {most}")
     shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
-    if count > (most := most or _MOST):
+    if count > most:
         step = math.ceil(math.sqrt(count / most))
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
         camera = dataclasses.replace(camera, **size)
