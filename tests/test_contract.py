@@ -170,7 +170,7 @@ HOST = {
     "systems.dynamic.relight.view_side": "the same",
     "systems.dynamic.relight.mix": "the same",
     "systems.devices": "puts arrays on devices",
-    "systems.protocol": "calls the verbs of systems; tests/systems/test_protocol.py holds these",
+    "systems.protocol": "calls the methods of systems; tests/systems/test_protocol.py holds these",
     "systems.dynamic.relight.combine": "takes indices; the same",
     "systems.bounces.relight.light_side": "takes half precision; bounces.radiance has them all",
     "systems.bounces.relight.arriving": "takes indices; the same",

@@ -272,7 +272,8 @@ def _warn_of_backs(view: View) -> None:
     away = np.sum(normal * (np.asarray(view.camera.eye) - position), 1) < 0
     if 2 * np.sum(away) > len(away):
         message = f"{np.sum(away)} of {len(away)} triangles in the picture face away and will be black"
-        click.echo(f"Warning: {message}: is the mesh inside out, with clockwise faces?", err=True)
+        remedy = "If the mesh is inside out, with clockwise faces, reverse the corners of each face."
+        click.echo(f"Warning: {message}. {remedy}", err=True)
 
 
 def _text(found: dict[str, Any], path: Path) -> str:

@@ -249,6 +249,8 @@ def test_the_exact_picture_has_rays_from_its_own_points():
     glossy = scene(floor=SHARP)
     shadings = [channels.of_part(part) for part in glossy.parts]
     camera = dataclasses.replace(CAMERA, width=32, height=20)
+    with pytest.raises(ValueError, match="most must be at least 1 point, got 0"):
+        exact_picture(glossy, shadings, [light()], camera, most=0)
     found = exact_picture(glossy, shadings, [light()], camera, most=150)  # of 640 pixels
     height, width = found.color.shape[1:3]
     assert (found.camera.width, found.camera.height) == (width, height)

@@ -1,4 +1,4 @@
-"""Scenes made ready: every recipe against the exact sum, the verbs of the whole, other materials, pictures, bad input.
+"""Scenes made ready: every recipe against the exact sum, methods of the whole, other materials, pictures, bad input.
 
 The scene is a floor of a textured material, a ball of a plain BRDF above it, and an ideally diffuse wall behind.
 """

@@ -1,4 +1,4 @@
-"""What every system promises through its four verbs, checked for all of them.
+"""What every system promises through its four methods, checked for all of them.
 
 To add a system, add a line to ``MADE``: it gets the scene's name and makes a system, with its materials, for that mesh.
 """
