@@ -115,7 +115,9 @@ def described(found: Report, lights: list[str]) -> dict[str, Any]:
 def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     """Errors, times and bytes of a BRDF on a sphere, for the sizes of each system."""
     if inputs.told_apart(chosen.files)[0]:
-        raise click.UsageError("--fit takes environments alone, got a mesh: give it --brdf in place of --fit")
+        raise click.UsageError(
+            "--fit measures on a sphere and takes environments only, got a mesh: use --brdf to measure on the mesh"
+        )
     systems = chosen.system or tuple(report.TABLES)
     unknown = [system for system in systems if system not in report.TABLES]
     if unknown:

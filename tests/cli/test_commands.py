@@ -80,10 +80,11 @@ def test_a_plan_is_printed_and_kept_and_relights(place, monkeypatch, capsys):
 
 
 def test_a_scene_is_measured_as_its_report_says(place, capsys):
-    given = [place / "mesh.obj", place / "sky.exr", "--light-size", "8", "--brdf", "lambert", "--lobes", "1"]
-    assert main("measure", *given, "--json") == 0
+    given = [place / "mesh.obj", place / "sky.exr", "--light-size", "8", "--brdf", "ggx:roughness=.6"]
+    assert main("measure", *given, "--lobes", "1,2", "--output", place / "kept", "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    found = told["systems"]["lobe"]
+    assert list(told["systems"]) == ["lobe_1", "lobe_2"]  # from rays that are traced once
+    found = told["systems"]["lobe_2"]
     assert told["lights"] == ["sky"]
     assert found["parts"][0]["vertices"] == 4
     assert 0 <= found["parts"][0]["vertex_error"]["sky"] < 0.3
@@ -99,7 +100,7 @@ def test_the_fit_of_a_brdf_is_measured_on_a_sphere(place, capsys):
     error = {(row["lobes"], row["texels"]): row["error sky"] for row in told["rows"]}
     assert error[4, 16] < error[1, 0] < 1
     assert main("measure", "--fit", "lambert", place / "mesh.obj") == 2
-    assert "--fit takes environments alone, got a mesh" in capsys.readouterr().err
+    assert "takes environments only, got a mesh: use --brdf" in capsys.readouterr().err
     assert main("measure", "--fit", "lambert", "--system", "clusters") == 2
     assert "--fit needs --system separable, harmonic, lobe, got clusters" in capsys.readouterr().err
 
