@@ -10,7 +10,7 @@ Duck of Khronos' samples on a ground, two sides of chess, and a room. Each is lo
 Mitsuba traces the same triangles and materials, as many bounces, twice with unlike seeds, so that noise falls out of
 each squared error. Pixels are points of 4 samples here and means over squares there. `error` is that of the whole
 picture, `indirect_error` that of light that was reflected at least once, relative to that light; both are relative L2
-over the pixels that the scene fills, and the medians over the triples. `indirect_fraction` is how much of the picture
+over the pixels that surfaces fill, and the medians over the triples. `indirect_fraction` is how much of the picture
 the indirect part is. `seconds` are of a new picture, rays included. Without LLVM of version 17 or newer, which Mitsuba
 needs, there are no errors. A store keeps Mitsuba's pictures too, so that a run that was stopped goes on.
 """
@@ -177,7 +177,8 @@ def judged(
         start = time.perf_counter()
         exact = kept(keep and keep / f"{number}.npz", Scene(parts), light, camera, sizes.samples)
         spent = (time.perf_counter() - start) / 4  # two of four pictures have the bounces
-        shown = np.asarray(raster.rasterize(whole.mesh, camera).triangle)[..., None] >= 0
+        # Pixels that surfaces fill: at silhouettes ours have the background, which Mitsuba leaves out.
+        shown = (np.asarray(raster.rasterize(whole.mesh, camera, samples=4).triangle) >= 0).all(-1, keepdims=True)
         rows.append(
             off(mine * shown, alone * shown, [(a * shown, b * shown) for a, b in exact]) | {"peer_seconds": spent}
         )

@@ -20,7 +20,7 @@ from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder, check
 
-ALGORITHM = 1  # version of the ray casting; raised by a release whose rays give other results
+ALGORITHM = 2  # version of the ray casting; raised by a release whose rays give other results
 ROUNDING = 3e-6  # relative to the norm: larger than the rounding error of single precision
 BLOCK = 64  # vertices in a block: a fraction of a second of work
 LEVELS = 16  # visibility is stored in sixteenths: 4 x 4 rays per texel

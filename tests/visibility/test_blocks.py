@@ -483,7 +483,7 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
     again = prt.separable.factor(prt.brdf.AshikhminShirley(nu=10.5), terms=2, resolution=8)
     with pytest.raises(ValueError, match=r"\(brdf: there and now differ by .* of the norm\).* jaxprt\.files\.save"):
         relit((mesh, again), path=path)
-    monkeypatch.setattr(separable.wavelets.sparse, "ALGORITHM", {"visibility": 1, "separable": 2})
+    monkeypatch.setattr(separable.wavelets.sparse, "ALGORITHM", {"visibility": 2, "separable": 2})
     with pytest.raises(
         ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
     ):
@@ -514,7 +514,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     for job, (kind, fields) in zip(before, kinds, strict=True):
         again = kind.make(mesh, None, None, 8, **rounded(fields))
         assert json.dumps(again.header) == json.dumps(job.header)
-        assert job.header["algorithm"]["visibility"] == 1
+        assert job.header["algorithm"]["visibility"] == 2
         assert len(job.header["algorithm"]) == 2
         assert kind.make(turned, None, None, 8, **fields).header["mesh"] != job.header["mesh"]
         for name, told in again.near.items():
