@@ -174,9 +174,7 @@ def judged(
         if not (sizes.quick or path_tracing.available()):
             continue
         parts = [dataclasses.replace(each, material=materials[each.name]) for each in whole.scene.parts]
-        start = time.perf_counter()
-        exact = kept(keep and keep / f"{number}.npz", Scene(parts), light, camera, sizes.samples)
-        spent = (time.perf_counter() - start) / 4  # two of four pictures have the bounces
+        exact, spent = kept(keep and keep / f"{number}.npz", Scene(parts), light, camera, sizes.samples)
         # Pixels that surfaces fill: at silhouettes ours have the background, which Mitsuba leaves out.
         shown = (np.asarray(raster.rasterize(whole.mesh, camera, samples=4).triangle) >= 0).all(-1, keepdims=True)
         rows.append(
@@ -190,16 +188,18 @@ def judged(
     return {**timing.line(), **found, "peer": "mitsuba", "peer_samples": sizes.samples}
 
 
-def kept(path: pathlib.Path | None, *asked: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What `reference` makes, from a file if there is one."""
-    if path is None or not path.is_file():
-        made = reference(*asked)
-        if path is None:
-            return made
+def kept(path: pathlib.Path | None, *asked: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
+    """The result of `reference` and the seconds of one of its pictures, from a file if there is one."""
+    if path is not None and path.is_file():
+        with np.load(path) as file:
+            return [(one, other) for one, other in file["pictures"]], float(file["seconds"])
+    start = time.perf_counter()
+    made = reference(*asked)
+    spent = (time.perf_counter() - start) / 4  # two of four pictures have the bounces
+    if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, pictures=np.asarray(made, np.float32))
-    with np.load(path) as file:
-        return [(one, other) for one, other in file["pictures"]]
+        np.savez(path, pictures=np.asarray(made, np.float32), seconds=spent)
+    return made, spent
 
 
 def reference(
