@@ -37,6 +37,7 @@ TABLE_LAPLACIAN = (1.0, 0.4)
 TABLE_LOBES = (4, 12, 24)
 TABLE_TEXELS = (0, 16, 64)
 PIXELS = 1000  # pixels at which pictures are measured
+POINTS = 1 << 14  # largest number of points of the exact picture: half a minute on two cores
 VERTICES = 300  # vertices of each part at which radiance is measured
 _AMPLIFY = 4.0  # brightness of the difference picture relative to the others
 _KEPT = 1 << 20  # pixels of the largest picture whose view is cached, about a gigabyte
@@ -174,7 +175,7 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
     options = {"pixels": PIXELS, "importance": _importance(itertools.chain(*drawn.values())), "progress": True}
     pixels = exact_pixels(view.scene, shadings, lights, view.camera, **options)
     seconds["pixels"], start = timeit.default_timer() - start, timeit.default_timer()
-    picture = exact_picture(view.scene, shadings, lights, view.camera, progress=True)
+    picture = exact_picture(view.scene, shadings, lights, view.camera, most=POINTS, progress=True)
     seconds["picture"], start = timeit.default_timer() - start, timeit.default_timer()
     random = np.random.default_rng(0)
     vertex = [random.permutation(each)[:VERTICES] for each in seen(view)]

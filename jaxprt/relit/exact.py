@@ -25,7 +25,6 @@ from jaxprt.systems import reference
 from jaxprt.visibility import blocks
 
 _SIDE = 4  # number of coverage places along the edge of a pixel
-_MOST = 1 << 14  # largest number of points of a whole picture: half a minute on two cores
 _COARSE = 64  # largest number of points for each vertex at which radiance is interpolated between vertices
 
 
@@ -146,7 +145,7 @@ def exact_picture(
     environments: Sequence[Environment],
     camera: Camera,
     *,
-    most: int = _MOST,
+    most: int = 1 << 14,
     progress: bool = False,
     between: Between = None,
 ) -> ExactPicture:

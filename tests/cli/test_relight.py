@@ -15,7 +15,6 @@ import jaxprt as prt
 from jaxprt.cli import animation
 from jaxprt.cli import report as cli_report
 from jaxprt.cli.main import program
-from jaxprt.relit import exact
 
 OBJ = """
 v 0 1 0
@@ -202,7 +201,7 @@ def glossy(place):
     with pytest.MonkeyPatch.context() as patch:
         for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("DEGREES", (1, 3)), ("LOBES", (1,))):
             patch.setattr(cli_report, f"TABLE_{name}", values)
-        patch.setattr(exact, "_MOST", 80)
+        patch.setattr(cli_report, "POINTS", 80)
         assert run(place, *options, sky=("sky.exr", "glossy/other/sky.exr"), output=folder) == 0
     return folder
 
