@@ -8,10 +8,11 @@ Duck of Khronos' samples on a ground, two sides of chess, and a room. Each is lo
 `roughness` have one roughness on all parts that are not grounds, half of them metals.
 
 Mitsuba traces the same triangles and materials, as many bounces, twice with unlike seeds, so that noise falls out of
-each squared error. Pixels are points of 4 samples here and means over squares there. `error` is that of the whole
-picture, `indirect_error` that of light that was reflected at least once, relative to that light; both are relative L2
-over the pixels that surfaces fill, and the medians over the triples. `indirect_fraction` is how much of the picture
-the indirect part is. `seconds` are of a new picture, rays included. Without LLVM of version 17 or newer, which Mitsuba
+each squared error. Pixels are means over squares there, and over 16 samples here; `_of_4_samples` are the errors of
+4. `error` is that of the whole picture, `indirect_error` that of light that was reflected at least once, relative to
+that light; both are relative L2 over the pixels that surfaces fill, and the medians over the triples.
+`indirect_fraction` is how much of the picture the indirect part is. `seconds` are of a new picture of 16 samples, rays
+included. Without LLVM of version 17 or newer, which Mitsuba
 needs, there are no errors. A store keeps Mitsuba's pictures too, so that a run that was stopped goes on.
 """
 
@@ -45,6 +46,7 @@ from jaxprt.scene.environment import rotate
 from jaxprt.scene.mesh import ground_plane, split
 
 EDGE, SAMPLES, TRIPLES, BOUNCES = 256, 144, 10, 2
+FINAL = 16  # samples of our pixels
 RANGE = (0.05, 0.8)
 ROUGHNESS = (0.05, 0.1, 0.2, 0.4, 0.8)
 SCENES = ("spheres", "duck", "chess", "room")
@@ -167,18 +169,28 @@ def judged(
     """Medians over some triples."""
     direct = RelitScene(whole.scene, whole.direct, whole.shading)
     first = triples[0]
-    timing = harness.measure(lambda: whole.picture(first.light, first.camera, materials=first.materials), repeats=3)
+    timing = harness.measure(
+        lambda: whole.picture(first.light, first.camera, materials=first.materials, samples=FINAL), repeats=3
+    )
     rows = []
     for number, (light, camera, materials) in enumerate(triples):
-        mine, alone = (np.asarray(each.picture(light, camera, materials=materials)) for each in (whole, direct))
+        rough, rough_alone, mine, alone = (
+            np.asarray(each.picture(light, camera, materials=materials, samples=samples))
+            for samples in (4, FINAL)
+            for each in (whole, direct)
+        )
         if not (sizes.quick or path_tracing.available()):
             continue
         parts = [dataclasses.replace(each, material=materials[each.name]) for each in whole.scene.parts]
         exact, spent = kept(keep and keep / f"{number}.npz", Scene(parts), light, camera, sizes.samples)
         # Pixels that surfaces fill: at silhouettes ours have the background, which Mitsuba leaves out.
         shown = (np.asarray(raster.rasterize(whole.mesh, camera, samples=4).triangle) >= 0).all(-1, keepdims=True)
+        filled = [(a * shown, b * shown) for a, b in exact]
+        coarser = off(rough * shown, rough_alone * shown, filled)
         rows.append(
-            off(mine * shown, alone * shown, [(a * shown, b * shown) for a, b in exact]) | {"peer_seconds": spent}
+            off(mine * shown, alone * shown, filled)
+            | {f"{key}_of_4_samples": coarser[key] for key in ("error", "direct_error", "indirect_error")}
+            | {"peer_seconds": spent}
         )
         print(number, {key: round(value, 4) for key, value in rows[-1].items()}, flush=True)
         if folder is not None:

@@ -1,6 +1,8 @@
 """Pictures of scenes. Radiance is computed at pixels where interpolation between vertices would be too inaccurate."""
 
+import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -22,6 +24,8 @@ from jaxprt.scene import Camera, Environment, Mesh
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.protocol import System
 
+# Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
+SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
 _ERROR = 0.01  # RMS error of interpolated radiance above which radiance is computed at the pixels
 
 
@@ -47,9 +51,10 @@ class PictureView(eqx.Module):
     Attributes:
         mesh: The mesh of all parts.
         system: The system of all parts.
-        camera: The camera.
+        camera: The camera of the drawn pixels.
         surface: One `Surface` for each part.
         canvas: The points that are shaded, and their pixels.
+        fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
         part: The points of each part that the picture shows.
         lamp: Radiance of each lamp; None without lamps.
         reflected: Traced reflections of the sharp parts, one entry for each row of points; None without.
@@ -63,6 +68,7 @@ class PictureView(eqx.Module):
     part: tuple[PartPixels, ...]
     lamp: Float[Array, "n 3"] | None
     reflected: tracing.Reflections | None = None
+    fold: int = eqx.field(static=True, default=1)
 
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
         """Renders the picture under an environment, in linear radiance.
@@ -91,7 +97,7 @@ class PictureView(eqx.Module):
                 each + jnp.stack([next(more) for _ in each]) if traced else each
                 for each, traced in zip(rows, sharp, strict=True)
             ]
-        return drawn(self.canvas, rows, environment)
+        return _folded(drawn(self.canvas, rows, environment), fold=self.fold)
 
     def _rows(
         self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree], between: Between
@@ -136,10 +142,17 @@ def make(
         surfaces: One `Surface` for each part.
         camera: The camera.
         lamp: Radiance of each lamp; None without lamps.
-        samples: Number of coverage samples of each pixel: 4 or 1.
+        samples: Number of coverage samples of each pixel: 1, 4 or 16.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
         between: Function that is called between steps of the work, as in `RelitScene.picture`.
+
+    Raises:
+        ValueError: `samples` is not 1, 4 or 16.
     """
+    if type(samples) is not int or samples not in SAMPLES:
+        raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
+    samples, fold = SAMPLES[samples]
+    camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):
         pixels, rows = _placed(mesh, surfaces, camera, samples, between)
     else:
@@ -158,7 +171,14 @@ def make(
             asked += [tracing.Asked(number, *each) for each in zip((look.blend for look in looks), points, strict=True)]
     canvas = lay_out(pixels, [each.index for each in parts], camera)
     reflected = tracing.trace(mesh, surfaces, asked, camera.eye, keep=keep) if asked else None
-    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp, reflected)
+    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp, reflected, fold)
+
+
+@partial(jit, static_argnames="fold")
+def _folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c"]:
+    """The picture with squares of `fold` x `fold` pixels averaged to one."""
+    height, width, colors = picture.shape
+    return jnp.mean(picture.reshape(height // fold, fold, width // fold, fold, colors), (1, 3))
 
 
 def _placed(

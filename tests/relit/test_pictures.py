@@ -110,6 +110,20 @@ def test_far_textures_are_averaged():
     np.testing.assert_allclose(picture, 0.5, atol=0.02)
 
 
+def test_more_samples_are_nearer_to_a_picture_of_eight_times_the_size():
+    ready = relit()
+    fine = dataclasses.replace(CAMERA, width=8 * CAMERA.width, height=8 * CAMERA.height)
+    # From 64 pixels, and not from their own samples, which lie elsewhere in the pixel.
+    true = np.asarray(ready.picture(light(), fine, samples=1))
+    true = true.reshape(CAMERA.height, 8, CAMERA.width, 8, -1).mean((1, 3))
+    found = [np.asarray(ready.picture(light(), CAMERA, samples=each)) for each in (1, 4, 16)]
+    assert {each.shape for each in found} == {true.shape}
+    one, four, sixteen = (np.linalg.norm(each - true) / np.linalg.norm(true) for each in found)
+    assert 2 * sixteen < 1.2 * four < one
+    with pytest.raises(ValueError, match="samples must be 1, 4 or 16, got 9"):
+        ready.picture_view(CAMERA, samples=9)
+
+
 @pytest.mark.parametrize("bounced", [0, 1])
 def test_a_kept_view_gives_the_picture_of_every_light(bounced, close):
     ready = relit(bounces=bounced)
