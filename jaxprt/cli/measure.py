@@ -29,9 +29,7 @@ _VERTICES = 300
     group="System",
     type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
-    default=0.05,
-    show_default=True,
-    help="Largest relative error of the planned system.",
+    help="Largest relative error of the planned system.  [default: 0.05, or the smallest that systems reach]",
 )
 @options.bounces
 @options.recipe

@@ -9,7 +9,7 @@ import click
 from jaxprt.cli import inputs, options, relight
 from jaxprt.cli.options import option
 from jaxprt.files import objects
-from jaxprt.relit.planning import Plan, key_of, plan
+from jaxprt.relit.planning import ERROR, Plan, key_of, plan
 
 
 @click.command(cls=options.Command, short_help="Find the smallest system that meets an error.")
@@ -20,9 +20,7 @@ from jaxprt.relit.planning import Plan, key_of, plan
     group="Plan",
     type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
-    default=0.05,
-    show_default=True,
-    help="Largest relative L2 error of the radiance of each part.",
+    help="Largest relative L2 error of the radiance of each part.  [default: 0.05, or the smallest that systems reach]",
 )
 @option(
     "--rate",
@@ -62,7 +60,8 @@ def _plan(chosen: SimpleNamespace) -> Plan:
         kept = chosen.output / "plan"
         if kept.exists():
             found = relight.saved(chosen.output)
-            if (found.key, found.asked, found.rate) == (key_of(scene, lights), chosen.error, chosen.rate):
+            asked = ERROR if chosen.error is None else chosen.error
+            if (found.key, found.asked, found.rate) == (key_of(scene, lights), asked, chosen.rate):
                 return found
             raise ValueError(f"{kept} was made for another scene, lights, error or rate: name another --output")
     candidates = None if chosen.output is None else chosen.output / "candidates"

@@ -21,7 +21,6 @@ from jaxprt.relit.planning import Plan
 from jaxprt.visibility import blocks
 
 SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
-_ERROR = 0.05
 
 
 @click.command(cls=options.Command, short_help="Render a scene under lights, and measure errors.")
@@ -34,7 +33,7 @@ _ERROR = 0.05
     group="System",
     type=options.Finite(0.0, 1.0, open=True),
     metavar="E",
-    help="Largest relative error of the planned system.  [default: 0.05]",
+    help="Largest relative error of the planned system.  [default: 0.05, or the smallest that systems reach]",
 )
 @option(
     "--plan",
@@ -226,8 +225,7 @@ def _made(
         bounces = plan.bounces if chosen.bounces is None else chosen.bounces
         return {system: report.make(view, plan.recipes, output / system, bounces=bounces, **more)}
     if system == "planned":
-        error = _ERROR if chosen.error is None else chosen.error
-        return {system: report.plan(view, output / system, error=error, bounces=chosen.bounces, **more)}
+        return {system: report.plan(view, output / system, error=chosen.error, bounces=chosen.bounces, **more)}
     made = sizes.recipes(system, chosen)
     # Data that does not depend on the number of lobes is shared in one folder.
     return {

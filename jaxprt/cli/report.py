@@ -115,7 +115,7 @@ class Truth(NamedTuple):
 
 
 def plan(
-    view: View, output: Path, *, error: float, bounces: int | str | None, executor: Executor | None = None
+    view: View, output: Path, *, error: float | None, bounces: int | str | None, executor: Executor | None = None
 ) -> Made:
     """Precomputes a scene by a plan. The plan is stored too, so that the same command continues with the same plan.
 

@@ -14,7 +14,7 @@ from jaxprt.files import objects
 from jaxprt.relit import lamps, reflection
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
-from jaxprt.relit.planning import Plan, key_of, plan
+from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
@@ -26,7 +26,7 @@ def precompute(
     scene: Scene,
     *,
     system: str | Recipe | Mapping[str, str | Recipe] | None = None,
-    error: float = 0.05,
+    error: float | None = None,
     environments: Sequence[Environment] | None = None,
     rate: float = 30.0,
     bounces: int | str | None = None,
@@ -47,7 +47,8 @@ def precompute(
         system: Name of a system ("lobe", "harmonic" or "separable"), or a recipe with its own parameters, such as
             `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the name of each part to one of these. If None,
             `jaxprt.plan` chooses the system with the fewest bytes that meets `error`, for each part.
-        error: Largest relative L2 error of the radiance of each part. Only used by the plan.
+        error: Largest relative L2 error of the radiance of each part. Only used by the plan. If None, 0.05, or the
+            smallest error that can be reached, with a warning.
         environments: Environments under which the error must hold; see `jaxprt.plan`. Only used by the plan.
         rate: Frames per second, each with a new light and a new view. Only used by the plan.
         bounces: Number of times that light is reflected between surfaces, or "all" for as many as contribute. If None,
@@ -146,12 +147,14 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
         found, environments = objects.load(kept), options["environments"]
         if found.key != key_of(scene, lights_of(scene) if environments is None else environments):
             raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
-        if found.asked == options["error"] and found.rate == options["rate"]:
+        asked = ERROR if options["error"] is None else options["error"]
+        if (found.asked, found.rate) != (asked, options["rate"]):
+            raise ValueError(
+                f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
+                f"got {asked:g} at {options['rate']:g}: name another path"
+            )
+        if options["error"] is None or found.error * MARGIN <= asked:
             return found
-        raise ValueError(
-            f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
-            f"got {options['error']:g} at {options['rate']:g}: name another path"
-        )
     made = plan(scene, path=folder and folder / "candidates", **options)
     if options["progress"]:
         tqdm.tqdm.write(str(made))

@@ -8,6 +8,7 @@ import math
 import os
 import pathlib
 import re
+import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -27,6 +28,7 @@ from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
 from jaxprt.scene import Environment, Scene
 from jaxprt.visibility import blocks
 
+ERROR = 0.05  # that is asked for where none is given
 MARGIN = 1.25  # safety factor on the error, for lights and views that were not measured
 _SAVING = 0.1  # smallest saving, as a fraction of the bytes, for which another system is measured
 _SLOW = 2.0  # a faster candidate may have this many times the bytes of one that is too slow
@@ -135,7 +137,7 @@ def plan(
     scene: Scene,
     *,
     environments: Sequence[Environment] | None = None,
-    error: float = 0.05,
+    error: float | None = None,
     rate: float = 30.0,
     path: str | os.PathLike | None = None,
     progress: bool = True,
@@ -154,7 +156,9 @@ def plan(
         environments: Environments under which the error must hold, all of one size. If None, those of the scene, or the
             two built-in ones if it has none.
         error: Largest relative L2 error of the radiance of each part, at the vertices and between them. It does not
-            include shadows that are finer than the triangles; see `PartPlan.mesh_error`.
+            include shadows that are finer than the triangles; see `PartPlan.mesh_error`. If None, it is 0.05 for each
+            part where a system reaches that. For other parts the system with the smallest error is chosen, with a
+            warning.
         rate: Frames per second for the whole scene, each with a new light and a new view, without rasterization.
         path: Folder in which measurements are stored. A call that was interrupted resumes from there.
         progress: Whether to show a progress bar.
@@ -165,12 +169,13 @@ def plan(
     Raises:
         TypeError: `scene` is not a `Scene`, or `environments` is not a list of `Environment`.
         ValueError: There are no lights, or lights of different sizes; a light or the result of a BRDF is not finite;
-            `error` or `rate` is not positive and finite; or no system meets the error for some part. The message then
-            gives the smallest error that can be met.
+            `error` or `rate` is not positive and finite; or no system meets the given error for some part. The message
+            then gives the smallest error that can be met.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     environments = lights_of(scene) if environments is None else environments
-    size = checked(environments, error, rate)
+    asked = ERROR if error is None else error
+    size = checked(environments, asked, rate)
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, parts = len(mesh.position), []
     shadings, key = [of_part(part) for part in scene.parts], key_of(scene, environments)
@@ -181,20 +186,33 @@ def plan(
         sample = Sample.make(part, shading, mesh, total, size, environments, views)
         count = len(part.mesh.position)
         kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
-        considered = tuple(_considered(sample, kept, error, count / total / rate))
-        good = [each for each in considered if each.error * MARGIN <= error]
+        considered = tuple(_considered(sample, kept, asked, count / total / rate))
+        good = [each for each in considered if each.error * MARGIN <= asked]
         if not good:
             best = min(considered, key=lambda each: each.error)
-            raise ValueError(
-                f"error must be at least {best.error * MARGIN:.3g} for part {part.name!r}, which "
-                f"{best.recipe} reaches; got {error}. Ask for a larger error, or name a system"
-            )
+            _unmet(part.name, best, error)
+            good = [best]
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         parts.append(PartPlan(part.name, count, sample.mesh_error, chosen, considered))
     reflected = reflection.fractions(shadings, environments)
-    bounces = reflection.needed(reflected, error)
-    return Plan(tuple(parts), reflected, bounces, float(error), float(rate), size, key)
+    bounces = reflection.needed(reflected, asked)
+    return Plan(tuple(parts), reflected, bounces, float(asked), float(rate), size, key)
+
+
+def _unmet(name: str, best: Candidate, error: float | None) -> None:
+    """Refuses a part for which no system meets a given error; warns if none was given."""
+    least = best.error * MARGIN
+    if error is not None:
+        raise ValueError(
+            f"error must be at least {least:.3g} for part {name!r}, which {best.recipe} reaches; got {error}. "
+            "Ask for a larger error, or name a system"
+        )
+    warnings.warn(
+        f"no system reaches an error of {100 * ERROR:g} % for part {name!r}: {best.recipe} is chosen, which reaches "
+        f"{100 * least:.1f} %",
+        stacklevel=3,
+    )
 
 
 def key_of(scene: Scene, environments: Sequence[Environment]) -> str:

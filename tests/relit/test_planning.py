@@ -20,6 +20,7 @@ from jaxprt.scene.mesh import ground_plane, make_mesh
 measuring = importlib.import_module("jaxprt.relit.measuring")
 sampling = importlib.import_module("jaxprt.relit.sampling")
 planning = importlib.import_module("jaxprt.relit.planning")
+build = importlib.import_module("jaxprt.relit.build")
 ASKED = 0.3
 VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
 
@@ -133,6 +134,24 @@ def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
 def test_an_error_that_nothing_reaches_is_refused_with_the_best(scene, sky):
     with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for part 'ball', which .* reaches; got 1e-05"):
         prt.plan(prt.Scene([scene["ball"]]), environments=[sky], error=1e-5, progress=False)
+
+
+def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky, tmp_path, monkeypatch):
+    part = prt.Scene([scene["ground"]])
+    for module in (planning, build):
+        monkeypatch.setattr(module, "ERROR", 1e-6)
+    options = {"environments": [sky], "path": tmp_path, "progress": False}
+    with pytest.warns(
+        UserWarning, match=r"no system reaches an error of 0.0001 % for part 'ground': Harmonics.* is chosen"
+    ):
+        ready = prt.precompute(part, **options)
+    found = prt.files.load(tmp_path / "plan")
+    assert found.asked == 1e-6
+    assert found.part[0].chosen.error == min(each.error for each in found.part[0].considered)
+    assert ready.direct.part[0].vertices == len(scene["ground"].mesh.position)
+    prt.precompute(part, **options)  # The kept plan serves again,
+    with pytest.raises(ValueError, match="error must be at least"):  # but not one who insists.
+        prt.precompute(part, error=1e-6, **options)
 
 
 def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monkeypatch):
