@@ -1,8 +1,9 @@
 """Pictures for the figures of Sun et al. 2007, from the scenes of `benchmarks.paper_scenes`.
 
-Each figure is a dictionary from titles to pictures in linear radiance, made by changing what the paper's caption says
-is changed: light, view or material. Pictures are made at pixels: what arrives is that of the vertices, interpolated;
-BRDF, view and lobes are the pixel's own. `traced` has Mitsuba's pictures of the same scenes.
+Each figure is a dictionary from titles to pictures in linear radiance, with coverage as fourth channel, made by
+changing what the paper's caption says is changed: light, view or material. Pictures are made at pixels: what arrives is
+that of the vertices, interpolated; BRDF, view and lobes are the pixel's own. `traced` has Mitsuba's pictures of the
+same scenes.
 
     python -m benchmarks.paper_figures FOLDER [--store FOLDER] [--only FIGURE...]     write them as PNG
 """
@@ -26,7 +27,6 @@ from jaxprt.scene.points import Points
 
 CHUNK = 1 << 14  # points that are shaded at once
 SAMPLES = 1024  # of Mitsuba's pixels
-WHITE = 1.0  # behind the scenes
 
 
 def picture(
@@ -37,7 +37,7 @@ def picture(
     materials: Sequence[Any] | None = None,
     system: Any = None,
 ) -> np.ndarray:
-    """A picture of a scene at pixels, anti-aliased, in linear radiance; the background is NaN where nothing is seen.
+    """A picture of a scene at pixels, anti-aliased, in linear radiance before black, with coverage.
 
     Args:
         made: The scene.
@@ -69,7 +69,7 @@ def picture(
         first = np.cumsum([0, *size[:-1]])
         for each, start in zip(rows, first, strict=True):
             color[each] = radiance[start : start + len(each)]
-    return np.asarray(image.resolve(pixels, jnp.asarray(color), background=_background(camera)))
+    return np.asarray(image.resolve(pixels, jnp.asarray(np.pad(color, ((0, 0), (0, 1)), constant_values=1))))
 
 
 def _local(region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,10 +93,6 @@ def _points(corner: np.ndarray, weight: np.ndarray, chosen: np.ndarray, count: i
     weights[0] = 1
     corners[:, : len(chosen)], weights[:, : len(chosen)] = corner[chosen].T, weight[chosen].T
     return Points(jnp.asarray(corners), jnp.asarray(weights))
-
-
-def _background(camera: Camera) -> np.ndarray:
-    return np.full((camera.height, camera.width, 3), WHITE, np.float32)
 
 
 def direct(made: Made) -> Any:
@@ -123,7 +119,7 @@ def models(made: Made, changed: Look | None = None) -> list[Any]:
 def traced(
     made: Made, changed: Look | None = None, *, camera: Camera, bounces: int = 2, samples: int = SAMPLES, seed: int = 0
 ) -> np.ndarray:
-    """Mitsuba's picture of a scene with so many bounces, in front of the same background."""
+    """Mitsuba's picture of a scene with so many bounces, with the coverage of ours."""
     found = path_tracing.picture(
         made.mesh,
         models(made, changed),
@@ -133,14 +129,14 @@ def traced(
         samples=samples,
         seed=seed,
     )
-    ones = jnp.zeros((len(made.mesh.position), 3), jnp.float32)
-    return found + np.asarray(image.render(made.mesh, ones, camera, background=jnp.asarray(_background(camera))))
+    coverage = image.render(made.mesh, jnp.ones((len(made.mesh.position), 1), jnp.float32), camera)
+    return np.concatenate([found, coverage], -1)
 
 
 def off(mine: np.ndarray, exact: np.ndarray) -> float:
     """Relative L2 of a picture against another, noise included, over the pixels that the scene fills."""
-    inside = np.all(exact != WHITE, -1) & np.all(mine != WHITE, -1)
-    return float(np.linalg.norm((mine - exact)[inside]) / np.linalg.norm(exact[inside]))
+    inside = (exact[..., 3] == 1) & (mine[..., 3] == 1)
+    return float(np.linalg.norm((mine - exact)[inside]) / np.linalg.norm(exact[inside, :3]))
 
 
 class Figures:
@@ -250,14 +246,17 @@ FIGURES: dict[str, Callable[[Figures], dict[str, np.ndarray]]] = {
 
 
 def exposed(pictures: dict[str, np.ndarray], *, brighter: float = 0.0) -> dict[str, np.ndarray]:
-    """The pictures of a figure for the screen, all with the exposure that the last one asks for."""
+    """The pictures of a figure for the screen, on white, all with the exposure that the last one asks for."""
     *_, last = pictures.values()
-    inside = np.where(last == WHITE, 0, last)
-    stops = image.automatic_exposure(jnp.asarray(inside)) + brighter
-    return {
-        title: np.where(each == WHITE, 1, np.asarray(image.display(image.expose(jnp.asarray(each), stops=stops))))
-        for title, each in pictures.items()
-    }
+    stops = image.automatic_exposure(jnp.asarray(last[..., :3])) + brighter
+    return {title: _on_white(each, stops) for title, each in pictures.items()}
+
+
+def _on_white(picture: np.ndarray, stops: float) -> np.ndarray:
+    """A picture with coverage, clamped for the screen before it is laid over white, so that edges stay smooth."""
+    cover = picture[..., 3:]
+    color = image.expose(jnp.asarray(picture[..., :3] / np.maximum(cover, 1e-6)), stops=stops)
+    return np.asarray(image.display(cover * jnp.clip(color, 0, 1) + 1 - cover))
 
 
 def main(options: Sequence[str] | None = None) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import paper_figures, paper_scenes
+from jaxprt import image
 
 
 @pytest.mark.parametrize("name", paper_scenes.RECIPES)
@@ -46,12 +47,23 @@ def test_few_numbers_of_points_serve_all():
 
 
 def test_the_background_does_not_count_in_what_a_picture_is_off():
-    exact = np.full((4, 4, 3), paper_figures.WHITE)
-    exact[1:3] = 0.5
+    exact = np.zeros((4, 4, 4))
+    exact[1:3] = [0.5, 0.5, 0.5, 1]
+    exact[0] = [0.1, 0.1, 0.1, 0.5]  # an edge
     mine = exact.copy()
-    mine[1, :2] = 0.6
-    expected = np.linalg.norm(mine - exact) / np.linalg.norm(exact[1:3])
+    mine[:2, :2, :3] = 0.6
+    expected = np.sqrt(2 * 0.01 / (8 * 0.25))
     assert paper_figures.off(mine, exact) == pytest.approx(expected)
+
+
+def test_pictures_fade_into_white_at_edges_also_where_they_are_brighter_than_the_screen():
+    bright = np.array([8.0, 8.0, 8.0, 1.0])
+    picture = np.stack([bright, bright / 2, bright * 0])[None]
+    (found,) = paper_figures.exposed({"bright": picture}, brighter=2.0).values()
+    np.testing.assert_allclose(found, 1, atol=1e-6)
+    dark = np.array([1e-9, 1e-9, 1e-9, 1.0])
+    shown = paper_figures.exposed({"dark": np.stack([dark, dark / 2, dark * 0])[None], "bright": picture})["dark"]
+    np.testing.assert_allclose(shown[0, :, 0], image.display(np.array([0.0, 0.5, 1.0])), atol=1e-5)
 
 
 def test_the_table_has_the_last_line_of_each_case_beside_the_papers_figures():
