@@ -128,7 +128,7 @@ RECIPES = {
         None,
     ),
     "ring": Recipe(
-        lambda quick: interiors.ring(spacing=4.0 if quick else 1.5),
+        lambda quick: interiors.ring(spacing=4.0 if quick else 1.0),
         "BP",
         {0: (0.02, [0.9, 0.7, 0.35], 200.0)},
         {1: 0.4},
