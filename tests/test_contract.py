@@ -80,6 +80,7 @@ HOST = {
     "systems.lobe.relight.scales": "NumPy tables",
     "systems.lamps.transport": "traces rays",
     "systems.lobe.relight.view_lobes": "gives indices beside weights, compiled in steps; lobe.radiance has them all",
+    "systems.lobe.widened": "views and sums of systems; tests/systems/lobe/test_widened.py",
     "systems.bounces.traced.is_sharp": "decides on the host",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",

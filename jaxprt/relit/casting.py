@@ -32,6 +32,16 @@ class Caster:
         self.part = np.asarray(mesh.region)[self.face[:, 0]]
 
     @cached_property
+    def bend(self) -> Float[np.ndarray, " f"]:
+        """Curvature of each triangle: change of the shading normal over distance, root mean square over its edges."""
+        position = np.asarray(self.mesh.position)
+        turn, length = (
+            sum(((each[self.face[:, i]] - each[self.face[:, i - 1]]) ** 2).sum(1) for i in range(3))
+            for each in (self.normal, position)
+        )
+        return np.sqrt(turn / np.maximum(length, np.finfo(np.float32).tiny))
+
+    @cached_property
     def start(self) -> Float[np.ndarray, "v 3"]:
         """Origins of the rays of each vertex."""
         return start_points(self.mesh, self.occluder)
@@ -61,6 +71,33 @@ class Caster:
         itself = np.all(met == corner[own], 1) if points is not None else np.any(met == corner[own], 1)
         triangle[ray, own], barycentric[ray, own] = np.where(itself, -1, found), weight
         return triangle, barycentric, start
+
+    def spread(
+        self,
+        rays: Rays,
+        triangle: Int[np.ndarray, "j v"],
+        barycentric: Float[np.ndarray, "j v 3"],
+        start: Float[np.ndarray, "v 3"],
+    ) -> Float[np.ndarray, "j v"]:
+        """Variance of the directions into which what a ray hits reflects the cone that the ray stands for.
+
+        The cone is the ray's share of its lobe. A curved surface spreads it further: over a distance d the cone becomes
+        d times its angle wide, and normals turn by that times the curvature.
+
+        Args:
+            rays: The rays that were cast.
+            triangle: The triangle that each ray hits.
+            barycentric: Barycentric weights of the hit.
+            start: Origins of the rays.
+
+        Returns:
+            The variance along one axis in squared radians, at most 1; without meaning where nothing was hit.
+        """
+        chance = np.asarray(rays.chance)
+        cone = 1 / (np.asarray(rays.concentration) * np.maximum(len(chance) * chance, 1))
+        corner = np.asarray(self.mesh.position)[self.face[triangle]]
+        distance = np.linalg.norm(np.einsum("jvk,jvki->jvi", barycentric, corner) - start, axis=-1)
+        return np.minimum(cone * (1 + 2 * distance * self.bend[triangle]) ** 2, 1).astype(np.float32)
 
 
 _CASTERS: collections.OrderedDict[int, tuple[Any, Caster]] = collections.OrderedDict()

@@ -15,6 +15,7 @@ from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend, System
 
 
@@ -50,10 +51,15 @@ class Surface(eqx.Module):
 
 
 @partial(jit, static_argnames="at_pixels")
-def look(surface: Surface, points: Points, eye: Array, *, at_pixels: bool) -> tuple[Points, Appearance, PyTree]:
-    """Some points of a part, the material there, and the view of each system of the part (None unless `at_pixels`)."""
+def look(
+    surface: Surface, points: Points, eye: Array, *, at_pixels: bool, variance: Float[Array, " p"] | None = None
+) -> tuple[Points, Appearance, PyTree]:
+    """Some points of a part, the material there, and the view of each system of the part (None unless `at_pixels`).
+
+    `variance`, in squared radians, widens the lobes of each point; see `jaxprt.systems.lobe.widened`.
+    """
     appearance = at_points(surface.part, surface.shading, surface.material, points)
-    return points, appearance, _view(surface, eye, points, appearance.blend) if at_pixels else None
+    return points, appearance, _view(surface, eye, points, appearance.blend, variance) if at_pixels else None
 
 
 @jit
@@ -83,11 +89,13 @@ def lit(
 
 
 @partial(jit, static_argnames="at_pixels")
-def shaded(surface, arriving, vertices, points: Points, eye, *, at_pixels: bool) -> Array:
+def shaded(
+    surface, arriving, vertices, points: Points, eye, *, at_pixels: bool, variance: Array | None = None
+) -> Array:
     """Colors of some points of a part. Intermediate results are recomputed for derivatives instead of stored."""
 
     def both(surface, arriving, vertices, eye):
-        viewed = look(surface, points, eye, at_pixels=at_pixels)
+        viewed = look(surface, points, eye, at_pixels=at_pixels, variance=variance)
         return lit(surface, arriving, vertices, viewed)
 
     return jax.checkpoint(both)(surface, arriving, vertices, eye)
@@ -106,13 +114,19 @@ def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: 
     return jnp.stack(rows)
 
 
-def _view(surface: Surface, eye: Array, points: Points | None, blend: Blend | None) -> tuple[PyTree, PyTree, PyTree]:
+def _view(
+    surface: Surface, eye: Array, points: Points | None, blend: Blend | None, variance: Array | None = None
+) -> tuple[PyTree, PyTree, PyTree]:
     """The view of each system of a part: direct light, reflected light and lamps; at points or at the vertices."""
     system = surface.system if points is None else surface.system.at(points)
     reflecting, lit = surface.reflecting, surface.lit
     traced = jnp.ones(len(points)) if isinstance(reflecting, SharpPart) and points is not None else None
     reflected = None if reflecting is None else reflecting.view(eye, blend, points)
-    return system.view(eye, blend), reflected, None if lit is None else lit.view(eye, blend, points, traced)
+    if variance is not None and widened.can_widen(system):
+        direct = widened.view(system, eye, blend, variance)
+    else:
+        direct = system.view(eye, blend)
+    return direct, reflected, None if lit is None else lit.view(eye, blend, points, traced)
 
 
 def _combine(
@@ -123,7 +137,11 @@ def _combine(
 ) -> Array:
     """Radiance of a part from all its systems."""
     system = surface.system if points is None else surface.system.at(points)
-    color = system.combine(arriving[0], view[0])
+    if isinstance(view[0], widened.WidenedView):
+        assert widened.can_widen(system)
+        color = widened.combine(system, arriving[0], view[0])
+    else:
+        color = system.combine(arriving[0], view[0])
     if surface.reflecting is not None:
         color = color + surface.reflecting.combine(arriving[1], view[1], points)
     return color if surface.lit is None else color + surface.lit.combine(arriving[2], view[2])

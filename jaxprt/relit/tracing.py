@@ -74,12 +74,14 @@ class HitRow(eqx.Module):
         number: Index of the part.
         points: The hits as points on the part.
         eye: Origin of the ray of each hit.
+        variance: Variance of the directions into which a cone around each ray is reflected, in squared radians.
         kept: What `look` returns for the hits; None if it is recomputed for each light.
     """
 
     number: int = eqx.field(static=True)
     points: Points
     eye: Float[Array, "h 3"]
+    variance: Float[Array, " h"]
     kept: PyTree
 
 
@@ -116,7 +118,9 @@ class Reflections(eqx.Module):
                 vertices[number] = at_vertices(surface, light, each.eye[0])
             own = vertices.get(number)
             if each.kept is None:
-                rows.append(shaded(surface, light, own, each.points, each.eye, at_pixels=not matte))
+                rows.append(
+                    shaded(surface, light, own, each.points, each.eye, at_pixels=not matte, variance=each.variance)
+                )
             else:
                 rows.append(lit(surface, light, own, each.kept))
         return _read(self.own, rows, lamp)
@@ -156,16 +160,16 @@ def trace(
         _check(mesh, surface.reflecting, each.points, eye, parameter)
         with jax.ensure_compile_time_eval():
             rays.append(surface.reflecting.rays(eye, parameter, each.points, each.seen))
-            found.append(caster(mesh).cast(rays[-1], surface.first, each.points))
+            met = caster(mesh).cast(rays[-1], surface.first, each.points)
+            found.append((*met, caster(mesh).spread(rays[-1], *met)))
     slots, hit = _rows(mesh, plain, found, keep=keep)
     own = []
     for each, ray, slot, triangle in zip(asked, rays, slots, found, strict=True):
         part = surfaces[each.number].reflecting
         assert isinstance(part, SharpPart)
         weight = part.weights(ray, eye, each.blend, each.points, each.seen)
-        sharpness = part.concentrations(ray, eye, each.blend, each.points)
         met = caster(mesh).part[triangle[0]] if (triangle[0] >= 0).any() else np.zeros_like(triangle[0])
-        lamp = _lamps(surfaces, each, np.where(triangle[0] >= 0, met, -1), weight, sharpness)
+        lamp = _lamps(surfaces, each, np.where(triangle[0] >= 0, met, -1), weight, ray.concentration)
         own.append(Carried(jnp.asarray(slot), weight, lamp))
     return Reflections(tuple(own), hit)
 
@@ -312,6 +316,7 @@ def _rows(mesh: Mesh, surfaces: Sequence[Surface], found: Sequence[tuple], *, ke
     triangle = np.concatenate([np.zeros(0, int), *(each[0].ravel() for each in found)])
     weight = np.concatenate([np.zeros((0, 3), np.float32), *(each[1].reshape(-1, 3) for each in found)])
     start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(each[2], (len(each[0]), 1)) for each in found)])
+    variance = np.concatenate([np.zeros(0, np.float32), *(each[3].ravel() for each in found)])
     part = np.where(triangle >= 0, cast.part[triangle], -1)
     slot, rows, total = np.full(len(triangle), -1, np.int32), [], 0
     for number, surface in enumerate(surfaces):
@@ -326,9 +331,10 @@ def _rows(mesh: Mesh, surfaces: Sequence[Surface], found: Sequence[tuple], *, ke
         index = np.pad(index, (0, count * length - len(index)), mode="edge").reshape(count, length)
         for each in index:
             points = Points(jnp.asarray(cast.face[triangle[each]].T - surface.first), jnp.asarray(weight[each].T))
-            eye = jnp.asarray(start[each])
-            kept = look(surface, points, eye, at_pixels=not _is_matte(surface)) if keep else None
-            rows.append(HitRow(number, points, eye, kept))
+            eye, wide = jnp.asarray(start[each]), jnp.asarray(variance[each])
+            matte = _is_matte(surface)
+            kept = look(surface, points, eye, at_pixels=not matte, variance=wide) if keep else None
+            rows.append(HitRow(number, points, eye, wide, kept))
     slot = np.where(slot < 0, total, slot)
     ends = np.cumsum([np.prod(each) for each in shape])[:-1] if shape else []
     return [each.reshape(size) for each, size in zip(np.split(slot, ends), shape, strict=True)], tuple(rows)

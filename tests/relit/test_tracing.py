@@ -70,6 +70,25 @@ def light(seed: int = 1) -> Environment:
     return Environment(jnp.asarray(radiance, jnp.float32))
 
 
+def test_a_ball_spreads_the_cone_of_a_ray_as_its_curvature_says():
+    ball, radius, distance = builtin.sphere(rings=40, sectors=60), 2.0, 3.0
+    ball = make_mesh(radius * np.asarray(ball.position), ball.face)
+    cast = casting.Caster(ball)
+    np.testing.assert_allclose(cast.bend[100:-100], 1 / radius, rtol=0.02)
+    face = 40 * 60 // 2
+    hit = np.array([[face, -1]]), np.full((1, 2, 3), 1 / 3, np.float32)
+    middle = np.asarray(ball.position)[cast.face[face]].mean(0)
+    start = np.stack([middle * (1 + distance / radius), middle])
+    ones = jnp.ones((1, 2))
+    rays = traced.Rays(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2), jnp.int32), ones, 50 * ones)
+    spread = cast.spread(rays, *hit, start)
+    np.testing.assert_allclose(spread[0, 0], (1 + 2 * distance / radius) ** 2 / 50, rtol=0.05)
+    few = traced.Rays(jnp.zeros((4, 2, 3)), jnp.zeros((4, 2), jnp.int32), jnp.full((4, 2), 0.5), jnp.full((4, 2), 50.0))
+    four = cast.spread(few, *(np.repeat(each, 4, 0) for each in hit), start)
+    np.testing.assert_allclose(four[:, 0], spread[0, 0] / 2, rtol=1e-5)
+    assert np.all(spread <= 1)
+
+
 def mirrored(place: np.ndarray) -> np.ndarray:
     """How far inside of the wall the mirrored ray from the eye through a point of the floor hits; outside below 0."""
     way = place - np.asarray(EYE)

@@ -42,11 +42,13 @@ class Rays(eqx.Module):
         direction: Unit directions in world space.
         lobe: Index of the lobe that each ray samples.
         chance: Probability of that lobe; 0 where nothing is traced.
+        concentration: Concentration of that lobe.
     """
 
     direction: Float[Array, "j v 3"]
     lobe: Int[Array, "j v"]
     chance: Float[Array, "j v"]
+    concentration: Float[Array, "j v"]
 
 
 class SharpPart(ReflectingPart):
@@ -126,12 +128,6 @@ class SharpPart(ReflectingPart):
     ) -> Float[Array, "j _ c"]:
         """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
         return _weighed(self._lobes(eye, blend, points), rays, blend, seen)
-
-    def concentrations(
-        self, rays: Rays, eye: Float[Array, "3"], blend: Blend | None, points: Points | None = None
-    ) -> Float[Array, "j _"]:
-        """Concentration of the lobe that each ray samples."""
-        return jnp.take_along_axis(self._lobes(eye, blend, points).concentration, rays.lobe, 0)
 
     def _lobes(self, eye: Array, blend: Blend | None, points: Points | None) -> Lobes:
         position, frame = placed(self.position, self.frame, points)
@@ -216,7 +212,7 @@ def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, 
     angle = 2 * np.pi * (turn + _GOLDEN * jnp.arange(count, dtype=turn.dtype)[:, None])
     local = _around([each(axis) for axis in lobes.mean], drop, angle)
     world = [reduce(jnp.add, (local[i] * frame[:, i, j] for i in range(3))) for j in range(3)]
-    return Rays(jnp.stack(world, -1), number.astype(jnp.int32), own)
+    return Rays(jnp.stack(world, -1), number.astype(jnp.int32), own, concentration)
 
 
 @jit

@@ -144,6 +144,7 @@ def view_lobes(
     *parameter: Float[Array, " v"],
     eye: Float[Array, "*p 3"],
     points: Points | None = None,
+    variance: Float[Array, " v"] | None = None,
 ) -> LobeView:
     """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
@@ -153,6 +154,8 @@ def view_lobes(
         parameter: Values of each BRDF parameter at the vertices or points, if the table has parameters.
         eye: Position of the viewer in world units: one, or one for each vertex or point.
         points: Points at which radiance is evaluated; None for the vertices.
+        variance: Variance in squared radians, along one axis, by which the lobes of each vertex or point are widened;
+            None for zero.
 
     Raises:
         TypeError: The BRDF is not a `LobeBrdf`.
@@ -160,14 +163,20 @@ def view_lobes(
             position nor one for each vertex or point.
     """
     require.position("the eye", eye, each=len(transport.position if points is None else points))
-    return _view_lobes(transport, brdf, parameter, eye, points)
+    return _view_lobes(transport, brdf, parameter, eye, points, variance)
 
 
 @jit
 def _view_lobes(
-    transport: LobeTransport, brdf: LobeBrdf, parameter: tuple[Array, ...], eye: Array, points: Points | None
+    transport: LobeTransport,
+    brdf: LobeBrdf,
+    parameter: tuple[Array, ...],
+    eye: Array,
+    points: Points | None,
+    variance: Array | None,
 ) -> LobeView:
-    lobe, (face, s, t, spread) = _places(*placed(transport.position, transport.frame, points), brdf, eye, *parameter)
+    placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
+    lobe, (face, s, t, spread) = _places(*placing, *parameter)
     seen = transport.lobe_visibility(face, s, t, spread, points)
     place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
     return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
@@ -175,10 +184,11 @@ def _view_lobes(
 
 @isolated
 def _places(
-    position: Array, frame: Array, brdf: LobeBrdf, eye: Array, *parameter: Array
+    position: Array, frame: Array, brdf: LobeBrdf, eye: Array, variance: Array | None, *parameter: Array
 ) -> tuple[Lobes, tuple[Array, ...]]:
     """Lobes of each vertex; and cubemap face, coordinates s and t on it, and spread of each lobe."""
     lobe = brdf.lookup(directions.view(frame, position, eye), *parameter)
+    lobe = lobe if variance is None else lobe.widened(variance)
     world = [sum(lobe.mean[j] * frame[:, j, i] for j in range(3)) for i in range(3)]
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 

@@ -40,13 +40,22 @@ class LobeSystem(protocol.VertexSystem):
             )
         return lit
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> LobeView:
-        """Texels at which each vertex reads the blurred light, with visibility; see `jaxprt.lobe.view_lobes`."""
+    def view(
+        self,
+        eye: Float[Array, "*p 3"],
+        materials: Blend | None = None,
+        variance: Float[Array, " v"] | None = None,
+    ) -> LobeView:
+        """Texels at which each vertex reads the blurred light, with visibility; see `jaxprt.lobe.view_lobes`.
+
+        `variance`, in squared radians, widens the lobes of each vertex or point.
+        """
         protocol.check_blend(materials)
+        options = {"eye": eye, "points": self.points, "variance": variance}
         if materials is None:
-            return view_lobes(self.transport, self.brdf, eye=eye, points=self.points)
+            return view_lobes(self.transport, self.brdf, **options)
         materials.check(self.vertices, len(self.brdf.weight))
-        seen = view_lobes(self.transport, self.brdf, *materials.parameter, eye=eye, points=self.points)
+        seen = view_lobes(self.transport, self.brdf, *materials.parameter, **options)
         weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight, precision="highest")
         diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight, precision="highest")
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))

@@ -54,6 +54,15 @@ class Lobes(eqx.Module):
         value = jnp.sum(self.weight * density, 1) + self.diffuse * wi[:, 2] / np.pi
         return jnp.where(wi[:, 2] > 0, value, 0)
 
+    def widened(self, variance: Float[Array, " v"]) -> "Lobes":
+        """The lobes averaged over directions of some variance, in squared radians along one axis, at each view.
+
+        A lobe near the horizon is widened less, so that little of it falls below, where nothing is seen.
+        """
+        variance = jnp.minimum(variance, jnp.maximum(self.mean[2], 0) ** 2 / 2)
+        concentration = self.concentration / (1 + self.concentration * variance)
+        return Lobes(self.mean, concentration, self.weight, self.diffuse)
+
 
 class LobeBrdf(eqx.Module):
     """BRDF x cosine as lobes, tabulated over the view direction and optionally over BRDF parameters.

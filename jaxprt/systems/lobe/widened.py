@@ -1,0 +1,95 @@
+"""The lobe system with lobes that are widened at each point: what a reflection ray sees, which stands for a cone.
+
+A ray of the reflection of a glossy surface stands for a cone of directions, which meets an area of the surface that it
+hits and leaves it with a wider spread still. If that surface is read at one direction, a highlight that a few rays hit
+makes bright dots. Widened lobes read the mean over the cone: a von Mises-Fisher lobe of concentration k, averaged over
+directions of variance s, is nearly one of concentration 1 / (1 / k + s).
+"""
+
+from typing import Any, TypeGuard
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt.compile import jit, total
+from jaxprt.sphere import cubemap, directions
+from jaxprt.systems.bright_texels import BrightLight, BrightTexels
+from jaxprt.systems.lobe.relight import LobeLight, LobeView
+from jaxprt.systems.lobe.system import LobeSystem
+from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.protocol import Blend
+from jaxprt.visibility import LEVELS
+
+
+class WidenedView(eqx.Module):
+    """A view of a lobe system with widened lobes.
+
+    Attributes:
+        rest: The view of the light without its brightest texels.
+        lobe: The widened lobes in local frames, for the brightest texels.
+        frame: Shading frames of the vertices or points; rows are tangent, bitangent, normal.
+    """
+
+    rest: LobeView
+    lobe: Lobes
+    frame: Float[Array, "v 3 3"]
+
+
+def can_widen(system: Any) -> TypeGuard[LobeSystem | BrightTexels]:
+    """Whether a system represents its BRDF by lobes."""
+    return isinstance(system.system if isinstance(system, BrightTexels) else system, LobeSystem)
+
+
+@jit
+def view(
+    system: LobeSystem | BrightTexels, eye: Float[Array, "*p 3"], blend: Blend | None, variance: Float[Array, " v"]
+) -> WidenedView:
+    """The view of a lobe system, with or without bright texels, whose lobes are widened.
+
+    Args:
+        system: The system, at vertices or points.
+        eye: Position of the viewer: one, or one for each vertex or point.
+        blend: Weights and parameters of the channels; None for the BRDF as it is.
+        variance: Variance in squared radians, along one axis, by which all lobes of a vertex or point are widened.
+    """
+    inner = system.system if isinstance(system, BrightTexels) else system
+    assert isinstance(inner, LobeSystem)
+    position, frame = inner.place(inner.transport)
+    lobe = inner.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
+    rest = inner.view(eye, blend, variance)
+    lobe = Lobes(lobe.mean, lobe.concentration, rest.weight, rest.diffuse).widened(variance)
+    return WidenedView(rest, lobe, frame)
+
+
+@jit
+def combine(
+    system: LobeSystem | BrightTexels, light: LobeLight | BrightLight, seen: WidenedView
+) -> Float[Array, "v c"]:
+    """Radiance: the blurred light, read by the widened lobes, and the brightest texels, each times the same lobes.
+
+    Args:
+        system: The system of the view.
+        light: The result of its `shade`.
+        seen: The result of `view`.
+    """
+    if not isinstance(light, BrightLight):
+        assert isinstance(system, LobeSystem)
+        return system.combine(light, seen.rest)
+    assert isinstance(system, BrightTexels)
+    assert light.seen is not None
+    size, points = system.visibility.size, system.points
+    direction, area = (each(size=size).reshape(-1, 3)[light.texel] for each in (cubemap.direction, cubemap.vector_area))
+    frame = jnp.moveaxis(seen.frame, 0, 2)
+    # A texel is a lobe itself, as wide as it is.
+    lobe = seen.lobe.widened(jnp.full(seen.frame.shape[0], 4 * jnp.pi / (6 * size**2 * 12), frame.dtype))
+
+    def lit(texel: tuple[Array, Array, Array, Array]) -> Float[Array, "c v"]:
+        direction, area, excess, visible = texel
+        share = visible.astype(frame.dtype) / LEVELS
+        share = share if points is None else points.carry(share)
+        wi = jnp.sum(frame * direction[:, None], 1).T
+        return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
+
+    sent = total(lit, (direction.astype(frame.dtype), area.astype(frame.dtype), light.excess, light.seen)).T
+    return system.system.combine(light.rest, seen.rest) + sent

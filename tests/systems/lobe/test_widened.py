@@ -1,0 +1,99 @@
+"""Lobes as reflection rays read them: widened lobes against averages over directions, and the sums that they enter."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxprt import bright_texels, lobe, visibility
+from jaxprt.brdf import CookTorrance
+from jaxprt.scene import Environment, builtin
+from jaxprt.scene.mesh import ground_plane, join
+from jaxprt.scene.points import Points
+from jaxprt.systems.lobe import widened
+from jaxprt.systems.lobe.table import Lobes
+
+pytestmark = pytest.mark.usefixtures("few_samples")
+SIZE = 16
+EYE = jnp.array([1.2, 1.5, 2.5])
+BRDF = CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.2)
+LOBES = 0.03  # of all radiance: what lobes change of the BRDF of the brightest texels, and a texel's width as a lobe
+
+ENERGY = 0.04  # of all radiance in white light: what falls below the horizon or onto other surfaces
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    ball = builtin.sphere(rings=8, sectors=10)
+    return join([ball, ground_plane(ball, vertices=36)])
+
+
+@pytest.fixture(scope="module")
+def seen(mesh):
+    return visibility.precompute(mesh, size=SIZE, progress=False)
+
+
+@pytest.fixture(scope="module")
+def systems(seen):
+    return both(seen, BRDF)
+
+
+def both(seen, brdf):
+    """The lobe system alone, and with the brightest texels apart."""
+    plain = lobe.LobeSystem(lobe.compress(seen), lobe.tabulate(brdf, lobes=6, resolution=16))
+    return plain, bright_texels.BrightTexels(plain, seen, brdf, count=8, samples=2)
+
+
+def lit(system, light, variance):
+    count = len(system.points) if system.points is not None else system.vertices
+    seen = widened.view(system, EYE, None, jnp.full(count, variance))
+    return np.asarray(widened.combine(system, system.shade(system.light(light)), seen))
+
+
+def test_a_widened_lobe_is_the_mean_over_directions():
+    rng, variance, concentration = np.random.default_rng(0), 0.02, 60.0
+    mean = np.array([0.3, 0.2, 0.93]) / np.linalg.norm([0.3, 0.2, 0.93])
+    turned = mean + variance**0.5 * rng.standard_normal((20_000, 3))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    wi = mean + np.linspace(0, 0.5, 9)[:, None] * np.cross(mean, [0, 0, 1.0]) + [0, 0, 1e-3]
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    expected = np.exp(concentration * (wi @ turned.T - 1)).mean(1) * concentration / (2 * np.pi)
+    ones = jnp.ones((1, 1, 1))
+    one = Lobes(jnp.asarray(mean)[:, None, None], concentration * ones[0], ones, 0 * ones[0])
+    found = one.widened(jnp.full(1, variance)).evaluate(jnp.asarray(wi))[0]
+    np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
+
+
+def test_unwidened_lobes_give_the_radiance_of_the_system(systems, close):
+    light, (plain, bright) = builtin.daylight(size=SIZE), systems
+    exact = [np.asarray(each.combine(each.shade(each.light(light)), each.view(EYE))) for each in systems]
+    close(lit(plain, light, 0.0), exact[0], tolerance=1e-5)
+    found = lit(bright, light, 0.0)
+    assert np.linalg.norm(found - exact[1]) < LOBES * np.linalg.norm(exact[1])
+
+
+def test_widening_keeps_energy_and_makes_highlights_wide(seen):
+    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
+    sun = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[2, SIZE // 2, SIZE // 2].set(100.0))
+    for system in both(seen, CookTorrance(diffuse=[0.0, 0.0, 0.0], roughness=0.2)):
+        sharp, wide = (lit(system, white, variance) for variance in (0.0, 0.1))
+        assert wide.sum() == pytest.approx(sharp.sum(), rel=ENERGY)
+        sharp, wide, widest = (lit(system, sun, variance) for variance in (0.0, 0.3, 3e8))
+        assert wide.max() < 0.5 * sharp.max()
+        assert np.all(np.isfinite(widest))
+
+
+def test_points_have_what_vertices_have(mesh, systems, close):
+    system, light = systems[1], builtin.daylight(size=SIZE)
+    corner = mesh.face[::7].T
+    weight = jnp.zeros(corner.shape).at[0].set(1)
+    at = system.at(Points(corner, weight, jnp.zeros((2, *corner.shape))))
+    close(lit(at, light, 0.1), lit(system, light, 0.1)[np.asarray(corner[0])], tolerance=1e-4)
+
+
+def test_only_systems_with_lobes_can_be_widened(systems):
+    plain, bright = systems
+    assert widened.can_widen(plain)
+    assert widened.can_widen(bright)
+    other = eqx.tree_at(lambda each: each.system, bright, bright)
+    assert not widened.can_widen(other)
