@@ -272,10 +272,11 @@ def _second(
     job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: _Run
 ) -> tuple[SecondBounce | None, np.ndarray]:
     """The second bounce, or None if a sample of clusters shows too little worth; and its irradiance at vertices."""
-    sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
-    brought = np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample])
-    if _rms(brought) < least:
-        return None, brought
+    if least > 0:
+        sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
+        brought = np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample])
+        if _rms(brought) < least:
+            return None, brought
     found = run.compute(job, "clusters_2", "bounce 2")
     parts = (found["weight"].reshape(*member.shape, -1), found["core"], found["error"])
     return SecondBounce(*map(jax.device_put, parts)), found["white"]
