@@ -148,7 +148,7 @@ def drawn(
     edge = 16 if quick else EDGE
     angle, height = 2 * np.pi * random.random(), random.uniform(0.2, 0.6)
     if name == "room":  # open to one side only, through which it is looked into
-        angle, height = 0.1 * (angle - np.pi), height / 4
+        angle, height = 0.05 * (angle - np.pi), height / 5
     camera = orbit(scene.mesh, azimuth=angle, elevation=height, width=edge, height=edge)
     materials = {}
     for part in scene.parts:
