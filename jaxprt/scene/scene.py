@@ -165,7 +165,7 @@ class Scene(eqx.Module):
         names = [each.name for each in (*self.parts, *self.point_lights)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"each part of a scene must have a name of its own, got several called {twice}")
+            raise ValueError(f"the parts of a scene must have different names, got several named {twice}")
 
     def __getitem__(self, name: str) -> Part:
         """The part with a given name.
