@@ -174,7 +174,7 @@ class Total(System):
         """Refuses systems of different vertices."""
         counts = [each.vertices for each in self.part]
         if len(set(counts)) != 1:
-            raise ValueError(f"systems must be one or more, of as many vertices, got {counts}")
+            raise ValueError(f"systems must be one or more with the same number of vertices, got {counts}")
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""

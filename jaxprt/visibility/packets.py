@@ -1,7 +1,7 @@
 """Shadow rays in packets of sixteen, traced by the Embree library that embreex ships.
 
 embreex traces rays one at a time. Sixteen rays with nearby origins and similar directions visit the same nodes of
-Embree's BVH. Traced as a packet they take less than half the time and give identical results.
+Embree's BVH. Traced as a packet they are faster and give identical results.
 """
 
 import ctypes

@@ -193,7 +193,7 @@ def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
 
 @pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
 def test_values_without_one_row_per_direction_are_refused(mesh, random, value):
-    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] here, got \["):
+    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] for 384 directions, got \["):
         reference.radiance(mesh, value, some_light(random), eye=EYE)
 
 

@@ -140,7 +140,7 @@ def test_a_store_made_from_something_else_is_refused(mesh, tmp_path):
         (mesh, {"size": SIZE, "occluder": builtin.plane(cells=1)}),
         (builtin.plane(cells=6), {"size": SIZE}),
     ):
-        with pytest.raises(ValueError, match=r"a\.prt holds arrays made from something else"):
+        with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
             precompute(other, path=path, progress=False, **options)
 
 
