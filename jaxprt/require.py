@@ -149,7 +149,9 @@ def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> No
     size = f"{what} take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
     if not in_files or jax.devices()[0].platform != "cpu":
         raise MemoryError(f"{size}; {advice}")
-    warnings.warn(f"{size}: they stay in files, and each new light reads all of these; or {advice}", stacklevel=4)
+    warnings.warn(
+        f"{size}: they stay in files, and each new light reads all of them. To avoid this, {advice}", stacklevel=4
+    )
 
 
 def available_memory() -> int | None:

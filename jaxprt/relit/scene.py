@@ -341,7 +341,7 @@ class RelitScene(System):
         known = {part.name: (part, each) for part, each in zip(self.scene.parts, self.shading, strict=True)}
         unknown = [name for name in materials if name not in known]
         if unknown:
-            raise ValueError(f"materials must be of the parts {list(known)}, got one of {unknown[0]!r}")
+            raise ValueError(f"materials must be for the parts {list(known)}, got one for {unknown[0]!r}")
         result = {}
         for name, given in materials.items():
             part, shading = known[name]
@@ -357,8 +357,8 @@ class RelitScene(System):
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
                 raise ValueError(
-                    f"part {name!r} was precomputed without emission, so that its light would not reach other parts: "
-                    "precompute the scene with a material that emits"
+                    f"part {name!r} was precomputed without emission, so light that it emits would not reach other "
+                    "parts: precompute the scene with a material that emits"
                 )
         return result
 
