@@ -116,7 +116,7 @@ def length(name: str, value: Any, count: int) -> None:
     """Refuses an array with a wrong number of rows.
 
     Args:
-        name: Description of the array for the message, such as "the light's coefficients".
+        name: Description of the rows for the message, such as "the light's coefficients".
         value: The array.
         count: Required number of rows.
 
@@ -124,7 +124,7 @@ def length(name: str, value: Any, count: int) -> None:
         ValueError: The array has another number of rows.
     """
     if value.shape[0] != count:
-        raise ValueError(f"{name} must be {count}, got {value.shape[0]}")
+        raise ValueError(f"the number of {name} must be {count}, got {value.shape[0]}")
 
 
 def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> None:

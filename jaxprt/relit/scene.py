@@ -224,8 +224,8 @@ class RelitScene(System):
             environment: One environment. It is also the background.
             camera: The camera; `self.camera` if None.
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
-            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes about
-                four times as long as 4, and matters where sharp highlights are smaller than a pixel.
+            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
+                than 4, and matters where sharp highlights are smaller than a pixel.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
@@ -251,8 +251,8 @@ class RelitScene(System):
         Args:
             camera: The camera; `self.camera` if None.
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
-            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes about
-                four times as long as 4, and matters where sharp highlights are smaller than a pixel.
+            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
+                than 4, and matters where sharp highlights are smaller than a pixel.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 

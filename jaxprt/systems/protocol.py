@@ -140,7 +140,7 @@ class Blend(eqx.Module):
         require.finite("the weights of the blend", self.weight)
         for each in self.parameter:
             require.finite("the parameters of the blend", each)
-            require.length("the parameters of the blend", each, len(self.weight))
+            require.length("values of each parameter of the blend", each, len(self.weight))
 
     def check(self, vertices: int, channels: int) -> None:
         """Refuses a blend with another number of vertices or channels.

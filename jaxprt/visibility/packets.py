@@ -77,7 +77,7 @@ class Packets:
         library.rtcCommitScene(self._scene)
         if code := library.rtcGetDeviceError(device):
             raise (MemoryError if code == _OUT_OF_MEMORY else RuntimeError)(
-                f"Embree must take a scene of {len(position)} vertices and {len(face)} triangles, got its error {code}"
+                f"Embree failed for a scene of {len(position)} vertices and {len(face)} triangles, error code {code}"
             )
         self._context = np.full(WIDTH, _NONE, np.uint32)
         # RTCOccludedArguments: flags and features, 32 bits each; context; filter; callback.

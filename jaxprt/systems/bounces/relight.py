@@ -319,7 +319,7 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
 
     A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
-    Constant light is preserved. Flux is preserved within 2.5 % for faces of 8 x 8 texels, and 5 % for 4 x 4.
+    Constant light is preserved exactly, and flux approximately.
 
     Args:
         radiance: Radiance of the fine texels.

@@ -157,7 +157,7 @@ def factor(
         terms: Number of terms. Give either `terms` or `error`.
         error: Relative L2 error that the terms must meet. With `light`, it holds under each of these lights, by
             `jaxprt.separable.light_errors`. Otherwise it is the mean over natural light with the covariance above, and
-            single lights may exceed it. Both are without shadows; `jaxprt.plan.separable` measures errors on a mesh.
+            single lights may exceed it. Both are without shadows; `jaxprt.relit.measuring.measure` includes them.
         light: Environments under which `error` must hold.
         resolution: Edge of the square maps in texels.
 

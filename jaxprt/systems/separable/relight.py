@@ -292,7 +292,7 @@ def modulate(
             f"terms must hold one number for each of {weight.shape[1]} weights and sum to the {view.shape[1]} terms of "
             f"the view tuple, got {terms}"
         )
-    require.length("the vertices of the weights", weight, len(view))
+    require.length("vertices of the weights", weight, len(view))
     require.finite("the weights", weight)
     return _modulated(view, weight, terms=terms)
 
