@@ -3,9 +3,9 @@
 `jit` requests full precision, because GPUs otherwise round the factors of float32 products to ten bits. `isolated`
 compiles a step separately, because XLA on CPUs may fuse a step into each of its uses and repeat it there, gathers and
 loops over vertices included. `linear` takes the transpose of a linear map explicitly, because JAX would otherwise
-derive gradients by transposing each operation, and the transpose of a gather is a scatter, which is five times as slow.
-Both work under all JAX transformations. `total` and `mapped` are loops in the form that suits the device: CPUs prefer
-steps that stay in the cache, GPUs few large kernels.
+derive gradients by transposing each operation, and the transpose of a gather is a scatter, which is slower. Both
+work under all JAX transformations. `total` and `mapped` are loops in the form that suits the device: CPUs prefer steps
+that stay in the cache, GPUs few large kernels.
 """
 
 import functools

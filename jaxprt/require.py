@@ -116,7 +116,7 @@ def length(name: str, value: Any, count: int) -> None:
     """Refuses an array with a wrong number of rows.
 
     Args:
-        name: Description of the array for the message, such as "the light's coefficients".
+        name: Description of the rows for the message, such as "the light's coefficients".
         value: The array.
         count: Required number of rows.
 
@@ -124,7 +124,7 @@ def length(name: str, value: Any, count: int) -> None:
         ValueError: The array has another number of rows.
     """
     if value.shape[0] != count:
-        raise ValueError(f"{name} must be {count}, got {value.shape[0]}")
+        raise ValueError(f"the number of {name} must be {count}, got {value.shape[0]}")
 
 
 def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> None:
@@ -149,7 +149,9 @@ def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> No
     size = f"{what} take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
     if not in_files or jax.devices()[0].platform != "cpu":
         raise MemoryError(f"{size}; {advice}")
-    warnings.warn(f"{size}: they stay in files, and each new light reads all of these; or {advice}", stacklevel=4)
+    warnings.warn(
+        f"{size}: they stay in files, and each new light reads all of them. To avoid this, {advice}", stacklevel=4
+    )
 
 
 def available_memory() -> int | None:

@@ -42,7 +42,9 @@ def load_ngan(path: str | pathlib.Path, material: str) -> Model:
     text = pathlib.Path(path).read_text(encoding="utf-8", errors="replace")
     lines = {found["name"]: found for found in map(_LINE.fullmatch, map(str.strip, text.splitlines())) if found}
     if not lines:
-        raise ValueError(f"{path}: lines must be like `name = Aggregate(Lambertian(..), NganWardDuer(..))`, got none")
+        raise ValueError(
+            f"{path}: must have lines such as `name = Aggregate(Lambertian(..), NganWardDuer(..))`, got none"
+        )
     found = lines[measured.one_of(material, list(lines), path)]
     if found["model"] not in _MODELS:
         raise ValueError(f"{path}: the model of {material} must be one of {', '.join(_MODELS)}, got {found['model']}")
@@ -50,7 +52,7 @@ def load_ngan(path: str | pathlib.Path, material: str) -> Model:
         field = {name: np.array(ast.literal_eval(value), float) for name, value in _FIELD.findall(found["rest"])}
         return _model(found["model"], np.array(ast.literal_eval(found["diffuse"]), float) * _SCALE, field)
     except (ValueError, KeyError, SyntaxError, TypeError) as error:
-        raise ValueError(f"{path}: {material} must have the numbers of {found['model']}: {error}") from error
+        raise ValueError(f"{path}: the numbers of {material} must fit its model {found['model']}: {error}") from error
 
 
 def _model(name: str, diffuse: np.ndarray, field: dict[str, Any]) -> Model:

@@ -18,8 +18,8 @@ def as_argument(brdf: Callable) -> Callable:
     """
     if getattr(brdf, "holds_cosine", False):
         raise TypeError(
-            f"the BRDF must give values in 1/sr; those of {type(brdf).__name__} hold the cosine of the light's "
-            "direction too: give the BRDF that the table was made from"
+            f"the BRDF must return values in 1/sr, got a {type(brdf).__name__}, whose values include the cosine of the "
+            "light's direction: give the BRDF that the table was made from"
         )
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 

@@ -76,7 +76,7 @@ class HalfDifferenceTable(eqx.Module):
     Cells are uniform in sqrt(theta_h), in theta_d (both up to a quarter turn) and in phi_d (up to half a turn, after
     which it repeats by reciprocity). Beyond the outermost centers the value is constant. The BRDF is reciprocal, and
     not negative if no root is negative. Cube roots are interpolated because highlights fall by orders of magnitude from
-    cell to cell: on the MERL grid they make a Cook-Torrance lobe of roughness 0.1 three times as accurate.
+    cell to cell, and linear interpolation of the values themselves would widen them.
 
     Gradients are those of the interpolant. Where angles are undefined (theta_h or theta_d zero) they are zero across
     that angle; ``tabulate`` makes the adjacent cells equal for all phi_d.
@@ -200,7 +200,7 @@ def tabulate(
         ValueError: No cell is valid.
     """
     if not valid.any():
-        raise ValueError(f"there must be a valid cell, got none of {valid.size}")
+        raise ValueError(f"at least one cell must be valid, got none of {valid.size}")
     half = value.shape[2] // 2
     around = np.pad(valid, ((0, 0), (0, 0), (half, half)), mode="wrap")  # The table repeats after half a turn.
     nearest = np.asarray(scipy.ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True))
@@ -244,7 +244,7 @@ def load_merl(path: str | pathlib.Path) -> HalfDifferenceTable:
     require(path, plane, np.isfinite(plane), "finite", "value at color, theta_h, theta_d, phi_d")
     valid = np.all(plane >= 0, 0)
     if not valid.any():
-        raise ValueError(f"{path}: must hold a cell with no negative value, got none of {valid.size}")
+        raise ValueError(f"{path}: must hold at least one cell without a negative value, got none of {valid.size}")
     return tabulate(np.moveaxis(plane, 0, -1) * _MERL_SCALE, valid)
 
 
@@ -309,11 +309,11 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
 
     Reference: Lafortune, Foo, Torrance, Greenberg 1997.
     """
-    form = f"{path}: must be JSON with materials, each of diffuse and lobes of Cxy, Cz, n in three colors"
+    form = f"{path}: must be JSON with materials, each with diffuse and lobes, whose Cxy, Cz and n have three colors"
     try:
         known = {str(name): entry for name, entry in json.loads(pathlib.Path(path).read_text())["materials"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{form}: {error!r}") from error
+        raise ValueError(f"{form}, got other content: {error!r}") from error
     entry = known[one_of(material, list(known), path)]
     try:
         diffuse = np.array(entry["diffuse"], float).reshape(3)
@@ -321,9 +321,9 @@ def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
             np.array([lobe[key] for lobe in entry["lobes"]], float).reshape(-1, 3) for key in ("Cxy", "Cz", "n")
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{form}, but {material} is not: {error!r}") from error
+        raise ValueError(f"{form}, got {material} in another form: {error!r}") from error
     if not len(cxy) == len(cz) == len(exponent):
-        raise ValueError(f"{form}, but {material} has {len(cxy)}, {len(cz)} and {len(exponent)} of them")
+        raise ValueError(f"{form}, got {len(cxy)} Cxy, {len(cz)} Cz and {len(exponent)} n for {material}")
     require(path, diffuse, np.isfinite(diffuse) & (diffuse >= 0), "finite and non-negative", "diffuse at color")
     for value, name in ((cxy, "Cxy"), (cz, "Cz"), (exponent, "n")):
         good = np.isfinite(value) & ((value > 0) | (name != "n"))

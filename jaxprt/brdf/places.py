@@ -225,8 +225,9 @@ def columns(
     if not in_columns(point, chart=chart):
         count = len(_split(scaled, rounding))
         raise ValueError(
-            "points must be in at least two columns of one first coordinate each, whose second coordinates have the "
-            f"same least and largest value, got {len(point)} points with {count} first coordinates"
+            "points must form at least two columns: the points of a column share their first coordinate, and all "
+            "columns have the same smallest and largest second coordinate; "
+            f"got {len(point)} points with {count} different first coordinates"
         )
     found = _split(scaled, rounding)
     most = max(map(len, found))
@@ -324,8 +325,8 @@ def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Coordinates as floating-point numbers. Infinite ones become large finite ones."""
     value = jnp.asarray(coordinate, jnp.result_type(float))
     if value.shape != shape:
-        kind = "two coordinates" if shape else "one coordinate, a number,"
-        raise ValueError(f"a point of this set has {kind} not an array of shape {list(value.shape)}")
+        kind = "two coordinates" if shape else "one number"
+        raise ValueError(f"a point of this set must be {kind}, got an array of shape {list(value.shape)}")
     return jnp.clip(value, -_FAR, _FAR)
 
 

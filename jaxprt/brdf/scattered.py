@@ -141,10 +141,9 @@ def interpolate_scattered(
         wo: Unit directions to the viewer above the horizon.
         value: The BRDF in 1/sr; negative values count as zero.
         smoothing: Smoothing parameter of ``scipy.interpolate.RBFInterpolator``; larger values fit the samples less
-            closely. For measured lacquers, 0.01 lets the BRDF overshoot between the measured angles of incidence to 16
-            to 24 times the largest nearby sample. With 1 it stays below twice that sample and predicts left-out samples
-            equally well. In the highlight (theta_h below 1.5 degrees) a thousandth of it is used, because the few
-            samples there would be smoothed away.
+            closely. Much smaller values let the BRDF overshoot between the measured angles of incidence. In the
+            highlight (theta_h below 1.5 degrees) a thousandth of it is used, because the few samples there would be
+            smoothed away.
         resolution: Number of cells in theta_h, theta_d and phi_d; the last must be even.
 
     Returns:
@@ -202,8 +201,8 @@ def spectrum_to_rgb(
     """Converts a spectral reflectance or BRDF to linear Rec. 709 RGB under the illuminant D65.
 
     A constant spectrum of value 1 becomes (1, 1, 1): each channel is divided by that of a reflectance of 1. This
-    corrects about one percent for the ends of the spectrum and for the approximated matching functions. Colors outside
-    of the gamut of Rec. 709 are clipped at zero.
+    corrects for the ends of the spectrum, which are not integrated, and for the approximated matching functions. Colors
+    outside of the gamut of Rec. 709 are clipped at zero.
 
     Args:
         reflectance: Values at the wavelengths.

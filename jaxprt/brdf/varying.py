@@ -27,7 +27,7 @@ class PerVertex(eqx.Module):
         if not leaves or any(not each.ndim for each in leaves):
             raise ValueError("every parameter of the model must have a leading axis of vertices, got one without")
         for each in leaves:
-            require.length("the rows of each parameter of the model", each, len(leaves[0]))
+            require.length("rows of each parameter of the model", each, len(leaves[0]))
 
     @property
     def vertices(self) -> int:

@@ -59,7 +59,9 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
     materials = []
     for part in view.scene.parts:
         if isinstance(part.material, TexturedMaterial):
-            raise ValueError(f"the dynamic system needs BRDFs, got the material of part {part.name!r}: give --brdf")
+            raise ValueError(
+                f"the dynamic system needs BRDFs, got a TexturedMaterial for part {part.name!r}: give --brdf"
+            )
         materials.append(part.material)
     changing = [each for each in materials if isinstance(each, CookTorrance)]
     if not changing:

@@ -1,6 +1,7 @@
 """The command `jaxprt export`: writes scenes and lights for other programs."""
 
 import json
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxprt.cli import inputs, options, play, sizes
+from jaxprt.cli import inputs, options, play, relight, sizes
 from jaxprt.cli.options import option
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
@@ -42,7 +43,7 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
 @option(
     "--most",
     group="Output",
-    type=click.IntRange(1),
+    type=options.Whole(1),
     metavar="BYTES",
     default=32_000_000,
     show_default=True,
@@ -89,12 +90,30 @@ def _check(chosen: SimpleNamespace) -> None:
     for path in chosen.output:
         if path.suffix.lower() not in _KINDS:
             raise click.UsageError(f"--output must end in {', '.join(_KINDS)}, got {path}")
-        if not path.parent.is_dir():
+        if not path.parent.exists():
             raise click.UsageError(f"--output must be in a folder that exists, got {path}: there is no {path.parent}")
-        if path.is_dir():
+        if os.path.isdir(path):
             raise click.UsageError(f"--output must be a file, got the folder {path}")
     if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
-        raise click.UsageError("an export has one system, and one number of lobes, got several")
+        raise click.UsageError("an export takes one system and one number of lobes, got several")
+    for path in chosen.output:
+        _check_writable(path)
+    if chosen.store is not None:
+        relight.make_folder(chosen.store, name="--store")
+
+
+def _check_writable(path: Path) -> None:
+    """Opens the file for writing, because permissions alone do not tell. An existing file is not changed."""
+    new = not os.path.lexists(path)
+    try:
+        with path.open("ab"):
+            pass
+        if new:
+            path.unlink()
+    except OSError as error:
+        raise click.ClickException(
+            f"--output must be a file that can be written, got {path}: {error.strerror}"
+        ) from error
 
 
 def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:

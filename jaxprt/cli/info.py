@@ -31,7 +31,7 @@ _NAMES = 6  # most names of a file's materials that the text lists
 @option(
     "--light-size",
     group="Light",
-    type=click.IntRange(1, 1024),
+    type=options.Whole(1, 1024),
     default=64,
     show_default=True,
     metavar="N",

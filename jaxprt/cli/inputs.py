@@ -177,7 +177,7 @@ def _number(names: Sequence[str], name: str) -> int:
     if name.isdecimal() and int(name) < len(names):
         return int(name)
     known = ", ".join(f"{number} {each!r}" for number, each in enumerate(names))
-    raise ValueError(f"--material must name a part, which are {known}; got {name!r}")
+    raise ValueError(f"--material must name one of the parts {known}, got {name!r}")
 
 
 def _playable(part: Part) -> Part:

@@ -47,18 +47,63 @@ class Finite(click.ParamType):
 
     def __init__(self, least: float | None = None, most: float | None = None, *, open: bool = False):
         """Takes the ends of the range. With `open` the ends are excluded."""
-        self._range = click.FloatRange(least, most, min_open=open, max_open=open)
+        self._ends, self._open = (least, most), open
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parses the number.
 
         Raises:
-            click.UsageError: The value is not a number or out of range.
+            click.UsageError: The value is not a finite number in the range.
         """
-        number = self._range.convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
+        number = _parsed(float, value)
+        if number is None or not math.isfinite(number) or not _inside(number, *self._ends, open=self._open):
+            self.fail(
+                _required("a finite number", *self._ends, open=self._open, number=number, value=value), param, ctx
+            )
         return number
+
+
+class Whole(click.IntRange):
+    """A whole number in a range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Parses the number.
+
+        Raises:
+            click.UsageError: The value is not a whole number in the range.
+        """
+        number = _parsed(int, value)
+        if number is None or not _inside(number, self.min, self.max, open=False):
+            self.fail(
+                _required("a whole number", self.min, self.max, open=False, number=number, value=value), param, ctx
+            )
+        return number
+
+
+def _parsed(kind: Callable, value: Any) -> Any:
+    """The value as a number; None if it is none."""
+    try:
+        return kind(value)
+    except ValueError:
+        return None
+
+
+def _inside(number: int | float, least: int | float | None, most: int | float | None, *, open: bool) -> bool:
+    if open and number in (least, most):
+        return False
+    return (least is None or least <= number) and (most is None or number <= most)
+
+
+def _required(
+    what: str, least: int | float | None, most: int | float | None, *, open: bool, number: Any, value: Any
+) -> str:
+    """The message for a value that is not such a number, or not in the range."""
+    low = "" if least is None else f" {'above' if open else 'of at least'} {least:g}"
+    high = "" if most is None else f" {'below' if open else 'of at most'} {most:g}"
+    both = f"{low} and{high}" if low and high else low + high
+    if low and high and not open:
+        both = f" from {least:g} to {most:g}"
+    return f"must be {what}{both}, got {repr(value) if number is None else value}"
 
 
 class Several(click.ParamType):
@@ -213,7 +258,7 @@ light = together(
     option(
         "--light-size",
         group="Light",
-        type=click.IntRange(1, 1024),
+        type=Whole(1, 1024),
         metavar="N",
         help="Texels along the edge of the light's cubemap faces, a power of two.  [default: 64]",
     ),
@@ -240,7 +285,7 @@ camera = together(
     option(
         "--size",
         group="Camera",
-        type=click.IntRange(1, 8192),
+        type=Whole(1, 8192),
         metavar="N",
         default=512,
         show_default=True,
@@ -251,21 +296,21 @@ few_sizes = together(
     option(
         "--lobes",
         group="Sizes",
-        type=Several(click.IntRange(1, 64)),
+        type=Several(Whole(1, 64)),
         metavar="N,..",
         help="Lobes per BRDF (lobe). Several numbers make several systems.  [default: 12]",
     ),
     option(
         "--texels",
         group="Sizes",
-        type=click.IntRange(0),
+        type=Whole(0),
         metavar="N",
         help="Brightest texels that are summed one by one (lobe, clusters).  [default: 16]",
     ),
     option(
         "--order",
         group="Sizes",
-        type=click.IntRange(1, 15),
+        type=Whole(1, 15),
         metavar="N",
         default=5,
         show_default=True,
@@ -284,28 +329,28 @@ _more_sizes = together(
     option(
         "--terms",
         group="Sizes",
-        type=click.IntRange(1),
+        type=Whole(1),
         metavar="N",
         help="BRDF terms.  [default: 4 for separable, 32 for clusters]",
     ),
     option(
         "--keep",
         group="Sizes",
-        type=click.IntRange(1),
+        type=Whole(1),
         metavar="N",
         help="Wavelet coefficients.  [default: 96 per vertex and term for separable, 768 per cluster for clusters]",
     ),
     option(
         "--components",
         group="Sizes",
-        type=click.IntRange(1),
+        type=Whole(1),
         metavar="N",
         help="Principal components along the vertices of each cluster (clusters).  [default: 16]",
     ),
     option(
         "--modes",
         group="Sizes",
-        type=click.IntRange(1),
+        type=Whole(1),
         metavar="N",
         help="Principal components along the light of each cluster (clusters).  [default: 80]",
     ),

@@ -14,7 +14,7 @@ from typing import Any
 import click
 import jax
 
-from jaxprt.cli import inputs, options, sizes
+from jaxprt.cli import inputs, options, relight, sizes
 from jaxprt.cli.options import option
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
@@ -42,7 +42,7 @@ _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads s
 @option(
     "--port",
     group="Viewer",
-    type=click.IntRange(0, 65535),
+    type=options.Whole(0, 65535),
     default=0,
     help="Port of this machine.  [default: a free one]",
 )
@@ -69,6 +69,8 @@ def command(**given: Any) -> None:
       jaxprt view bunny.ply --brdf metallic-roughness:base_color=.9/.6/.2,roughness=.3 --port 8080 --no-browser
     """  # noqa: D301
     check_port(given["port"])
+    if given["output"] is not None:
+        relight.make_folder(given["output"])
     made, lights = ready(SimpleNamespace(**given))
     server = _serve(made, lights, given["port"])
     click.echo(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it")

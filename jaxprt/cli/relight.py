@@ -47,14 +47,14 @@ SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
 @option(
     "--animate",
     group="Output",
-    type=click.IntRange(2),
+    type=options.Whole(2),
     metavar="N",
     help="Write N pictures with changing light, view and materials (dynamic).",
 )
 @option(
     "--table",
     group="Output",
-    type=click.IntRange(1),
+    type=options.Whole(1),
     metavar="N",
     help="Report errors of each system at several sizes, on N vertices of the first part.",
 )
@@ -160,7 +160,7 @@ def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
     if chosen.error is not None and chosen.saved is not None:
         raise click.UsageError("--plan has its own error: give --error or --plan, got both")
     if chosen.part is not None and "dynamic" in systems:
-        raise click.UsageError("--part needs systems other than dynamic")
+        raise click.UsageError("--part needs systems other than dynamic, got dynamic")
     return systems
 
 
@@ -189,8 +189,8 @@ def saved(folder: Path) -> Plan:
     return found
 
 
-def make_folder(path: Path) -> None:
-    """Creates the output folder, before anything is computed.
+def make_folder(path: Path, *, name: str = "--output") -> None:
+    """Creates the folder of the option `name`, before anything is computed.
 
     Raises:
         ValueError: The folder cannot be created or written to.
@@ -198,9 +198,9 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"--output must be a folder that can be made, got {path}: {error.strerror}") from error
+        raise ValueError(f"{name} must be a folder that can be made, got {path}: {error.strerror}") from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise ValueError(f"--output must be a folder that can be written to, got {path}")
+        raise ValueError(f"{name} must be a folder that can be written to, got {path}")
 
 
 def _share(

@@ -157,7 +157,7 @@ def _made(view: View, output: Path, **options: Any) -> Made:
     try:
         ready = relit.precompute(view.scene, path=output, **options)
     except ValueError as error:
-        raise ValueError(f"{error}; here: name another --output" if found else str(error)) from error
+        raise ValueError(f"{error}; on the command line, name another --output" if found else str(error)) from error
     direct = relit.RelitScene(ready.scene, ready.direct, ready.shading)
     cost = {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)}
     return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)

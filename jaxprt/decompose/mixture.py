@@ -166,7 +166,7 @@ def fit(
     Reference: Dempster, Laird, Rubin 1977; for the lobes Banerjee, Dhillon, Ghosh, Sra 2005.
     """
     if (fixed is None) != (weight is None):
-        raise ValueError("fixed densities and their weights must be given together")
+        raise ValueError("fixed densities and their weights must be given together, got only one of them")
     if fixed is None or weight is None:
         fixed, weight = jnp.zeros((len(sample), 0), sample.dtype), jnp.zeros(0, sample.dtype)
     extent = jnp.broadcast_to(jnp.asarray(extent, sample.dtype), mass.shape)

@@ -190,7 +190,7 @@ def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
     for mode in range(tensor.ndim):
         square = np.asarray(jnp.linalg.eigvalsh(gram(tensor, mode=mode)), np.float64)
         if not np.isfinite(square).all():
-            raise ValueError("the tensor must be finite, and is not")
+            raise ValueError("the tensor must be finite, got NaN or infinity")
         left = np.cumsum(np.maximum(square, 0))  # starting with the smallest
         result.append(max(1, len(square) - int(np.searchsorted(left, error**2 / tensor.ndim * left[-1], "right"))))
     return tuple(result)

@@ -259,7 +259,7 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
     except Exception as error:
         raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
     if found.get("format") != _FORMAT:
-        raise ValueError(f"{path} exists but is no store of this package; name another path")
+        raise ValueError(f"{path} exists but is not a store that jaxprt wrote; name another path")
     if found.get("version") != VERSION:
         raise ValueError(f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it")
     before, now = found.get("algorithm"), header.get("algorithm")
@@ -270,8 +270,10 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
         )
     differ = [key for key in header if found.get(key) != header[key]]
     if differ:
-        told = "; ".join(f"{key}: there {found.get(key)}, now {header[key]}" for key in differ)
-        raise ValueError(f"{path} holds arrays made from something else ({told}); name another path or delete it")
+        told = "; ".join(f"{key}: stored {found.get(key)}, now {header[key]}" for key in differ)
+        raise ValueError(
+            f"{path} holds arrays that were computed from other inputs ({told}); name another path or delete it"
+        )
     _check_near(path, found.get("near", {}), near)
     return str(found.get("key"))
 
@@ -309,7 +311,7 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
         distance = float(np.linalg.norm(np.subtract(now[2:], found[name][2:])))
         if not distance <= now[0] * norm:
             raise ValueError(
-                f"{path} holds arrays made from something else ({name}: there and now differ by "
+                f"{path} holds arrays that were computed from other inputs ({name}: stored and given values differ by "
                 f"{distance / (norm or 1):.2g} of the norm); name another path or delete it. Where it was factored or "
                 "traced again on another machine, save it there by jaxprt.files.save and load it here"
             )

@@ -183,7 +183,9 @@ def _read_exr(path: pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[st
     if any(found[name].xSampling != 1 or found[name].ySampling != 1 for name in names):
         raise ValueError(f"{path} must have all its channels at full resolution, got subsampled ones")
     if x0 > right or y0 > bottom or x1 < left or y1 < top:
-        raise ValueError(f"{path} must show some of its data, got the data window {x0}..{x1}, {y0}..{y1} outside")
+        raise ValueError(
+            f"{path} must have a data window that overlaps its display window, got {x0}..{x1}, {y0}..{y1} outside of it"
+        )
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -207,7 +207,9 @@ def _make(path: Path, node: dict[str, Any], arrays: list[Any]) -> Any:
         return {key: _make(path, each, arrays) for key, each in node["dict"].items()}
     if "function" in node:
         if node["function"] not in _FUNCTIONS:
-            raise ValueError(f"{path} names the function {node['function']!r}, which no object of this jaxprt holds")
+            raise ValueError(
+                f"{path} names the function {node['function']!r}, which this version of jaxprt does not save"
+            )
         return _function(node["function"])
     kind = _class(path, node["class"])
     if list(node["field"]) != _fields(kind):

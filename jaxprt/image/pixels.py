@@ -77,12 +77,12 @@ def shading_points(
     shape = fragments.triangle.shape
     if shape[:2] != (camera.height, camera.width) or shape[2:] not in ((), (4,)) or 0 in shape:
         raise ValueError(
-            f"the fragments must be of the camera's {camera.height} x {camera.width} pixels, at least one, with one "
-            f"sample or four in each, got {list(shape)}"
+            f"the fragments must have the camera's {camera.height} x {camera.width} pixels, with 1 or 4 samples each, "
+            f"got {list(shape)}"
         )
     concrete = not isinstance(fragments.triangle, Tracer)
     if concrete and (highest := int(np.max(fragments.triangle))) >= len(mesh.face):
-        raise ValueError(f"the fragments must be of the mesh's {len(mesh.face)} triangles, got triangle {highest}")
+        raise ValueError(f"the fragments must refer to the mesh's {len(mesh.face)} triangles, got triangle {highest}")
     projected, block = _projected(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
     uneven = jnp.zeros(len(mesh.face), bool) if uneven is None else uneven

@@ -334,7 +334,7 @@ def _draw(nearest: depths.Narrow | depths.Wide, drawn: Bool[Array, " f"], x, y, 
 
 
 def _running_sum(count: Int[Array, " n"] | Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Inclusive prefix sums of counts by products with triangular matrices, four times faster than XLA's on the CPU.
+    """Inclusive prefix sums of counts by products with triangular matrices, which are faster than XLA's on the CPU.
 
     Sums are exact to 2^24. Larger sums may be rounded or too small, but stay above 2^24.
     """

@@ -156,7 +156,7 @@ _product = jit(jnp.vdot)
 
 @functools.cache
 def _jaxopt() -> Any:
-    """The package jaxopt, imported at first use, because importing it takes half as long as importing jaxprt."""
+    """The package jaxopt, imported at first use, because the import is slow."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says that it is not developed further.
         import jaxopt

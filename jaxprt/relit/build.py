@@ -88,7 +88,10 @@ def precompute(
     if roughness is not None and not (len(roughness) == 2 and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
     if roughness is not None and system is None:
-        raise ValueError("roughness needs a system: the plan is for the materials that the scene has")
+        raise ValueError(
+            "roughness must be given together with a system, got no system: "
+            "a plan is made for the materials of the scene"
+        )
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():

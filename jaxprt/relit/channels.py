@@ -266,7 +266,8 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
     if _known(inside) and not np.all(np.asarray(inside)):
         raise ValueError(
             f"part {name!r} was precomputed for roughness from {low:.3f} to {high:.3f}, got a material from "
-            f"{jnp.min(new.roughness):.3f} to {jnp.max(new.roughness):.3f}: precompute it with a material of both"
+            f"{jnp.min(new.roughness):.3f} to {jnp.max(new.roughness):.3f}: precompute it with a material that covers "
+            "both ranges"
         )
     return fits & inside
 
@@ -349,8 +350,8 @@ def _warn_of_varying_anisotropy(name: str, surface: Surface) -> None:
     strength = np.asarray(surface.anisotropy)
     if np.ptp(strength) > _EQUAL:
         warnings.warn(
-            f"part {name!r} has a texture of anisotropy, from {strength.min():.2f} to {strength.max():.2f}; "
-            f"its mean {strength.mean():.2f} stands for it",
+            f"the anisotropy of part {name!r} varies from {strength.min():.2f} to {strength.max():.2f} over its "
+            f"texture, which is not supported: its mean {strength.mean():.2f} is used everywhere",
             stacklevel=3,
         )
 

@@ -134,7 +134,7 @@ def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, Point
     known = {} if lamp is None else {each.name: each for each in lamp.point_lights}
     for name, each in changed.items():
         if name not in known:
-            raise ValueError(f"point lights must be of those of the scene, {list(known)}, got one called {name!r}")
+            raise ValueError(f"point lights must be among those of the scene, {list(known)}, got one named {name!r}")
         now, then = each.position, known[name].position
         if isinstance(now, Tracer) or isinstance(then, Tracer):
             continue

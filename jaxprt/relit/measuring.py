@@ -172,7 +172,7 @@ def checked(environments: Sequence[Environment], error: float, rate: float) -> i
         require.kind(f"environment {number}", light, Environment, source="jaxprt.load_environment")
     shapes = sorted({str(list(light.radiance.shape)) for light in environments})
     if len(shapes) != 1 or environments[0].radiance.ndim != 4:
-        raise ValueError(f"environments must be of one size [6, n, n, c], got {', '.join(shapes)}")
+        raise ValueError(f"environments must all have the same size [6, n, n, c], got {', '.join(shapes)}")
     for number, light in enumerate(environments):
         require.finite(f"the radiance of environment {number}", light.radiance)
     for name, value in (("error", error), ("rate", rate)):
@@ -213,7 +213,7 @@ def _exact(visible, judged: np.ndarray, brdf: Callable, environments, views: np.
     seen, position, frame = jnp.asarray(visible.seen(judged)), visible.position[judged], visible.frame[judged]
     each = [reference.integrate(seen, position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
     exact = np.stack(each, 1)
-    require.finite("what the BRDF makes of the lights, by light, view, vertex and color,", exact)
+    require.finite("the radiance that the BRDF reflects, by light, view, vertex and color,", exact)
     return exact
 
 

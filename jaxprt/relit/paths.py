@@ -46,9 +46,9 @@ class Path(NamedTuple):
 def factored(shading: Shading) -> Path:
     """The factored BRDF with which a part sends reflected light to other parts.
 
-    Lobes too narrow for the resolution of the maps are widened: otherwise a mirror of roughness 0.05 would send 235
-    times the light it receives. Each channel is scaled to its true albedo. Widening is acceptable because the light
-    that arrives elsewhere is represented by low-order harmonics, which are wider still.
+    Lobes too narrow for the resolution of the maps are widened: otherwise a smooth metal would send many
+    times the light that it receives. Each channel is scaled to its true albedo. Widening is acceptable because the
+    light that arrives elsewhere is represented by low-order harmonics, which are wider still.
     """
     knot = _finer(shading.knot)
     members = [shading.brdf(jnp.asarray(each)) for each in knot[0]] if knot else [shading.brdf]

@@ -81,7 +81,7 @@ class PictureView(eqx.Module):
         """
         require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
         if environment.radiance.ndim != 4:
-            raise ValueError(f"a picture has one light [6, n, n, c], got {list(environment.radiance.shape)}")
+            raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
         blends = [each.appearance.blend for each in self.surface]
         arriving = finished(self.system.shade(self.system.light(environment), blends), between)
         if self.surface[0].reflecting is None:

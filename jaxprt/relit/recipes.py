@@ -281,5 +281,5 @@ def check(recipe: Recipe, shading: Shading) -> None:
         low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
         raise ValueError(
             f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
-            f"{high:.2f}: take the lobe or the harmonic system"
+            f"{high:.2f}: use the lobe or the harmonic system"
         )

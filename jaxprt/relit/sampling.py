@@ -189,7 +189,7 @@ def _judged(
         return np.stack(each, 1)
 
     exact, true = radiance(told), radiance(traced)
-    require.finite("what the BRDF makes of the lights, by light, view, point and color,", exact)
+    require.finite("the radiance that the BRDF reflects, by light, view, point and color,", exact)
     return facing, exact, max(relative_error(a[facing], b[facing]) for a, b in zip(exact, true, strict=True))
 
 

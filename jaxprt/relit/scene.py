@@ -224,8 +224,8 @@ class RelitScene(System):
             environment: One environment. It is also the background.
             camera: The camera; `self.camera` if None.
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
-            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes about
-                four times as long as 4, and matters where sharp highlights are smaller than a pixel.
+            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
+                than 4, and matters where sharp highlights are smaller than a pixel.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
@@ -251,8 +251,8 @@ class RelitScene(System):
         Args:
             camera: The camera; `self.camera` if None.
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
-            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes about
-                four times as long as 4, and matters where sharp highlights are smaller than a pixel.
+            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
+                than 4, and matters where sharp highlights are smaller than a pixel.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 
@@ -341,7 +341,7 @@ class RelitScene(System):
         known = {part.name: (part, each) for part, each in zip(self.scene.parts, self.shading, strict=True)}
         unknown = [name for name in materials if name not in known]
         if unknown:
-            raise ValueError(f"materials must be of the parts {list(known)}, got one of {unknown[0]!r}")
+            raise ValueError(f"materials must be for the parts {list(known)}, got one for {unknown[0]!r}")
         result = {}
         for name, given in materials.items():
             part, shading = known[name]
@@ -357,8 +357,8 @@ class RelitScene(System):
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
                 raise ValueError(
-                    f"part {name!r} was precomputed without emission, so that its light would not reach other parts: "
-                    "precompute the scene with a material that emits"
+                    f"part {name!r} was precomputed without emission, so light that it emits would not reach other "
+                    "parts: precompute the scene with a material that emits"
                 )
         return result
 

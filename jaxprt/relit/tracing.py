@@ -303,9 +303,9 @@ def _check(mesh: Mesh, part: SharpPart, points: Points | None, eye: Any, paramet
     wrong = [name for name, value in names.items() if not known(value)]
     if wrong:
         raise ValueError(
-            f"rays of sharp reflections must start from known places in known directions, but JAX traces {wrong[0]}: "
-            "make the view outside of jax.jit and jax.grad, by RelitScene.view or picture_view, or take "
-            "RelitScene.with_rays(0), which reflects by harmonics alone"
+            f"rays for sharp reflections need concrete values, but {wrong[0]} is traced by JAX: call RelitScene.view "
+            "or picture_view outside of jax.jit and jax.grad, or use RelitScene.with_rays(0), which computes all "
+            "reflections from harmonics"
         )
 
 

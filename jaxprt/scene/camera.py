@@ -51,7 +51,7 @@ class Camera(eqx.Module):
         if angle is not None and not np.all((angle > 0) & (angle < np.pi)):
             raise ValueError(f"the camera's field_of_view must be between 0 and pi, in radians, got {angle}")
         if eye is not None and target is not None and np.array_equal(eye, target):
-            raise ValueError(f"the camera's eye and target must be two places, got {eye} for both")
+            raise ValueError(f"the camera's eye and target must be different points, got {eye} for both")
 
 
 def orbit(

@@ -169,7 +169,9 @@ class TexturedMaterial(eqx.Module):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
         for name, value in vars(self).items():
             if name.endswith("_texture") and isinstance(value, np.ndarray | jax.Array):
-                raise TypeError(f"{name} of TexturedMaterial must be a Texture: jaxprt.scene.Texture(image)")
+                raise TypeError(
+                    f"{name} of TexturedMaterial must be a Texture, got an array: use jaxprt.scene.Texture(image)"
+                )
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 

@@ -162,8 +162,8 @@ def split(mesh: Mesh) -> list[Mesh]:
     mixed = np.flatnonzero((corner != corner[:, :1]).any(1))
     if mixed.size:
         raise ValueError(
-            f"the corners of a face must be in one region, got {mixed.size} faces of {len(face)} in several, "
-            f"the first is face {mixed[0]} in the regions {corner[mixed[0]].tolist()}"
+            f"the corners of a face must be in one region, got {mixed.size} of {len(face)} faces with corners in "
+            f"several, the first is face {mixed[0]} in the regions {corner[mixed[0]].tolist()}"
         )
     parts = []
     for number in np.unique(region):
@@ -189,7 +189,7 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     matrix = np.asarray(rotation, np.float64)
     same = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL)
     if not same or np.linalg.det(matrix) < 0:
-        raise ValueError(f"rotation must be a 3 x 3 matrix that turns and nothing else, got {matrix.tolist()}")
+        raise ValueError(f"rotation must be a 3 x 3 rotation matrix, got {matrix.tolist()}")
     place, normal, tangent = (
         jnp.matmul(each, jnp.asarray(matrix.T, each.dtype), precision="highest")
         for each in (mesh.position, mesh.normal, mesh.tangent)
@@ -323,8 +323,8 @@ def _check(position: np.ndarray, face: np.ndarray, region: np.ndarray, name: str
     wrong = np.flatnonzero(((face < 0) | (face >= len(position))).any(1))
     if wrong.size:
         raise ValueError(
-            f"{name}: faces must name vertices 0 to {len(position) - 1}, got {wrong.size} of {len(face)} faces "
-            f"that name others, the first is {face[wrong[0]].tolist()} at face {wrong[0]}"
+            f"{name}: faces must refer to vertices 0 to {len(position) - 1}, got {wrong.size} of {len(face)} faces "
+            f"that refer to others, the first is {face[wrong[0]].tolist()} at face {wrong[0]}"
         )
     wrong = np.flatnonzero(region < 0)
     if wrong.size:

@@ -18,11 +18,6 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
     therefore remains, a finely divided plane keeps little more than its rim, and most faces remain where the mesh is
     curved. The result is the same in every run and, up to rounding, at every scale of the mesh.
 
-    For the bunny and its ground (112,669 faces), 11,000 faces stay within 0.11 % of the bunny's diagonal from its
-    vertices, with a root mean square of 0.02 %. Rays then cost a fifth less, and triangles take a tenth of the memory.
-    Under Grace, radiance at the vertices of the full mesh changes by 2.6 % on the glossy bunny and by 0.6 % on the
-    ground.
-
     Args:
         mesh: The mesh to simplify. Degenerate faces and vertices without faces are removed.
         faces: Target number of faces. More remain if boundaries require them.
@@ -47,7 +42,7 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
     edge = position[np.asarray(mesh.face)[:, 1:]] - position[np.asarray(mesh.face)[:, :1]]
     solid = np.flatnonzero(np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1))
     if not solid.size:
-        raise ValueError(f"mesh must have faces with an area, got {len(edge)} without")
+        raise ValueError(f"mesh must have at least one face with an area above 0, got {len(edge)} faces without")
     corner = np.sort(place.reshape(-1)[np.asarray(mesh.face)[solid]], 1)
     _, alike, count = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
     twin = (count > 1)[alike.reshape(-1)]

@@ -49,7 +49,9 @@ class Part(eqx.Module):
         """Refuses a wrong type of name or mesh, a mesh without vertices, and arrays of other vertices."""
         if not isinstance(self.name, str):
             raise TypeError(f"the name of a part must be text, got {self.name!r}")
-        require.kind(f"the mesh of part {self.name!r}", self.mesh, Mesh, source="scene.make_mesh or load_mesh")
+        require.kind(
+            f"the mesh of part {self.name!r}", self.mesh, Mesh, source="jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
+        )
         count = len(self.mesh.position)
         if not count or not len(self.mesh.face):
             raise ValueError(
@@ -79,7 +81,7 @@ class Part(eqx.Module):
         Raises:
             TypeError: The material is a BRDF, which has no textures.
         """
-        require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="load_scene")
+        require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="jaxprt.load_scene")
         assert isinstance(self.material, TexturedMaterial)
         position, place, second = self.mesh.position, self.mesh.texture, self.second
         place = jnp.zeros((len(position), 2), position.dtype) if place is None else place
@@ -165,7 +167,7 @@ class Scene(eqx.Module):
         names = [each.name for each in (*self.parts, *self.point_lights)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"each part of a scene must have a name of its own, got several called {twice}")
+            raise ValueError(f"the parts of a scene must have different names, got several named {twice}")
 
     def __getitem__(self, name: str) -> Part:
         """The part with a given name.

@@ -102,7 +102,7 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     Reference: Pharr, Jakob, Humphreys 2023, "Physically Based Rendering", section 6.5.
     """
     if mesh.texture is None:
-        raise ValueError("the mesh must have texture coordinates, got none: `mesh.make_mesh` takes them")
+        raise ValueError("the mesh must have texture coordinates, got none: give them to `jaxprt.scene.mesh.make_mesh`")
     face = np.asarray(mesh.face)
     corner, place = (np.asarray(each, np.float64)[face] for each in (mesh.position, mesh.texture))
     edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
@@ -130,7 +130,7 @@ def handedness(mesh: Mesh) -> Float[np.ndarray, " v"]:
         ValueError: The mesh has no texture coordinates.
     """
     if mesh.texture is None:
-        raise ValueError("the mesh must have texture coordinates, got none: `mesh.make_mesh` takes them")
+        raise ValueError("the mesh must have texture coordinates, got none: give them to `jaxprt.scene.mesh.make_mesh`")
     face = np.asarray(mesh.face)
     place = np.asarray(mesh.texture, np.float64)[face]
     covered = np.linalg.det(place[:, 1:] - place[:, :1])

@@ -91,7 +91,7 @@ def to_local(frame: Float[Array, "*b 3 3"], direction: Float[Array, "d 3"]) -> F
     """Rotates world directions to every local frame.
 
     The products are written out by component, which XLA fuses with the code that uses the result. Its CPU code for a
-    matrix product with an inner dimension of three takes eight times as long.
+    matrix product with an inner dimension of three is much slower.
 
     Args:
         frame: Shading frames; rows are tangent, bitangent, normal.

@@ -341,7 +341,7 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
     if not isinstance(kept, Tracer) and not 0 <= np.asarray(kept) <= 1:
-        raise ValueError(f"the share of the squared Laplacian must be from 0 to 1, got {kept}")
+        raise ValueError(f"kept, the share of the squared Laplacian that remains, must be from 0 to 1, got {kept}")
     return _least_laplacian(coefficient, kept)
 
 

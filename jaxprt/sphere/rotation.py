@@ -76,7 +76,9 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
     if coefficient.ndim == 2:
         coefficient = coefficient[..., None]
     elif coefficient.shape[2:] != (count,):
-        raise ValueError(f"the last axis must count the {count} rotations, got the shape {coefficient.shape}")
+        raise ValueError(
+            f"the last axis must have one entry for each of the {count} rotations, got the shape {coefficient.shape}"
+        )
     return _rotated(coefficient, jnp.moveaxis(rotation, 0, -1))
 
 

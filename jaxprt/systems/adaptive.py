@@ -77,7 +77,7 @@ def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -
     wo = jnp.broadcast_to(wo, wi.shape).reshape(-1, 3)
     found = brdf(wi.reshape(-1, 3), wo)
     if jnp.ndim(found) != 2 or found.shape[0] != len(wo):
-        raise ValueError(f"the BRDF must return [{len(wo)}, c] here, got {list(jnp.shape(found))}")
+        raise ValueError(f"the BRDF must return [{len(wo)}, c] for {len(wo)} directions, got {list(jnp.shape(found))}")
     return found.reshape(*wi.shape[:-1], -1)
 
 
@@ -222,7 +222,7 @@ def _visit(fixed: tuple, colors: int) -> Callable:
 def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
     """Maximum over lights of light times weight.
 
-    Lights are processed one at a time, because the compiler's loop for a maximum over all takes ten times as long.
+    Lights are processed one at a time, because the compiler's loop for a maximum over all lights is much slower.
     """
 
     def step(most, each):

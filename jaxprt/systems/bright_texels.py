@@ -107,7 +107,7 @@ class BrightTexels(VertexSystem):
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, Visibility, source=source)
         if self.points is None:
-            require.length("the vertices of the visibility", self.visibility.position, self.system.vertices)
+            require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
@@ -233,7 +233,7 @@ def radiance(
 
 def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
     """Checks that texels and excess fit each other and the transport; returns the excess in floating point."""
-    require.length("the rows of the excess", excess, len(texel))
+    require.length("rows of the excess", excess, len(texel))
     require.finite("the excess", excess)
     require.within("the texels", texel, 0, 6 * transport.size**2 - 1)
     return jnp.asarray(excess, jnp.result_type(excess, transport.position))

@@ -100,7 +100,9 @@ def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignor
     """
     across = _mesh(devices)
     if not any("v" in axes for axes, _ in leaves(value)):
-        raise TypeError(f"only transports, systems and scenes of jaxprt have vertices, got {type(value).__name__}")
+        raise TypeError(
+            f"value must be a transport, system or scene of jaxprt, which have vertices, got {type(value).__name__}"
+        )
     even = jax.tree.map(lambda each: _even(each, across.size), value, is_leaf=lambda x: isinstance(x, VertexSystem))
     if not isinstance(value, System):
         _check_shares(value, across.size)
@@ -115,7 +117,7 @@ def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignor
 def _mesh(devices: Any) -> jax.sharding.Mesh:
     each = list(devices) if isinstance(devices, Sequence | np.ndarray) else [devices]
     if not each or not all(isinstance(one, jax.Device) for one in each) or len(set(each)) < len(each):
-        raise ValueError(f"the devices must be one or more different ones of {jax.devices()}, got {devices}")
+        raise ValueError(f"the devices must be one or more of {jax.devices()}, each at most once, got {devices}")
     return jax.sharding.Mesh(np.array(each), ("vertex",))
 
 
@@ -145,8 +147,8 @@ def _check_shares(value: PyTree, shares: int) -> None:
     for axes, leaf in leaves(value):
         if "v" in axes and leaf.shape[axes.index("v")] % shares:
             raise ValueError(
-                f"the transport's {leaf.shape[axes.index('v')]} vertices must divide by {shares} devices; "
-                "lay a system over them, which may have any number"
+                f"the number of vertices of a transport must be divisible by the {shares} devices, got "
+                f"{leaf.shape[axes.index('v')]}: distribute a system instead, which may have any number of vertices"
             )
 
 

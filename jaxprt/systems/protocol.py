@@ -140,7 +140,7 @@ class Blend(eqx.Module):
         require.finite("the weights of the blend", self.weight)
         for each in self.parameter:
             require.finite("the parameters of the blend", each)
-            require.length("the parameters of the blend", each, len(self.weight))
+            require.length("values of each parameter of the blend", each, len(self.weight))
 
     def check(self, vertices: int, channels: int) -> None:
         """Refuses a blend with another number of vertices or channels.
@@ -174,7 +174,7 @@ class Total(System):
         """Refuses systems of different vertices."""
         counts = [each.vertices for each in self.part]
         if len(set(counts)) != 1:
-            raise ValueError(f"systems must be one or more, of as many vertices, got {counts}")
+            raise ValueError(f"systems must be one or more with the same number of vertices, got {counts}")
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""

@@ -42,16 +42,16 @@ def take(value: Piece, start: int, stop: int) -> Piece:
     """
     start, stop = operator.index(start), operator.index(stop)
     if isinstance(value, System) and not isinstance(value, VertexSystem):
-        raise TypeError(f"ranges are of systems of one mesh, as the parts of RelitScene.system, got {_kind(value)}")
+        raise TypeError(f"value must be a system of one mesh, such as a part of RelitScene.system, got {_kind(value)}")
     if isinstance(value, VertexSystem) and value.points is not None:
-        raise TypeError(f"ranges are of systems at vertices, got {_kind(value)} at points")
+        raise TypeError(f"value must be a system at vertices, got {_kind(value)} at points")
     value = jax.tree.map(_bare, value, is_leaf=lambda each: isinstance(each, SparseTransport))
     every = list(leaves(value))
     counts = {leaf.shape[axes.index("v")] for axes, leaf in every if "v" in axes}
     if isinstance(value, Mesh) or len(counts) != 1:
-        raise TypeError(f"ranges are of transports and systems that have vertices, got {_kind(value)}")
+        raise TypeError(f"value must be a transport or a system with vertices, got {_kind(value)}")
     if any("p" in axes or "g" in axes for axes, _ in every):
-        raise TypeError(f"ranges are of transport without clusters, which a range would cut, got {_kind(value)}")
+        raise TypeError(f"value must have no clusters, because a range would cut them, got a {_kind(value)}")
     if not 0 <= start < stop <= max(counts):
         raise ValueError(f"the range must be within {max(counts)} vertices, got {start} to {stop}")
     if start % BLOCK and any("block" in axes for axes, _ in every):

@@ -86,7 +86,7 @@ def radiance(
     position, frame = np.asarray(position), np.asarray(frame)
     size = light.radiance.shape[-2]
     if isinstance(brdf, PerVertex) and brdf.vertices != len(position):
-        raise ValueError(f"the BRDF must be of the mesh's {len(position)} vertices, got {brdf.vertices}")
+        raise ValueError(f"the BRDF must have parameters for the mesh's {len(position)} vertices, got {brdf.vertices}")
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []

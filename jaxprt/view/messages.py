@@ -79,7 +79,7 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
         raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {light!r}")
     eye, target = (numbers(message, name, 3) for name in ("eye", "target"))
     if eye == target:
-        raise ValueError(f"eye and target must be two places, got {list(eye)} for both")
+        raise ValueError(f"eye and target must be different points, got {list(eye)} for both")
     return Look(
         system,
         light,
@@ -144,7 +144,9 @@ def unpack(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
             buffers.append(data[place : place + each])
             place += each + -each % 8
     except (struct.error, ValueError, KeyError, TypeError, RecursionError):
-        raise ValueError(f"a message must be what the viewer sends, got {len(data)} other bytes") from None
+        raise ValueError(
+            f"a message must have the binary form that the viewer sends, got {len(data)} bytes in another form"
+        ) from None
     return content, buffers
 
 
@@ -184,7 +186,7 @@ def _lamp(message: Any) -> Lamp:
         raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {message!r}")
     direction = numbers(message, "direction", 3)
     if not 1e-6 < math.hypot(*direction) < 1e6:
-        raise ValueError(f"the direction of a lamp must have a length, got {list(direction)}")
+        raise ValueError(f"the direction of a lamp must have a length between 1e-6 and 1e6, got {list(direction)}")
     return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, low=0.0, high=1e9))
 
 
@@ -196,7 +198,9 @@ def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], .
 
 def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     if not isinstance(message, Mapping) or not set(message) <= set(MATERIAL):
-        raise ValueError(f"the material of part {part!r} must have some of {', '.join(MATERIAL)}, got {message!r}")
+        raise ValueError(
+            f"the material of part {part!r} must be a dictionary with keys among {', '.join(MATERIAL)}, got {message!r}"
+        )
     result = []
     for name in sorted(message):
         count, most = MATERIAL[name]

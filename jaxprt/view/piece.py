@@ -119,7 +119,7 @@ def export(
             path.write_bytes(page)
             return Piece(path, least, size.edge, texels, size.degree, error)
     raise ValueError(
-        f"most must be at least about the {least} bytes of the scene with its coarsest visibility, got {most}"
+        f"most must be at least about {least} bytes, the size of the page with the coarsest visibility, got {most}"
     )
 
 

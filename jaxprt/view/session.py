@@ -70,7 +70,7 @@ class Session:
         shape = [(part.name, part.mesh.position.shape) for part in scene.scene.parts]
         for name, each in every.items():
             if [(part.name, part.mesh.position.shape) for part in each.scene.parts] != shape:
-                raise ValueError(f"systems must be of one scene, got another one for {name!r}")
+                raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
         lights = _named(lights_of(scene.scene)) if environments is None else dict(environments)
         _check_lights(lights)
         self.stages = Stages(every, lights)

@@ -86,7 +86,7 @@ class Stages:
         parts = {part.name: part for part in self.scene.scene.parts}
         unknown = [name for name, _ in look.material if name not in parts]
         if unknown:
-            raise ValueError(f"materials must be of the parts {', '.join(parts)}, got one of {unknown[0]!r}")
+            raise ValueError(f"materials must be for the parts {', '.join(parts)}, got one for {unknown[0]!r}")
         return {name: changed(parts[name].material, name, dict(values)) for name, values in look.material if values}
 
     def appearances(self, look: Look) -> dict[str, Appearance]:
@@ -232,7 +232,7 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
             new["specular"] = _tinted(material.specular, 1.0, values)
         return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
-        raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change while it is looked at")
+        raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change in the viewer")
     new: dict[str, Any] = {}
     if "roughness" in values:
         new["roughness"] = values["roughness"]

@@ -155,7 +155,7 @@ def compute(
         if left:
             raise UnfinishedError(
                 f"part {part.number}/{part.count} of {store.path} is done; {left} of its {blocks} blocks are missing: "
-                "run the other parts, then the same once more without a part"
+                "run the other parts, then run again without a part"
             )
     return {name: store.whole(name, count) for name, count in counts.items()}
 
@@ -218,7 +218,10 @@ def _run(job, todo, keep, store, executor, bar) -> None:
             if array is not None:
                 keep(block, array)
             elif not here and store.read(block) is None:
-                raise OSError(f"{store.path} lacks block {block} that a worker wrote: is it one folder everywhere?")
+                raise OSError(
+                    f"{store.path} lacks block {block} that a worker wrote: "
+                    "the path must be the same shared folder for all workers"
+                )
             rays += count
             bar.update(_count(job, block))
             if rays:

@@ -34,7 +34,8 @@ class Occluder:
         self.diagonal = float(np.linalg.norm(high.astype(np.float64) - low)) or 1.0
         if not _SMALLEST <= self.diagonal <= _LARGEST:
             raise ValueError(
-                f"what casts shadows must be {_SMALLEST:g} to {_LARGEST:g} units across, got {self.diagonal:.3g}: "
+                f"the bounding box of an occluder must have a diagonal of {_SMALLEST:g} to {_LARGEST:g} units, "
+                f"got {self.diagonal:.3g}: "
                 "scale it"
             )
         # Far from the origin, the spacing of float32 is larger than this share of the diagonal.
@@ -144,4 +145,6 @@ def check(mesh: Mesh, name: str) -> None:
     face = np.asarray(mesh.face)
     low, high = int(face.min()), int(face.max())
     if low < 0 or high >= len(mesh.position):
-        raise ValueError(f"faces of the {name} must name vertices 0 to {len(mesh.position) - 1}, got {low} to {high}")
+        raise ValueError(
+            f"faces of the {name} must refer to vertices 0 to {len(mesh.position) - 1}, got {low} to {high}"
+        )

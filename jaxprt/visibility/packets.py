@@ -1,7 +1,7 @@
 """Shadow rays in packets of sixteen, traced by the Embree library that embreex ships.
 
 embreex traces rays one at a time. Sixteen rays with nearby origins and similar directions visit the same nodes of
-Embree's BVH. Traced as a packet they take less than half the time and give identical results.
+Embree's BVH. Traced as a packet they are faster and give identical results.
 """
 
 import ctypes
@@ -77,7 +77,7 @@ class Packets:
         library.rtcCommitScene(self._scene)
         if code := library.rtcGetDeviceError(device):
             raise (MemoryError if code == _OUT_OF_MEMORY else RuntimeError)(
-                f"Embree must take a scene of {len(position)} vertices and {len(face)} triangles, got its error {code}"
+                f"Embree failed for a scene of {len(position)} vertices and {len(face)} triangles, error code {code}"
             )
         self._context = np.full(WIDTH, _NONE, np.uint32)
         # RTCOccludedArguments: flags and features, 32 bits each; context; filter; callback.

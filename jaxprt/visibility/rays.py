@@ -133,7 +133,7 @@ def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
     named = vertex.ndim == 1 and vertex.dtype.kind in "iu" and np.all((vertex >= -count) & (vertex < count))
     if not mask and not named:
         raise ValueError(
-            f"vertex must be a mask [{count}] or whole numbers below {count} in one row, got {vertex.dtype} "
+            f"vertex must be a mask [{count}] or a 1-D array of indices below {count}, got {vertex.dtype} "
             f"{vertex.shape}: {np.array2string(vertex, threshold=4)}"
         )
     return number[vertex]

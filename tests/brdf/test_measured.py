@@ -201,7 +201,7 @@ def test_files_that_are_not_merl_are_refused(tmp_path, content, message):
 
 def test_merl_files_without_a_number_are_refused(tmp_path):
     plane = np.full((3, *MERL), -1.0)
-    with pytest.raises(ValueError, match=r"must hold a cell with no negative value, got none of 1458000"):
+    with pytest.raises(ValueError, match=r"must hold at least one cell without a negative value, got none of 1458000"):
         load_merl(write(tmp_path / "empty.binary", plane))
     plane[2, 5, 6, 7] = np.nan
     with pytest.raises(ValueError, match=r"finite, got 1 that are not, the first .* \(2, 5, 6, 7\): nan"):

@@ -143,9 +143,9 @@ def nearest(plane, spot, samples=4000):
 
 @pytest.mark.parametrize("coordinate", [0.3, [0.3], [0.3, 0.1, 0.1], [[0.3, 0.1]]])
 def test_a_place_in_a_plane_has_two_coordinates(coordinate, unchecked):
-    with pytest.raises(ValueError, match="a point of this set has two coordinates not an array of shape"):
+    with pytest.raises(ValueError, match="a point of this set must be two coordinates, got an array of shape"):
         cook_torrance().navigation.weight(coordinate)
-    with pytest.raises(ValueError, match="a point of this set has one coordinate, a number, not an array of shape"):
+    with pytest.raises(ValueError, match="a point of this set must be one number, got an array of shape"):
         Line(jnp.array([1.0, 2.0])).weight([1.5])
 
 

@@ -109,8 +109,8 @@ def half_cosine():
     ("text", "words"),
     [
         (NGAN.format(model="NganHe", more="roughness = 1"), "must be one of NganBlinnPhong, .* got NganHe"),
-        (NGAN.format(model="NganWardDuer", more="sharpness = 1"), "must have the numbers of NganWardDuer: 'roughness'"),
-        ("nothing", "lines must be like"),
+        (NGAN.format(model="NganWardDuer", more="sharpness = 1"), "must fit its model NganWardDuer: 'roughness'"),
+        ("nothing", "must have lines such as"),
     ],
 )
 def test_other_fits_are_refused(tmp_path, text, words):
@@ -118,7 +118,7 @@ def test_other_fits_are_refused(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(ValueError, match=words):
         prt.brdf.load_ngan(path, "a-metal")
-    with pytest.raises(ValueError, match=r"one of 2 names such as a-metal.* got 'a-meta'|must be like"):
+    with pytest.raises(ValueError, match=r"one of 2 names such as a-metal.* got 'a-meta'|must have lines such as"):
         prt.brdf.load_ngan(path, "a-meta")
 
 

@@ -94,6 +94,32 @@ def test_exports_that_cannot_be_written_are_refused_before_anything_is_computed(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("name", "reason"), [("file/probes.json", "Not a directory"), ("x" * 300 + ".json", "File name")]
+)
+def test_an_export_to_a_place_that_cannot_be_written_names_it_and_the_reason(
+    name, reason, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(inputs, "lights", None)
+    (tmp_path / "file").write_text("precious")
+    fine, path = tmp_path / "fine.json", tmp_path / name
+    assert main(["export", "--output", str(fine), "--output", str(path)]) == 1
+    assert f"Error: --output must be a file that can be written, got {path}: {reason}" in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "precious"
+    assert not fine.exists()
+
+
+def test_folders_that_cannot_be_made_are_refused_before_anything_is_computed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(inputs, "lights", None)
+    monkeypatch.setattr(inputs, "scene", None)
+    (tmp_path / "file").write_text("precious")
+    within = str(tmp_path / "file" / "within")
+    assert main(["export", "--output", str(tmp_path / "piece.html"), "--store", within]) == 2
+    assert f"--store must be a folder that can be made, got {within}: Not a directory" in capsys.readouterr().err
+    assert main(["view", "--output", within]) == 2
+    assert f"--output must be a folder that can be made, got {within}: Not a directory" in capsys.readouterr().err
+
+
 def test_the_page_of_files_is_served(place, monkeypatch, capsys):
     monkeypatch.setattr(inputs.builtin, "daylight", None)
     opened = []
@@ -131,8 +157,8 @@ def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        (["--lobes", "0"], "'--lobes': 0 is not in the range 1<=x<=64"),
-        (["--port", "70000"], "'--port': 70000 is not in the range 0<=x<=65535"),
+        (["--lobes", "0"], "'--lobes': must be a whole number from 1 to 64, got 0"),
+        (["--port", "70000"], "'--port': must be a whole number from 0 to 65535, got 70000"),
         (["--ground"], "--ground needs a mesh"),
         (["nothing.obj"], "nothing.obj"),
         (["nothing.exr"], "nothing.exr"),

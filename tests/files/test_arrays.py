@@ -171,9 +171,12 @@ def test_arrays_whose_headers_are_damaged_are_refused(path, content):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"header": {"keep": 4}}, r"a\.prt holds arrays made from something else \(keep: there 3, now 4\)"),
-        ({"header": {"system": "other"}}, r"\(system: there test, now other\)"),
-        ({"header": {"more": 1}}, r"\(more: there None, now 1\)"),
+        (
+            {"header": {"keep": 4}},
+            r"a\.prt holds arrays that were computed from other inputs \(keep: stored 3, now 4\)",
+        ),
+        ({"header": {"system": "other"}}, r"\(system: stored test, now other\)"),
+        ({"header": {"more": 1}}, r"\(more: stored None, now 1\)"),
     ],
 )
 def test_stores_of_something_else_are_refused(path, change, message):
@@ -183,7 +186,7 @@ def test_stores_of_something_else_are_refused(path, change, message):
 
 
 def test_stores_with_another_number_of_blocks_are_refused(path):
-    with pytest.raises(ValueError, match=r"blocks: there 5, now 6"):
+    with pytest.raises(ValueError, match=r"blocks: stored 5, now 6"):
         BlockStore(path, HEADER, LAYOUT, 6)
 
 
@@ -331,7 +334,7 @@ def test_stores_compare_sketches_up_to_rounding_and_headers_by_the_version_of_th
     open_store(path, header=header, near=near)
     open_store(path, header=header, near={"brdf": arrays.sketch(np.nextafter(value, 2))})
     for wrong in (1.01 * value, np.full(99, np.nan, np.float32)):
-        with pytest.raises(ValueError, match=r"made from something else \(brdf: there and now differ by"):
+        with pytest.raises(ValueError, match=r"computed from other inputs \(brdf: stored and given values differ by"):
             open_store(path, header=header, near={"brdf": arrays.sketch(wrong)})
     with pytest.raises(ValueError, match=r"must have sketches of \[\], got \['brdf'\]"):
         open_store(path, header=header)

@@ -436,7 +436,7 @@ def test_fits_inside_transformations_are_refused_by_name(shaded):
         ({"prior": 0.1}, TypeError, "the prior must be a function, got float"),
         ({"prior": lambda x: x["a"] * jnp.ones(2)}, ValueError, r"the prior must be one number .* got .*shape=\(2,\)"),
         ({"prior": lambda x: None}, ValueError, "the prior must be one number of floating point, got None"),
-        ({"prior": inverse.smoothness}, ValueError, r"of texels, \[6, n, n, c\], got dict: of an Environment"),
+        ({"prior": inverse.smoothness}, ValueError, r"of texels, \[6, n, n, c\], got dict: for an Environment"),
         ({"lower": {"a": 0.0}}, ValueError, "one number, or made like the start"),
         ({"lower": {"a": "red", "b": 0.0}}, ValueError, r"a bound must be a number, None, or .* \[\], got <U3"),
         ({"lower": [0.0, 0.0]}, ValueError, "one number, or made like the start"),

@@ -235,9 +235,7 @@ def test_a_texture_of_anisotropy_counts_as_its_mean_and_says_so():
     texel = np.full((ROWS, COLUMNS, 3), 0.5, np.float32)
     texel[..., 0], texel[..., 2] = 1.0, np.linspace(0, 1, COUNT).reshape(ROWS, COLUMNS)
     part = patch(TexturedMaterial(anisotropy=0.8, anisotropy_texture=Texture(jnp.asarray(texel))))
-    with pytest.warns(
-        UserWarning, match=r"part 'patch' has a texture of anisotropy, from 0\.00 to 0\.80; its mean 0\.40"
-    ):
+    with pytest.warns(UserWarning, match=r"anisotropy of part 'patch' varies from 0\.00 to 0\.80 .* its mean 0\.40"):
         shading = of_part(part)
     np.testing.assert_allclose(shading.exact.model.anisotropy, 0.4, rtol=1e-6)
 

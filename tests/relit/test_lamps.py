@@ -128,10 +128,10 @@ def test_what_was_not_precomputed_is_refused():
             "'floor' was precomputed without emis",
         ),
         ({"bulb": PointLight("bulb", [0, 1, 0], 1.0)}, "point light 'bulb' was traced from"),
-        ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be of those of the scene, \['bulb'\]"),
+        ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be among those of the scene, \['bulb'\]"),
     ]
     for materials, message in given:
         with pytest.raises(ValueError, match=message):
             relit().radiance(DARK, eye=EYE, materials=materials)
-    with pytest.raises(ValueError, match="several called"):
+    with pytest.raises(ValueError, match="several named"):
         Scene(scene().parts, point_lights=[PointLight("floor", [0, 1, 0])])

@@ -295,7 +295,7 @@ def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(scene)
 
 def test_a_brdf_that_is_not_finite_has_no_plan(scene, sky):
     broken = prt.Scene([prt.Part("broken", scene["ball"].mesh, lambda wi, wo: jnp.nan * wi[..., :1])])
-    with pytest.raises(ValueError, match=r"what the BRDF makes of the lights, .* must be finite, got"):
+    with pytest.raises(ValueError, match=r"the radiance that the BRDF reflects, .* must be finite, got"):
         prt.plan(broken, environments=[sky], progress=False)
 
 

@@ -389,7 +389,7 @@ def test_a_second_call_with_the_same_folder_traces_nothing(tmp_path, monkeypatch
     np.testing.assert_array_equal(second.radiance(light(), eye=EYE), first.radiance(light(), eye=EYE))
     monkeypatch.undo()
     moved = eqx.tree_at(lambda each: each.parts[1].mesh.position, scene(), mesh("ball").position + 0.1)
-    message = r"0_floor_lobe\.prt holds arrays made from something else .* name another path or delete it"
+    message = r"0_floor_lobe\.prt holds arrays that were computed from other inputs .* name another path or delete it"
     with pytest.raises(ValueError, match=message):
         prt.precompute(moved, path=tmp_path / "kept" / "scene", **options)
 
@@ -434,7 +434,7 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for rough in ((0.5, 0.1), (-0.1, 0.2), (0.1, 1.2), (0.1,), (float("nan"), 1.0)):
         with pytest.raises(ValueError, match="roughness must be two numbers from 0 to 1, the smaller one first, got"):
             prt.precompute(scene(), system="harmonic", roughness=rough)
-    with pytest.raises(ValueError, match="roughness needs a system"):
+    with pytest.raises(ValueError, match="roughness must be given together with a system"):
         prt.precompute(scene(), roughness=(0.1, 0.5))
     with pytest.raises(ValueError, match="bounces must be at least 0, got -1"):
         prt.precompute(scene(), system="harmonic", bounces=-1)
@@ -449,7 +449,7 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
 
 MATERIALS = {
     "list": ([wood()], TypeError, "the materials must be a dictionary from names of parts to materials, got list"),
-    "unknown": ({"roof": wood()}, ValueError, "of the parts ['floor', 'ball', 'wall'], got one of 'roof'"),
+    "unknown": ({"roof": wood()}, ValueError, "for the parts ['floor', 'ball', 'wall'], got one for 'roof'"),
     "kind": (
         {"floor": GLOSSY},
         TypeError,
@@ -477,9 +477,9 @@ def test_lights_eyes_and_cameras_of_another_kind_are_refused():
     for call in (ready.light, functools.partial(ready.radiance, eye=EYE), ready.picture):
         with pytest.raises(TypeError, match=r"the light must be of class Environment, which jaxprt\.scene\.load_env"):
             call(light().radiance)
-    with pytest.raises(ValueError, match="must have the transport's 8 texels, got 16"):
+    with pytest.raises(ValueError, match="texels along an edge as the transport's, 8, got 16"):
         ready.radiance(Environment(jnp.ones((6, 16, 16, 3))), eye=EYE)
-    with pytest.raises(ValueError, match=r"a picture has one light \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
+    with pytest.raises(ValueError, match=r"a picture needs one light \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
         ready.picture(Environment(jnp.ones((2, 6, SIZE, SIZE, 3))))
     with pytest.raises(TypeError, match="the camera must be of class Camera"):
         ready.picture(light(), EYE)

@@ -127,9 +127,9 @@ def test_points_pictures_and_programs_agree_with_the_vertices(close):
     close(whole[: len(face)][apart], np.asarray(color)[vertex[apart]], tolerance=0.02)
     # The eye is known inside of programs too, unless it is an argument.
     close(jax.jit(lambda each: ready.radiance(Environment(each), eye=EYE))(light().radiance), color, tolerance=1e-4)
-    with pytest.raises(ValueError, match=re.escape("but JAX traces the eye: make the view outside of jax.jit")):
+    with pytest.raises(ValueError, match=re.escape("but the eye is traced by JAX: call RelitScene.view")):
         jax.jit(lambda eye: ready.radiance(light(), eye=eye))(EYE)
-    with pytest.raises(ValueError, match="but JAX traces the eye"):
+    with pytest.raises(ValueError, match="but the eye is traced by JAX"):
         jax.grad(lambda eye: jnp.sum(ready.radiance(light(), eye=eye)))(EYE)
     assert np.isfinite(jax.jit(lambda eye: ready.with_rays(0).radiance(light(), eye=eye))(EYE)).all()
 

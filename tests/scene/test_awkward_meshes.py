@@ -152,7 +152,7 @@ def test_a_missing_file_and_an_unknown_kind_are_told_apart(tmp_path):
         ("far.obj", "f 1 2 3\nf 1 2 9\n", r"far\.obj: faces .* the vertices 1 to 3, got 1 of 2 .* 'f 1 2 9' in line 5"),
         ("zero.obj", "f 0 1 2\n", r"zero\.obj: faces .* got 1 of 1 .* 'f 0 1 2' in line 4"),
         ("back.obj", "f -1 -2 -4\n", r"back\.obj: .* 'f -1 -2 -4' in line 4"),
-        ("cut.obj", "f 1 2 3\nf 1 2", r"cut\.obj: faces must name three or more .* 'f 1 2' in line 5"),
+        ("cut.obj", "f 1 2 3\nf 1 2", r"cut\.obj: faces must refer to three or more .* 'f 1 2' in line 5"),
         ("word.obj", "f 1 2 x\n", r"word\.obj: .* 'f 1 2 x' in line 4"),
         ("nan.obj", "v nan 0 0\nf 1 2 4\n", r"nan\.obj: positions must be finite, got 1 of 3 .* at vertex 2"),
         ("points.obj", "", r"points\.obj must hold vertices and faces, got no faces"),
@@ -172,7 +172,7 @@ def test_a_ply_whose_faces_name_missing_vertices_is_refused(tmp_path):
         "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 1 7\n"
     )
-    with pytest.raises(ValueError, match=r"far\.ply: faces must name vertices 0 to 2, got 1 of 2 .* \[0, 1, 7\]"):
+    with pytest.raises(ValueError, match=r"far\.ply: faces must refer to vertices 0 to 2, got 1 of 2 .* \[0, 1, 7\]"):
         load_mesh(path)
 
 

@@ -108,7 +108,7 @@ def test_places_and_angles_that_are_not_finite_are_refused_by_name_unless_they_a
     [
         ({"field_of_view": 0.0}, "field_of_view must be between 0 and pi, in radians, got 0"),
         ({"field_of_view": 45.0}, "field_of_view must be between 0 and pi, in radians, got 45"),
-        ({"target": [1.0, 2, 3]}, "eye and target must be two places"),
+        ({"target": [1.0, 2, 3]}, "eye and target must be different points"),
         ({"width": 0}, "width must be a whole number of pixels, at least 1, got 0"),
         ({"height": -3}, "height must be a whole number of pixels, at least 1, got -3"),
         ({"width": 32.0}, r"width must be a whole number of pixels, at least 1, got 32\.0"),

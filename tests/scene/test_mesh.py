@@ -116,7 +116,9 @@ def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_fractions(tmp_path, 
 def test_faces_that_name_missing_texture_coordinates_are_loaded_without_them_and_a_warning_says_so(tmp_path, index):
     lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 -1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl sound\nf 1/1/1 2/2/1 3/3/1\n"
     damaged = f"usemtl damaged\nf 1/1/1 2/{index}/1 3/3/1\n"
-    with pytest.warns(UserWarning, match=r"missing.obj: faces should name .* 1 to 3 or none, got 1 of 2 .* in line 11"):
+    with pytest.warns(
+        UserWarning, match=r"missing.obj: faces should refer to .* 1 to 3 or none, got 1 of 2 .* in line 11"
+    ):
         mesh = load_mesh(write(tmp_path, "missing.obj", lines + damaged))
     place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_array_equal(mesh.position, np.concatenate([place, place]))
@@ -219,10 +221,10 @@ def test_arrays_come_out_in_single_precision(x64):
     [
         ({"position": np.zeros((0, 3))}, "hat must hold vertices and faces, got 0 vertices and 2 faces"),
         ({"face": np.zeros((0, 3), int)}, "hat must hold vertices and faces, got 4 vertices and 0 faces"),
-        ({"face": np.array([[0, 1, 2], [0, 1, 4]])}, r"name vertices 0 to 3, got 1 of 2 .* \[0, 1, 4\] at face 1"),
+        ({"face": np.array([[0, 1, 2], [0, 1, 4]])}, r"refer to vertices 0 to 3, got 1 of 2 .* \[0, 1, 4\] at face 1"),
         (
             {"face": np.array([[0, -1, 2], [0, 1, 2**40]])},
-            r"got 2 of 2 faces that name others.* \[0, -1, 2\] at face 0",
+            r"got 2 of 2 faces that refer to others.* \[0, -1, 2\] at face 0",
         ),
         (
             {"position": SQUARE + np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, np.inf], [0, 0, 0]])},
@@ -282,7 +284,7 @@ def test_lists_make_a_mesh(close):
     ],
 )
 def test_only_rotations_turn_a_mesh(matrix):
-    with pytest.raises(ValueError, match="rotation must be a 3 x 3 matrix that turns and nothing else, got"):
+    with pytest.raises(ValueError, match="rotation must be a 3 x 3 rotation matrix, got"):
         rotate(make_mesh(SQUARE, SQUARE_FACE), matrix)
 
 

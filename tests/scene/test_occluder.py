@@ -180,7 +180,7 @@ def test_faces_without_area_and_vertices_without_faces_are_left_out(sphere):
     simple = simplify(mesh, faces=300)
     assert np.abs(np.asarray(simple.position)).max() < 1.1
     np.testing.assert_array_equal(edges(simple), 2)
-    with pytest.raises(ValueError, match="mesh must have faces with an area, got 5 without"):
+    with pytest.raises(ValueError, match="mesh must have at least one face with an area above 0, got 5"):
         simplify(make_mesh(np.zeros((3, 3)), np.zeros((5, 3), int)), faces=4)
 
 

@@ -80,7 +80,7 @@ def test_the_parameters_of_a_part_are_those_at_its_vertices(close):
         (
             lambda: Scene([Part(name, BALL, brdf.Lambert()) for name in ("a", "b", "a")]),
             ValueError,
-            r"each part of a scene must have a name of its own, got several called \['a'\]",
+            r"the parts of a scene must have different names, got several named \['a'\]",
         ),
         (
             lambda: Scene(scene()["ball"]),

@@ -69,7 +69,7 @@ def test_what_is_of_another_kind_is_refused_by_the_function_that_makes_what_is_n
     ],
 )
 def test_tables_whose_values_hold_the_cosine_do_not_pass_for_brdfs(refused):
-    with pytest.raises(TypeError, match="those of HarmonicBrdf hold the cosine"):
+    with pytest.raises(TypeError, match="got a HarmonicBrdf, whose values include the cosine"):
         refused()
 
 

@@ -484,7 +484,7 @@ def test_a_transport_is_laid_over_devices_where_its_vertices_divide():
     laid = prt.shard(transport, devices(3))
     coefficient = jnp.asarray(np.random.default_rng(3).normal(size=(6 * SIZE**2, 3)), jnp.float32)
     np.testing.assert_allclose(laid.apply(coefficient), transport.apply(coefficient), rtol=1e-5, atol=1e-6)
-    with pytest.raises(ValueError, match="the transport's 3 vertices must divide by 4 devices"):
+    with pytest.raises(ValueError, match="must be divisible by the 4 devices, got 3"):
         prt.shard(transport, devices(4))
 
 
@@ -492,7 +492,7 @@ def test_a_transport_is_laid_over_devices_where_its_vertices_divide():
 def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
     system, here = made("lobe", "triangle").system, jax.devices()[0]
     for wrong in ([], "cuda", ["cuda:0"], [here, here], 4, None):
-        with pytest.raises(ValueError, match=r"devices must be one or more different ones of \["):
+        with pytest.raises(ValueError, match=r"devices must be one or more of \["):
             prt.shard(system, wrong)
     with pytest.raises(TypeError, match="have vertices, got Environment"):
         prt.shard(light(), [here])
@@ -612,7 +612,7 @@ def test_lights_of_another_size_are_refused(name):
 def test_only_systems_are_relit():
     with pytest.raises(TypeError, match=r"system must be one of jaxprt, such as .*, got SparseTransport"):
         prt.radiance(made("separable").system.transport, light(), eye=EYE)
-    with pytest.raises(ValueError, match=r"as many vertices, got \[3, 101\]"):
+    with pytest.raises(ValueError, match=r"the same number of vertices, got \[3, 101\]"):
         prt.total(made("lobe", "triangle").system, made("lobe").system)
     with pytest.raises(ValueError, match="at least one"):
         prt.radiance(made("lobe").system, Environment(jnp.ones((0, 6, SIZE, SIZE, 3))), eye=EYE)

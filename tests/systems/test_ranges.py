@@ -80,7 +80,7 @@ def test_ranges_beyond_the_vertices_empty_or_within_a_block_are_refused(sparse, 
 def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
     clustered = separable.clustered.precompute(seen, brdf, progress=False, keep=20)
     for value, name in ((brdf, "SeparableBrdf"), (clustered, "ClusteredTransport")):
-        with pytest.raises(TypeError, match=f"ranges are of .*, got {name}"):
+        with pytest.raises(TypeError, match=f"value must .*, got (a )?{name}"):
             ranges.take(value, 0, 3)
 
 
@@ -100,5 +100,5 @@ def test_what_is_no_system_of_one_mesh_has_no_ranges(sparse, brdf):
     system = separable.SeparableSystem(sparse, brdf)
     points = prt.scene.points.on_triangles(mesh.face, np.array([0, 1]), np.full((2, 3), 1 / 3, np.float32))
     for value in (mesh, prt.systems.protocol.Joined((system, system)), system.at(points)):
-        with pytest.raises(TypeError, match="ranges are of"):
+        with pytest.raises(TypeError, match="value must be a"):
             ranges.take(value, 0, 2)

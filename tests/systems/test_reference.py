@@ -111,7 +111,7 @@ def test_vertices_may_be_chosen_by_a_mask(mesh, random):
     "vertex", [np.array(3), np.zeros((2, 2), int), np.zeros(5, bool), np.array([0.0]), np.array([999])]
 )
 def test_vertices_that_cannot_be_are_refused(mesh, random, vertex):
-    with pytest.raises(ValueError, match=r"vertex must be a mask .* or whole numbers below"):
+    with pytest.raises(ValueError, match=r"vertex must be a mask .* or a 1-D array of indices below"):
         reference.radiance(mesh, GLOSSY, some_light(random), eye=EYE, vertex=vertex)
 
 
@@ -193,7 +193,7 @@ def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
 
 @pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
 def test_values_without_one_row_per_direction_are_refused(mesh, random, value):
-    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] here, got \["):
+    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] for 384 directions, got \["):
         reference.radiance(mesh, value, some_light(random), eye=EYE)
 
 

@@ -248,7 +248,7 @@ def test_matte_scene_needs_no_visibility(browser, lights, look, tmp_path):
 def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
     smaller = view.export(systems["lobes"], tmp_path / "a.html", environments=lights, most=made.nbytes - 2000)
     assert smaller.edge == 1
-    with pytest.raises(ValueError, match="bytes of the scene with its coarsest visibility, got 1000"):
+    with pytest.raises(ValueError, match="the size of the page with the coarsest visibility, got 1000"):
         view.export(systems["lobes"], tmp_path / "b.html", environments=lights, most=1000)
 
 

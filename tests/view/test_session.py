@@ -249,12 +249,15 @@ WRONG = {
     "turn": ({"turn": float("nan")}, "turn must be a finite number, got nan"),
     "text": ({"turn": "1"}, "turn must be a finite number, got '1'"),
     "eye": ({"eye": [0, 0]}, "eye must be 3 numbers, got 2"),
-    "target": ({"target": [2.0, 1.5, 4.0]}, "eye and target must be two places"),
+    "target": ({"target": [2.0, 1.5, 4.0]}, "eye and target must be different points"),
     "angle": ({"field_of_view": 4}, "field_of_view must be from 0.001 to"),
     "size": ({"kind": "still", "width": 0, "height": 4}, "width must be from 1 to 2048, got 0"),
-    "part": ({"materials": {"cat": {"f0": 0.1}}}, "materials must be of the parts ball, ground, got one of 'cat'"),
+    "part": ({"materials": {"cat": {"f0": 0.1}}}, "materials must be for the parts ball, ground, got one for 'cat'"),
     "range": ({"materials": {"ball": {"f0": 2}}}, "f0 must be from 0 to 1, got 2"),
-    "name": ({"materials": {"ball": {"fur": 1}}}, "must have some of roughness, exponent, f0, diffuse, specular"),
+    "name": (
+        {"materials": {"ball": {"fur": 1}}},
+        "must be a dictionary with keys among roughness, exponent, f0, diffuse, specular",
+    ),
     "rough": ({"materials": {"ball": {"roughness": 0.1}}}, "precomputed for roughness from 0.400 to 0.800"),
     "gloss": ({"materials": {"ground": {"f0": 0.1, "specular": [1, 1, 1]}}}, None),
     "lamp": ({"lamps": [{"direction": [0, 0, 0], "angle": 1, "radiance": [1, 1, 1]}]}, "must have a length"),
@@ -312,7 +315,7 @@ def test_messages_come_through_as_they_went():
 
 @pytest.mark.parametrize("data", [b"", b"abc", b"\xff\xff\xff\xff{}", messages.pack({"a": 1}, [bytes(64)])[:-40]])
 def test_bytes_that_are_no_message_are_refused(data):
-    with pytest.raises(ValueError, match=f"what the viewer sends, got {len(data)} other bytes"):
+    with pytest.raises(ValueError, match=f"the viewer sends, got {len(data)} bytes in another form"):
         messages.unpack(data)
 
 

@@ -140,7 +140,7 @@ def test_a_store_made_from_something_else_is_refused(mesh, tmp_path):
         (mesh, {"size": SIZE, "occluder": builtin.plane(cells=1)}),
         (builtin.plane(cells=6), {"size": SIZE}),
     ):
-        with pytest.raises(ValueError, match=r"a\.prt holds arrays made from something else"):
+        with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
             precompute(other, path=path, progress=False, **options)
 
 
@@ -152,7 +152,7 @@ def test_sizes_that_are_no_powers_of_two_are_refused(mesh, size):
 
 def test_vertices_that_are_not_there_are_refused(mesh):
     for vertex in (np.array([39]), np.array([0.5]), np.ones(38, bool)):
-        with pytest.raises(ValueError, match=r"vertex must be a mask \[39\] or whole numbers below 39"):
+        with pytest.raises(ValueError, match=r"vertex must be a mask \[39\] or a 1-D array of indices below 39"):
             precompute(mesh, size=SIZE, vertex=vertex, progress=False)
 
 

@@ -40,7 +40,7 @@ def read(path: pathlib.Path) -> Scene:
         cameras, skipped = _cameras(document, (used.min(0) + used.max(0)) / 2)
     ignored = (ignored | skipped) - _HONORED
     if ignored:
-        warnings.warn(f"{path}: not honored are {', '.join(sorted(ignored))}", stacklevel=3)
+        warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
     return Scene(parts, cameras)
 
 
@@ -83,7 +83,7 @@ def _camera(document: Document, item: dict[str, Any], owner: str, matrix: np.nda
     eye, back, up = matrix[:3, 3], matrix[:3, 2], matrix[:3, 1]
     length = np.linalg.norm(back)
     if not length > 0:
-        raise document.error(f"must place {owner} by transforms that can be inverted", "a scale of zero")
+        raise document.error(f"must have invertible transforms for {owner}", "a scale of zero")
     target = eye - back / length * (np.linalg.norm(center - eye) or 1.0)
     eye, target, up, angle = (np.asarray(each, np.float32) for each in (eye, target, up, angle))
     return Camera(eye, target, up, angle, max(1, round(_HEIGHT * float(aspect))), _HEIGHT)

@@ -41,7 +41,7 @@ class Document:
         try:
             self.header = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise self.error("must be an undamaged glTF file", f"a header that is no JSON: {error}") from error
+            raise self.error("must be an undamaged glTF file", f"a header that is not JSON: {error}") from error
         version = str(self.header.get("asset", {}).get("version", "none")) if isinstance(self.header, dict) else "none"
         if not version.startswith("2."):
             raise self.error("must be an undamaged glTF file of version 2", f"version {version}")
@@ -70,7 +70,7 @@ class Document:
         """
         found = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
-            raise self.error(f"must name one of its {len(found)} {kind} in {owner}", repr(index))
+            raise self.error(f"must refer to one of its {len(found)} {kind} in {owner}", repr(index))
         return found[index]
 
     def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

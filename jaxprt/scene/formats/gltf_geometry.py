@@ -134,7 +134,7 @@ def _transform(document: Document, item: dict[str, Any], name: str) -> np.ndarra
     )
     length = np.linalg.norm(rotation)
     if not length > 0:
-        raise document.error(f"must have a quaternion that is not zero for the rotation of {name}", "zero")
+        raise document.error(f"must have a nonzero quaternion for the rotation of {name}", "zero")
     x, y, z, w = rotation / length
     matrix = np.eye(4)
     matrix[:3, :3] = [
@@ -150,7 +150,7 @@ def _transform(document: Document, item: dict[str, Any], name: str) -> np.ndarra
 def _check_readable(document: Document) -> None:
     compressed = _COMPRESSED & set(document.header.get("extensionsRequired", []))
     if compressed:
-        raise document.error("must have geometry that is not compressed", ", ".join(sorted(compressed)))
+        raise document.error("must have uncompressed geometry", ", ".join(sorted(compressed)))
 
 
 def _primitives(
@@ -217,8 +217,8 @@ def _faces(document: Document, item: dict[str, Any], count: int, name: str) -> n
         index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)[:, 0].astype(np.int64)
         if index.min() < 0 or index.max() >= count:
             wrong = np.flatnonzero((index < 0) | (index >= count))
-            got = f"{len(wrong)} of {len(index)} that name others, the first is {index[wrong[0]]} at {wrong[0]}"
-            raise document.error(f"must name vertices 0 to {count - 1} in indices of {name}", got)
+            got = f"{len(wrong)} of {len(index)} that refer to others, the first is {index[wrong[0]]} at {wrong[0]}"
+            raise document.error(f"must refer to vertices 0 to {count - 1} in indices of {name}", got)
     mode = item.get("mode", _TRIANGLES)
     if len(index) < 3 or (mode == _TRIANGLES and len(index) % 3):
         must = "a multiple of three" if mode == _TRIANGLES else "three or more"

@@ -108,13 +108,13 @@ def _obj_text(path: pathlib.Path) -> str:
     wrong = [line for line, corners, low, high, *_ in faces if corners < 3 or low < 1 or high > count["v"]]
     if wrong:
         raise ValueError(
-            f"{path}: faces must name three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
+            f"{path}: faces must refer to three or more of the vertices 1 to {count['v']}, got {len(wrong)} of "
             f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}"
         )
     wrong = [line for line, *_, low, high in faces if low < 1 or high > count["vt"]]
     if wrong:
         warnings.warn(
-            f"{path}: faces should name texture coordinates 1 to {count['vt']} or none, got {len(wrong)} of "
+            f"{path}: faces should refer to texture coordinates 1 to {count['vt']} or none, got {len(wrong)} of "
             f"{len(faces)} faces that do not, the first is {lines[wrong[0]]!r} in line {wrong[0] + 1}: their materials "
             "are loaded without texture coordinates",
             stacklevel=5,

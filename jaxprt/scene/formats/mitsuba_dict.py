@@ -64,7 +64,7 @@ def read(scene: Mapping[str, Any]) -> Scene:
         elif not MaterialMaker.knows(kind) and kind not in _SILENT:
             ignored.add(f"{name} ({kind})")
     if ignored:
-        warnings.warn(f"the dictionary: not honored are {', '.join(sorted(ignored))}", stacklevel=3)
+        warnings.warn(f"the dictionary: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
     return Scene(parts, cameras, lights)
 
 
@@ -186,7 +186,7 @@ def _environment(name: str, item: Mapping[str, Any]) -> Environment:
     light = environment.load_environment(item["filename"])
     turned = transform(item.get("to_world"), f"to_world of {name}")[:3, :3]
     if not np.allclose(turned @ turned.T, np.eye(3), rtol=0, atol=1e-4) or np.linalg.det(turned) < 0:
-        raise ValueError(f"to_world of {name} must turn and nothing else, got {turned.tolist()}")
+        raise ValueError(f"to_world of {name} must be a pure rotation, got {turned.tolist()}")
     if not np.allclose(turned, np.eye(3), rtol=0, atol=1e-7):
         light = environment.rotate(light, jnp.asarray(turned, jnp.float32))
     return eqx.tree_at(lambda each: each.radiance, light, light.radiance * float(item.get("scale", 1.0)))

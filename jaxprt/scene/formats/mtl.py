@@ -67,7 +67,7 @@ def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
                 ignored.add(f"mtllib ({path.parent / each}, which does not exist)")
     ignored |= {f"usemtl {each} (no such material)" for each in order if each is not None and each not in found}
     if ignored:
-        warnings.warn(f"{path}: not honored are {', '.join(sorted(ignored))}", stacklevel=3)
+        warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
     return [each or "default" for each in order], [found.get(each or "", matte()) for each in order]
 
 

@@ -59,7 +59,7 @@ def pairs(count: int, navigation: Line | Plane | Columns | None) -> Int[np.ndarr
         return np.array([*every], int).reshape(-1, 2)
     known = len(navigation.knot if isinstance(navigation, Line) else navigation.point)
     if known != count:
-        raise ValueError(f"navigation must be through the set's {count} BRDFs, got one through {known}")
+        raise ValueError(f"navigation must be for the set's {count} BRDFs, got one for {known}")
     return navigation.pairs
 
 

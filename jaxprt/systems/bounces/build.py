@@ -228,12 +228,14 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
 def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[DynamicBrdf | SeparableBrdf]) -> None:
     """Refuses weights of other regions or channels."""
     if len(weights) != len(brdfs):
-        raise ValueError(f"weights must be one, or None, for each of {len(brdfs)} regions, got {len(weights)}")
+        raise ValueError(
+            f"weights must have one entry, an array or None, for each of {len(brdfs)} regions, got {len(weights)}"
+        )
     for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
         if each is None:
             continue
         if isinstance(brdf, DynamicBrdf):
-            raise ValueError(f"the weights of region {number}, which has a set of BRDFs, must be None")
+            raise ValueError(f"the weights of region {number} must be None because it has a set of BRDFs, got an array")
         shape, channels = np.shape(each), brdf.view_map.shape[-1]
         if len(shape) != 2 or shape[0] != channels:
             raise ValueError(f"the weights of region {number} must be [{channels} channels, c], got {list(shape)}")

@@ -105,7 +105,7 @@ def arrive(
 
     Args:
         response: Responses of the light factors at all vertices of the surfaces, from `respond` or `respond_again`. The
-            light is the last axis, so that memory is read contiguously, which is three times as fast.
+            light is the last axis, so that memory is read contiguously.
         frame: Frames of these vertices.
         basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
         owner: Index of the point of each group of rays; see `Rays`.

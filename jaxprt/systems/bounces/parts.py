@@ -81,15 +81,15 @@ class PartBounces(protocol.System):
         found = [each.ndim for each in self.tensor.factor]
         if found != [2] * len(counts):
             raise ValueError(
-                f"the tensor must be of one factored BRDF for each of {len(counts)} parts, got {len(found)}, "
+                f"the tensor must have one factored BRDF for each of {len(counts)} parts, got {len(found)} BRDFs, "
                 f"{sum(each > 2 for each in found)} of them sets"
             )
         if len(self.tensor.place) != sum(counts):
-            raise ValueError(f"the tensor must be of the parts' {sum(counts)} vertices, got {len(self.tensor.place)}")
+            raise ValueError(f"the tensor must have the parts' {sum(counts)} vertices, got {len(self.tensor.place)}")
         if isinstance(self.tensor.region, Tracer):
             return
         if np.any(np.asarray(self.tensor.region) != np.repeat(np.arange(len(counts)), counts)):
-            raise ValueError("the tensor's regions must be the parts in their order, one after the other")
+            raise ValueError("the tensor's regions must be the parts in the same order, got other regions")
 
     def light(self, environment: Environment) -> LitTransfer:
         """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""

@@ -139,11 +139,11 @@ def arriving(
     weight, change = weights(tensor, materials), changes(tensor, materials)
     if len(tensor.place) != len(transport.place):
         raise ValueError(
-            f"the tensor must be of the transport's {len(transport.place)} vertices, got {len(tensor.place)}"
+            f"the tensor must have the transport's {len(transport.place)} vertices, got {len(tensor.place)}"
         )
     if tensor.mesh and transport.mesh and tensor.mesh != transport.mesh:
         raise ValueError(
-            "the tensor must be of the transport's mesh and regions, got one of others with as many vertices"
+            "the tensor must be made for the transport's mesh and regions, got one for others with as many vertices"
         )
     return _arriving(transport, tensor, light, weight, change)
 
@@ -163,7 +163,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
     rows = []
     for number, (factor, material) in enumerate(zip(tensor.factor, materials, strict=True)):
         if (factor.ndim > 2) != (material is not None):
-            needs = "needs a material" if factor.ndim > 2 else "has one BRDF for good: give None"
+            needs = "needs a material" if factor.ndim > 2 else "has a BRDF that cannot change: give None"
             raise ValueError(f"region {number} {needs}")
         if material is None:
             rows.append(factor)
@@ -319,7 +319,7 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
 
     A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
-    Constant light is preserved. Flux is preserved within 2.5 % for faces of 8 x 8 texels, and 5 % for 4 x 4.
+    Constant light is preserved exactly, and flux approximately.
 
     Args:
         radiance: Radiance of the fine texels.
@@ -330,7 +330,7 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     """
     size = radiance.shape[1]
     if edge < 1 or size % edge:
-        raise ValueError(f"the edge of coarse faces must divide the light's {size}, got {edge}")
+        raise ValueError(f"the edge of coarse faces must divide the edge of the light's faces, {size}, got {edge}")
     area, way = cubemap.solid_angle(size=size)[..., None], cubemap.direction(size=size)
     each = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
     shape = jax.ShapeDtypeStruct((6, edge, edge, each.shape[-1]), each.dtype)
@@ -352,7 +352,7 @@ def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
 
 
 def _met(light: Float[Array, "g c e"], core: Float[Array, "g e *f"]) -> Float[Array, "g c *f"]:
-    """Applies cores to light, cluster by cluster. Converting all half-precision cores at once is five times as slow."""
+    """Applies cores to light, cluster by cluster. Converting all half-precision cores at once is slower."""
     clusters, kinds, *shape = core.shape
 
     def one(argument):

@@ -38,7 +38,7 @@ class BouncesSystem(protocol.System):
         require.kind("the direct system", self.direct, dynamic.DynamicSystem, source="jaxprt.dynamic.DynamicSystem")
         count = len(self.direct.transport.place)
         if len(self.tensor.place) != count:
-            raise ValueError(f"the tensor must be of the transport's {count} vertices, got {len(self.tensor.place)}")
+            raise ValueError(f"the tensor must have the transport's {count} vertices, got {len(self.tensor.place)}")
 
     def light(self, environment: Environment) -> LitTransfer:
         """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""

@@ -5,8 +5,8 @@
 
 The tensors hold for any light and any BRDFs. For one bounce the light has 6 x 8 x 8 texels l. It arrives as 16
 harmonics s in world directions. q counts the functions of all regions, from `jaxprt.bounces.functions`, and H are their
-current weights. For two bounces, off functions q and then p, the light is reduced to 6 x 2 x 2 texels, which costs 7 %
-error. The paper treats the second bounce as uniform over direction, which would cost 50 %. Vertices are clustered, and
+current weights. For two bounces, off functions q and then p, the light is reduced to 6 x 2 x 2 texels. It arrives
+as 16 harmonics too, whereas the paper treats it as uniform over direction. Vertices are clustered, and
 the tensor of each cluster is decomposed along vertices and light. `jaxprt.bounces.radiance` computes radiance from it.
 
 A third bounce of this kind would cost as many times the second as there are functions. Bounces after the second are

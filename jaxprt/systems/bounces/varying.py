@@ -31,7 +31,8 @@ class Sent(eqx.Module):
         knots = len(self.knot[0]) if self.knot else 1
         if len(self.knot) > 1 or len(self.factor) != knots:
             raise ValueError(
-                f"the factors must be along one parameter or none, got {len(self.factor)} for {len(self.knot)}"
+                f"the factors must have one row for each knot of at most one parameter, got {len(self.factor)} rows "
+                f"for {len(self.knot)} parameters"
             )
 
     def mean(self, blend: Blend, area: Float[Array, " v"]) -> Float[Array, "p c"]:

@@ -187,7 +187,7 @@ def factor(
 ) -> DynamicBrdf:
     """Makes a set of BRDFs from their lobes and a Tucker decomposition of the residual.
 
-    Eight free lobes leave a residual of about 1 %, which is not visible, so `ranks` can be None. With the published
+    Eight free lobes leave a residual that is not visible, so `ranks` can be None. With the published
     lobes, or without lobes, give `ranks`.
 
     The decomposed tensor holds the light that each BRDF reflects to each view from each spherical harmonic, weighted by
@@ -301,7 +301,9 @@ def check(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int) 
         raise ValueError(f"resolution must be at least 4, got {resolution}")
     _check_sequence(brdfs)
     if lobe is not None and (len(lobe.knot) != 1 or lobe.scale.shape[1] != len(brdfs)):
-        raise ValueError(f"the lobes must be those of the {len(brdfs)} BRDFs, got {list(lobe.scale.shape)}")
+        raise ValueError(
+            f"the lobes must be made for the {len(brdfs)} BRDFs, got a table of shape {list(lobe.scale.shape)}"
+        )
     direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
     shapes = [eqx.filter_eval_shape(brdf, direction, direction).shape for brdf in brdfs]
     if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] not in (1, 3):

@@ -78,8 +78,8 @@ def check_values(least: Sequence[Float[Array, " _"]]) -> None:
     wrong = np.flatnonzero(~(value >= 0))
     if wrong.size:
         raise ValueError(
-            f"a BRDF must be finite and not negative above the horizon, {wrong.size} of {len(value)} are not, first "
-            f"number {wrong[0]}"
+            f"a BRDF must be finite and not negative above the horizon, got {wrong.size} of {len(value)} BRDFs that "
+            f"are not, the first is number {wrong[0]}"
         )
 
 

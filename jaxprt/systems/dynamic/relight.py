@@ -344,11 +344,15 @@ def _check(number: int, own: RegionTransport, brdf, material: Material | None, v
     changes = isinstance(brdf, DynamicBrdf)
     terms = brdf.light_map.shape[0] + changes
     if terms != own.terms.terms or (changes and brdf.lobe is not None) != _has_pyramid(own):
-        raise ValueError(f"the BRDF of region {number} must be the one that its transport was made for")
+        raise ValueError(
+            f"the BRDF of region {number} must be the one that its transport was made for, got another one"
+        )
     light = brdf.light_map[..., None] if changes else brdf.light_map
     check_mark(own.terms.mark, light, name=f"the BRDF of region {number}")
     if changes != (material is not None):
-        raise ValueError(f"region {number} {'needs a material' if changes else 'has one BRDF for good: give None'}")
+        raise ValueError(
+            f"region {number} {'needs a material' if changes else 'has a BRDF that cannot change: give None'}"
+        )
     if material is not None:
         check_material(number, material, brdf.size, vertices)
 

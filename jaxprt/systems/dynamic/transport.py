@@ -118,8 +118,7 @@ def precompute(
     for brdf in brdfs:
         if not isinstance(brdf, DynamicBrdf | SeparableBrdf):
             raise TypeError(
-                "each BRDF must be a set, by jaxprt.dynamic.factor, or factored, by "
-                f"jaxprt.separable.factor, got {type(brdf).__name__}"
+                f"each BRDF must be made by jaxprt.dynamic.factor or jaxprt.separable.factor, got {type(brdf).__name__}"
             )
     lobe.pyramid.scales(size)
     regions = []

@@ -56,13 +56,14 @@ def export_transfer(
     require.kind("the transport", transport, TransferVector, TransferMatrix, source="jaxprt.harmonic.precompute")
     if len(transport.position) != len(mesh.position):
         raise ValueError(
-            f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {len(transport.position)}"
+            f"the transport must have all {len(mesh.position)} vertices of the mesh, got {len(transport.position)}"
         )
     matrix = isinstance(transport, TransferMatrix)
     if (matrix and corners) or (kind == ".ply" and (matrix or corners)):
         raise ValueError(
-            "corners hold vectors, and PLY files vectors of vertices; write matrices to .npz or .npy files, got "
-            f"{'matrices' if matrix else 'vectors'} of {'corners' if corners else 'vertices'} for {kind}"
+            "matrices must be of vertices, not corners, and a .ply file must hold vectors of vertices, got "
+            f"{'matrices' if matrix else 'vectors'} of {'corners' if corners else 'vertices'} for {kind}: write "
+            "matrices of vertices, or vectors of corners, to .npz or .npy files"
         )
     if isinstance(transport, TransferMatrix):
         inner = convention.written(np.asarray(transport.matrix), axis=3)
@@ -187,13 +188,15 @@ def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.
 def _same(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
     """Refuses positions or frames in a file that differ from those of the mesh."""
     if found.shape != wanted.shape:
-        raise ValueError(f"{name} must be those of the mesh, {list(wanted.shape)}, got {list(found.shape)}")
+        raise ValueError(
+            f"{name} must have the shape of those of the mesh, {list(wanted.shape)}, got {list(found.shape)}"
+        )
     off = np.abs(found - wanted).reshape(len(found), -1).max(1)
     wrong = np.flatnonzero(~(off <= _AGREE * max(float(np.abs(wanted).max()), 1e-30)))
     if len(wrong):
         raise ValueError(
-            f"{name} must be those of the mesh, in our axes, got {len(wrong)} of {len(off)} that are not, first "
-            f"{wrong[0]}: {found[wrong[0]].tolist()} for {wanted[wrong[0]].tolist()}"
+            f"{name} must be those of the mesh, in the axes of jaxprt, got {len(wrong)} of {len(off)} that are not, "
+            f"first {wrong[0]}: {found[wrong[0]].tolist()} instead of {wanted[wrong[0]].tolist()}"
         )
 
 

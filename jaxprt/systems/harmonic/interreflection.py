@@ -251,9 +251,9 @@ class _DiffuseBounceJob(visibility.rays.VisibilityJob):
 def _check(mesh: Mesh, vertices: int, materials: int, bounces: int) -> None:
     """Refuses transport of other vertices, regions without a material, and bounces that are not a whole number >= 0."""
     if not isinstance(bounces, int | np.integer) or bounces < 0:
-        raise ValueError(f"bounces must be a whole number from 0, got {bounces}")
+        raise ValueError(f"bounces must be a whole number of at least 0, got {bounces}")
     if vertices != len(mesh.position):
-        raise ValueError(f"the transport must be of all {len(mesh.position)} vertices of the mesh, got {vertices}")
+        raise ValueError(f"the transport must have all {len(mesh.position)} vertices of the mesh, got {vertices}")
     regions = int(np.max(mesh.region, initial=0)) + 1
     if materials < regions:
         raise ValueError(f"each of the mesh's {regions} regions must have a material, got {materials}")

@@ -329,7 +329,9 @@ def combine(light: Float[Array, "lm c *w"], view: Float[Array, "lm l v"]) -> Flo
 def _colors(mine: int, other: int) -> int:
     """Number of colors of a product."""
     if mine != other and 1 not in (mine, other):
-        raise ValueError(f"both factors must have as many colors, or one, got {mine} and {other}")
+        raise ValueError(
+            f"both factors must have the same number of colors, or one of them a single color, got {mine} and {other}"
+        )
     return max(mine, other)
 
 
@@ -341,4 +343,4 @@ def _color(number: int, colors: int) -> int:
 def _check_degree(mine: int, other: int, name: str, other_name: str) -> None:
     mine, other = harmonics.degree_of(mine), harmonics.degree_of(other)
     if mine != other:
-        raise ValueError(f"{name} must have the degree of {other_name}, {other}, got {mine}")
+        raise ValueError(f"{name} must have the same degree as {other_name}, {other}, got {mine}")

@@ -96,7 +96,7 @@ class HarmonicBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
+            raise ValueError(f"the table needs {len(self.knot)} parameters, got {len(parameter)}")
         resolution = self.table.shape[-1]
         # At the normal the azimuth is undefined. There (x, y) / sin_o is 0, and so are all coefficients except m = 0.
         sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
@@ -163,7 +163,7 @@ def tabulate(
     if not 0 <= degree <= 50 or (resolution is not None and resolution < 2) or not wanted > 0:
         raise ValueError(
             "tabulate needs a degree of 0 to 50, a resolution of at least 2 and an error above 0, "
-            f"got {degree}, {resolution} and {error}"
+            f"got degree={degree}, resolution={resolution} and error={error}"
         )
     knots = grid.checked(knot)
     points = list(itertools.product(*knots))
@@ -199,7 +199,7 @@ def tabulate(
         else:
             advice = f"give a resolution above {table.table.shape[-1]}"
         warnings.warn(
-            f"the error of the table of harmonics must be at most {wanted:.3g}, and is {reached:.3g}: {advice}",
+            f"the error of the table of harmonics must be at most {wanted:.3g}, got {reached:.3g}: {advice}",
             stacklevel=2,
         )
     return eqx.tree_at(lambda each: each.error, table, jnp.asarray(reached, table.table.dtype))
@@ -229,7 +229,9 @@ def project(
         wi, area = hemisphere.arcs(mirror, rings=rings, sectors=sectors)
         value = brdf(wi, jnp.broadcast_to(view, wi.shape))
         if jnp.ndim(value) != 2 or value.shape[0] != len(wi):
-            raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
+            raise ValueError(
+                f"the BRDF must return [{len(wi)}, c] for {len(wi)} directions, got {list(jnp.shape(value))}"
+            )
         return harmonics.evaluate(wi, degree=degree).T @ (value * jnp.maximum(wi[:, 2:], 0) * area[:, None])
 
     return jnp.moveaxis(jax.lax.map(one, wo, batch_size=_BATCH), 0, -1)
@@ -256,7 +258,7 @@ def _table(
     for point, table in zip(points, tables, strict=True):
         if not np.isfinite(table).all():
             at = f" at parameters {point}" if point else ""
-            raise ValueError(f"the BRDF must be finite for all directions above the horizon, and is not{at}")
+            raise ValueError(f"the BRDF must be finite for all directions above the horizon, got NaN or infinity{at}")
     colors, dtype = max(table.shape[1] for table in tables), tables[0].dtype
     every = np.stack([np.broadcast_to(each, (len(each), colors, each.shape[2])) for each in tables], 2)
     value = every.reshape(len(every), colors, *map(len, knots), *wo.shape[:-1])

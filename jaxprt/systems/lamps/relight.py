@@ -108,7 +108,7 @@ class LitByLamps(eqx.Module):
         Raises:
             ValueError: The number of rows of `radiance` differs from the number of lamps.
         """
-        require.length("the radiance of lamps", radiance, self.transport.lamps)
+        require.length("rows of the lamps' radiance", radiance, self.transport.lamps)
         return _combine(radiance, view)
 
 

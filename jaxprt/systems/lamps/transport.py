@@ -151,7 +151,7 @@ def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[
     across *= np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
     area = np.linalg.norm(across, axis=1)
     if not area.sum() > 0:
-        raise ValueError(f"a lamp must have an area, got one of {len(area)} triangles without any")
+        raise ValueError(f"a lamp must have an area above 0, got one whose {len(area)} triangles have none")
     total = np.cumsum(area)
     # The area is divided into `count` equal shares with one point each. Places inside triangles follow a
     # low-discrepancy sequence.

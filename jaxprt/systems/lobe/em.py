@@ -45,7 +45,9 @@ def samples(
         wi, area = hemisphere.arcs(mirror(view), rings=RINGS, sectors=SECTORS)
         value = brdf(wi, jnp.broadcast_to(view, wi.shape))
         if jnp.ndim(value) != 2 or len(value) != len(wi):
-            raise ValueError(f"the BRDF must return [{len(wi)}, c] here, got {list(jnp.shape(value))}")
+            raise ValueError(
+                f"the BRDF must return [{len(wi)}, c] for {len(wi)} directions, got {list(jnp.shape(value))}"
+            )
         cosine = jnp.maximum(wi[:, 2], jnp.finfo(wi.dtype).tiny)
         # Over a disk of solid angle a, the mean of 1 - cos of the angle to its center is a / (4 pi).
         return wi, value * (cosine * area)[:, None], jnp.log(cosine / np.pi)[:, None], area / (4 * np.pi)

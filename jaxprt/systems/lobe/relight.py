@@ -242,7 +242,10 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
         ValueError: The light has another size than the transport of the view.
     """
     if light.size != view.size:
-        raise ValueError(f"the light's faces must have the transport's {view.size} texels, got {light.size}")
+        raise ValueError(
+            f"the light's faces must have as many texels along an edge as the transport's, {view.size}, "
+            f"got {light.size}"
+        )
     irradiance = light.coefficient.T @ view.vector
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)

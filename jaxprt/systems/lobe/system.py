@@ -36,7 +36,8 @@ class LobeSystem(protocol.VertexSystem):
         lit = prefilter(environment)
         if lit.size != self.transport.size:
             raise ValueError(
-                f"the light's faces must have the transport's {self.transport.size} texels, got {lit.size}"
+                f"the light's faces must have as many texels along an edge as the transport's, "
+                f"{self.transport.size}, got {lit.size}"
             )
         return lit
 

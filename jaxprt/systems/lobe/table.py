@@ -115,7 +115,7 @@ class LobeBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            raise ValueError(f"the table has {len(self.knot)} parameters, got {len(parameter)}")
+            raise ValueError(f"the table needs {len(self.knot)} parameters, got {len(parameter)}")
         result = self
         for knot, value in zip(self.knot, parameter, strict=True):
             low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
@@ -242,7 +242,7 @@ def tabulate(
     if (lobes is not None and not lobes >= 1) or (error is not None and not error > 0) or resolution < 4:
         raise ValueError(
             f"tabulate needs at least one lobe or an error above 0, and a resolution of at least 4, "
-            f"got {lobes}, {error} and {resolution}"
+            f"got lobes={lobes}, error={error} and resolution={resolution}"
         )
     knots = grid.checked(knot)
     made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
@@ -379,6 +379,6 @@ def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
         view, sample, _ = wrong[0]
         at = f" at parameters {tuple(map(float, point))}" if point else ""
         raise ValueError(
-            f"the BRDF must be finite and not negative{at}, and is not for {len(wrong)} pairs of directions, first for "
-            f"wi = {np.asarray(direction)[view, sample]}, wo = {wo[view]}"
+            f"the BRDF must be finite and not negative{at}, got {len(wrong)} pairs of directions where it is not, the "
+            f"first is wi = {np.asarray(direction)[view, sample]}, wo = {wo[view]}"
         )

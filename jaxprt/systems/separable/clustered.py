@@ -213,15 +213,17 @@ def precompute(
     if not isinstance(brdf, SeparableBrdf):
         raise TypeError(f"brdf must be factored, by jaxprt.separable.factor, got {type(brdf).__name__}")
     if brdf.light_map.shape[-1] != 1:
-        raise ValueError(f"light maps must be shared by all colors, got {brdf.light_map.shape[-1]} channels")
+        raise ValueError(
+            f"light maps must have one channel that all colors share, got {brdf.light_map.shape[-1]} channels"
+        )
     if member is None:
         count = members.clusters_for(len(direct.position)) if clusters is None else clusters
         member = members.cluster(direct.position, direct.frame[:, 2], clusters=count)
     missing = np.setdiff1d(np.arange(len(direct.position)), member).size
     if missing or member.min() < 0 or member.max() >= len(direct.position):
         raise ValueError(
-            f"member must name all {len(direct.position)} vertices and no others, got {missing} missing and "
-            f"numbers from {member.min()} to {member.max()}"
+            f"member must hold the indices of all {len(direct.position)} vertices and no others, got {missing} missing "
+            f"and indices from {member.min()} to {member.max()}"
         )
     components = min(_COMPONENTS, member.shape[1]) if components is None else components
     keep = min(_KEEP, direct.texels) if keep is None else keep

@@ -157,7 +157,7 @@ def factor(
         terms: Number of terms. Give either `terms` or `error`.
         error: Relative L2 error that the terms must meet. With `light`, it holds under each of these lights, by
             `jaxprt.separable.light_errors`. Otherwise it is the mean over natural light with the covariance above, and
-            single lights may exceed it. Both are without shadows; `jaxprt.plan.separable` measures errors on a mesh.
+            single lights may exceed it. Both are without shadows; `jaxprt.relit.measuring.measure` includes them.
         light: Environments under which `error` must hold.
         resolution: Edge of the square maps in texels.
 
@@ -227,7 +227,9 @@ def _maps(
 def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None, error: float | None, resolution: int):
     """`factor` with the smallest number of terms that meets the error under each light."""
     if error is None or not len(light):
-        raise ValueError(f"lights must be at least one and come with error, got {len(light)} and terms={terms}")
+        raise ValueError(
+            f"lights must be at least one, and error must be given with them, got {len(light)} lights and terms={terms}"
+        )
     count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
     while True:
         found = factor(brdf, terms=count, resolution=resolution)
@@ -261,7 +263,10 @@ def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
     """
     kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
     if len(kinds) != 1:
-        raise ValueError(f"brdfs must be at least one, on maps of one kind, got {', '.join(kinds) or 'none'}")
+        raise ValueError(
+            f"brdfs must be at least one, all with maps of the same resolution and coordinates, "
+            f"got {', '.join(kinds) or 'none'}"
+        )
 
     def side_by_side(maps):
         colors = max(each.shape[-1] for each in maps)

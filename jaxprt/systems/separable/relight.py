@@ -289,10 +289,10 @@ def modulate(
     """
     if weight.shape[1] != len(terms) or view.shape[1] != sum(terms):
         raise ValueError(
-            f"terms must be one number for each of {weight.shape[1]} weights that add up to the tuple's "
-            f"{view.shape[1]}, got {terms}"
+            f"terms must hold one number for each of {weight.shape[1]} weights and sum to the {view.shape[1]} terms of "
+            f"the view tuple, got {terms}"
         )
-    require.length("the vertices of the weights", weight, len(view))
+    require.length("vertices of the weights", weight, len(view))
     require.finite("the weights", weight)
     return _modulated(view, weight, terms=terms)
 

@@ -64,7 +64,7 @@ class SparseTransport(eqx.Module):
     def with_transpose(self) -> "SparseTransport":
         """Adds a transposed copy of the coefficients, which makes gradients with respect to the light faster.
 
-        With it, such a gradient takes about as long as `apply`; without it, about five times as long. The copy takes 8
+        With it, such a gradient takes about as long as `apply`; without it, several times as long. The copy takes 8
         bytes per coefficient (16 in color) and padding. Derivatives with respect to the transport's values do not use
         it. `truncate` drops it.
         """

@@ -160,11 +160,11 @@ def test_what_has_no_equal_is_said_by_name():
         **{"type": "scene", "lamp": {"type": "point"}, "pane": {"type": "disk"}, "integrator": {"type": "path"}},
         "sheet": {"type": "rectangle", "to_world": np.eye(4).tolist(), "bsdf": {"type": "twosided", "inner": inner}},
     }
-    with pytest.warns(UserWarning, match="not honored") as caught:
+    with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(scene)
     (message,) = [str(each.message) for each in caught]
     expected = r"clearcoat of bsdf of sheet, lamp (point), pane (disk), twosided (backs of surfaces are black)"
-    assert message == f"the dictionary: not honored are {expected}"
+    assert message == f"the dictionary: not supported and ignored are {expected}"
 
 
 @pytest.mark.parametrize(

@@ -141,10 +141,10 @@ def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     path = write(tmp_path, f"newmtl a\n{statements}", "usemtl a\n" + FACE + "usemtl b\n" + FACE)
     path.write_text("mtllib gone.mtl\n" + path.read_text())
-    with pytest.warns(UserWarning, match="not honored") as caught:
+    with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         scene = load_scene(path)
     (message,) = [str(each.message) for each in caught]
-    assert message.startswith(f"{path}: not honored are ")
+    assert message.startswith(f"{path}: not supported and ignored are ")
     expected = ["Kd above 1", "aniso", "bump", ", d,", r"absent.png, which does not exist", "text.png must be an EXR"]
     for each in [*expected, "gone.mtl, which does not exist", "usemtl b (no such material)"]:
         assert message.count(each) == 1, each

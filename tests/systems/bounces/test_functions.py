@@ -151,7 +151,7 @@ def test_a_set_of_three_has_three_functions_and_terms_bring_more():
         ({"functions": 7}, "functions must be a whole number from 1 to 6 for these BRDFs, got 7"),
         ({"functions": 1.5}, "functions must be a whole number from 1 to 6 for these BRDFs, got 1.5"),
         ({"terms": 0}, "terms must be a whole number from 1 to 625 for these BRDFs, got 0"),
-        ({"navigation": Line(jnp.arange(4.0))}, "navigation must be through the set's 3 BRDFs, got one through 4"),
+        ({"navigation": Line(jnp.arange(4.0))}, "navigation must be for the set's 3 BRDFs, got one for 4"),
         ({"resolution": 2}, "resolution must be at least 4, got 2"),
     ],
 )
@@ -197,10 +197,12 @@ def test_colors_of_their_own_are_functions_of_their_own():
     np.testing.assert_allclose(bounces.functions.basis(glossy)(wi, wo) @ weight, glossy(wi, wo), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("ranks", "found"), [(None, "none"), ((1, 1, 1), "those of what its lobes leave")])
+@pytest.mark.parametrize(("ranks", "found"), [(None, "no terms"), ((1, 1, 1), "terms of the residual of its lobes")])
 def test_a_set_without_terms_of_whole_brdfs_makes_no_functions(ranks, found):
     row, up = np.ones((1, 1, 1, 4), np.float32), np.reshape([0, 0, 1], (3, 1, 1, 1)) * np.float32([1, 1, 1, 1])
     lobes = LobeBrdf(*map(jnp.asarray, (up, row[0], row, row[0])), (jnp.zeros(1),), jnp.zeros(()))
     table = dynamic.factor([Lambert(0.5)], lobes, ranks=ranks, resolution=8)
-    with pytest.raises(ValueError, match=f"without lobes, got {found}"):
+    with pytest.raises(
+        ValueError, match=f"terms of whole BRDFs, got {found}: factor the set with ranks and without lobes"
+    ):
         bounces.functions.basis(table)

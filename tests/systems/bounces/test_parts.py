@@ -162,10 +162,10 @@ def test_what_does_not_fit_is_refused():
     system = made(mesh, [Lambert(1.0)] * 2, terms=1)
     with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
         ReflectingPart(mesh.position, system.part[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
-    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2, 0 of them sets"):
+    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2 BRDFs, 0 of them sets"):
         PartBounces(system.tensor, system.part[:1])
     longer = ReflectingPart(mesh.position, jnp.eye(3) + 0 * mesh.position[:, :, None], system.part[0].brdf)
-    with pytest.raises(ValueError, match=rf"must be of the parts' {3 * count} vertices, got {2 * count}"):
+    with pytest.raises(ValueError, match=rf"must have the parts' {3 * count} vertices, got {2 * count}"):
         PartBounces(system.tensor, (system.part[0], longer))
     with pytest.raises(TypeError, match="materials must be a list, one for each of 2 parts"):
         system.view(EYE, [None])

@@ -269,7 +269,7 @@ def test_derivatives_by_weights(lobes, pairs):
         (lambda _: dynamic.factor([], None, ranks=(1, 1, 1)), "at least one, got none"),
         (lambda _: dynamic.separate([]), "at least one, got none"),
         (lambda _: dynamic.factor(SET, None), "lobes, or ranks of a tensor"),
-        (lambda each: dynamic.factor(SET[:2], each), "those of the 2 BRDFs"),
+        (lambda each: dynamic.factor(SET[:2], each), "made for the 2 BRDFs"),
         (lambda _: dynamic.factor(SET, None, ranks=(4, 1, 1), resolution=8), r"from 1 to the tensor's size \(3, "),
         (lambda _: dynamic.factor(SET, None, ranks=(0, 1, 1), resolution=8), "from 1"),
         (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=2), "resolution must be at least 4"),
@@ -281,7 +281,7 @@ def test_derivatives_by_weights(lobes, pairs):
         (lambda _: dynamic.factor([SET[0], Lambert([1.0, 0, 0])], None, ranks=(1, 1, 1)), r"\[b 1\], or all to"),
         (
             lambda _: dynamic.factor([SET[0], lambda wi, wo: -wi[:, 2:]], None, ranks=(1, 1, 1), resolution=8),
-            "1 of 2 are not, first number 1",
+            "1 of 2 BRDFs that are not, the first is number 1",
         ),
         (
             lambda _: dynamic.published.factor_tensor(

@@ -154,7 +154,9 @@ def test_matrices_that_do_not_fit_are_refused_with_their_bytes(monkeypatch, tmp_
     with pytest.raises(MemoryError, match=words):
         harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, progress=False)
     harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, vertex=np.arange(20), progress=False)
-    with pytest.warns(UserWarning, match="they stay in files, and each new light reads all of these; or take"):
+    with pytest.warns(
+        UserWarning, match="they stay in files, and each new light reads all of them. To avoid this, take"
+    ):
         mapped = harmonic.precompute(mesh(), degree=DEGREE, size=SIZE, path=tmp_path / "store", progress=False)
     np.testing.assert_array_equal(mapped.matrix, exact)
     monkeypatch.setattr(require, "_host_memory", lambda: 7_000_000_000)

@@ -253,10 +253,10 @@ def test_bounces_are_linear_in_the_transport(mesh, vector, close):
 
 def test_transport_of_some_vertices_is_refused(mesh, matrix, vector, lambert):
     some = precompute_diffuse(mesh, size=2, vertex=np.arange(5), progress=False)
-    with pytest.raises(ValueError, match=r"must be of all \d+ vertices of the mesh, got 5"):
+    with pytest.raises(ValueError, match=r"must have all \d+ vertices of the mesh, got 5"):
         interreflect_diffuse(mesh, some, ALBEDO, progress=False)
     some = eqx.tree_at(lambda t: (t.matrix, t.position), matrix, (matrix.matrix[:5], matrix.position[:5]))
-    with pytest.raises(ValueError, match=r"must be of all \d+ vertices of the mesh, got 5"):
+    with pytest.raises(ValueError, match=r"must have all \d+ vertices of the mesh, got 5"):
         interreflect(mesh, some, lambert, progress=False)
 
 
@@ -304,7 +304,7 @@ def test_bounces_go_on_from_their_folders_which_know_what_they_are_of(mesh, matr
     albedo = np.array([[0.5], [0.25]])
     kept = interreflect_diffuse(mesh, vector, albedo, path=tmp_path / "vector", **options).vector
     close(kept, interreflect_diffuse(mesh, vector, albedo, **options).vector)
-    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*brdf"):
+    with pytest.raises(ValueError, match=r"bounce_1 holds arrays that were computed from other inputs .*brdf"):
         interreflect(mesh, matrix, lambert[::-1], path=tmp_path / "matrix", **options)
-    with pytest.raises(ValueError, match=r"bounce_1 holds arrays made from something else .*albedo"):
+    with pytest.raises(ValueError, match=r"bounce_1 holds arrays that were computed from other inputs .*albedo"):
         interreflect_diffuse(mesh, vector, albedo / 2, path=tmp_path / "vector", **options)

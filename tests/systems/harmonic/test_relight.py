@@ -305,23 +305,31 @@ def test_degrees_that_differ_are_refused(random):
         lambda: harmonic.transferred_light(matrix, light),
         lambda: harmonic.diffuse_radiance(vector, jnp.ones(()), light),
     ):
-        with pytest.raises(ValueError, match=r"the light must have the degree of .*, 2, got 4"):
+        with pytest.raises(ValueError, match=r"the light must have the same degree as .*, 2, got 4"):
             refused()
-    with pytest.raises(ValueError, match="the BRDF must have the degree of the transport, 2, got 3"):
+    with pytest.raises(ValueError, match="the BRDF must have the same degree as the transport, 2, got 3"):
         harmonic.radiance(matrix, high, normal(random, 9, 3), eye=EYE)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_numbers_of_colors_that_differ_are_refused(random):
     matrix, brdf = made(random)
-    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+    with pytest.raises(
+        ValueError, match="must have the same number of colors, or one of them a single color, got 2 and 3"
+    ):
         harmonic.combine(normal(random, 9, 2), normal(random, 9, 3, 5))
-    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+    with pytest.raises(
+        ValueError, match="must have the same number of colors, or one of them a single color, got 2 and 3"
+    ):
         harmonic.radiance(matrix, brdf, normal(random, 9, 2), eye=EYE)
     colored = made(random, transported=3)[0]
-    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+    with pytest.raises(
+        ValueError, match="must have the same number of colors, or one of them a single color, got 2 and 3"
+    ):
         harmonic.transferred_light(colored, normal(random, 9, 2))
-    with pytest.raises(ValueError, match="must have as many colors, or one, got 2 and 3"):
+    with pytest.raises(
+        ValueError, match="must have the same number of colors, or one of them a single color, got 2 and 3"
+    ):
         harmonic.transferred_view(colored, normal(random, 9, 2, 5))
 
 

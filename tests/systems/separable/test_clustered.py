@@ -342,7 +342,7 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
         (seen, brdf, SMALL | {"components": 3}),
         (seen, brdf, SMALL | {"clusters": 5}),
     ):
-        with pytest.raises(ValueError, match=r"a\.prt holds arrays made from something else"):
+        with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
             precompute(transport, factored, path=path, progress=False, **options)
 
 
@@ -358,9 +358,12 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
         ({"modes": 0}, "smaller of keep and components x terms, 30, got 0"),
         ({"modes": 31}, "smaller of keep and components x terms, 30, got 31"),
         ({"keep": 7}, "smaller of keep and components x terms, 7, got 30"),
-        ({"member": np.arange(38)[None]}, "member must name all 39 vertices and no others, got 1 missing"),
-        ({"member": np.arange(40)[None]}, "and numbers from 0 to 39"),
-        ({"member": np.arange(-1, 39)[None]}, "and numbers from -1 to 38"),
+        (
+            {"member": np.arange(38)[None]},
+            "member must hold the indices of all 39 vertices and no others, got 1 missing",
+        ),
+        ({"member": np.arange(40)[None]}, "and indices from 0 to 39"),
+        ({"member": np.arange(-1, 39)[None]}, "and indices from -1 to 38"),
     ],
 )
 def test_impossible_numbers_are_refused(seen, brdf, options, message):
@@ -380,7 +383,7 @@ def test_brdfs_without_shared_light_maps_are_refused(seen):
     with pytest.raises(TypeError, match=r"must be factored, by jaxprt.separable.factor, got Lambert"):
         precompute(seen, Lambert(0.5), progress=False, **SMALL)
     colored = SeparableBrdf(jnp.ones((3, 4, 4, 3)), jnp.ones((3, 4, 4, 3)), jnp.zeros(()))
-    with pytest.raises(ValueError, match="light maps must be shared by all colors, got 3 channels"):
+    with pytest.raises(ValueError, match="light maps must have one channel that all colors share, got 3 channels"):
         precompute(seen, colored, progress=False, **SMALL)
 
 
@@ -430,7 +433,9 @@ def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_ref
         ((dimmed, brdf), "direct"),
         ((moved, brdf), "(member|position)"),
     ):
-        with pytest.raises(ValueError, match=rf"a\.prt holds arrays made from something else \({name}: there"):
+        with pytest.raises(
+            ValueError, match=rf"a\.prt holds arrays that were computed from other inputs \({name}: stored"
+        ):
             precompute(*what, path=path, **options)
 
 

@@ -152,7 +152,9 @@ def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_do
     errors = light_errors(brdf, chosen, sun, frames=50, views=20)  # others than it was chosen by
     assert errors.shape == (chosen.terms,)
     assert errors[-1] < 0.5
-    with pytest.raises(ValueError, match=r"lights must be at least one and come with error, got 1 and terms=3"):
+    with pytest.raises(
+        ValueError, match=r"lights must be at least one, and error must be given with them, got 1 lights and terms=3"
+    ):
         separable.factor(brdf, terms=3, light=[sun])
 
 

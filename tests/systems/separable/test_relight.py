@@ -304,7 +304,9 @@ def test_brdfs_on_other_maps_are_not_joined(basis):
     maps = basis[1].light_map, basis[1].view_map
     smaller = (each[:, :10, :10] for each in maps)
     for other in (SeparableBrdf(*smaller, jnp.zeros(())), SeparableBrdf(*maps, jnp.zeros(()))):
-        with pytest.raises(ValueError, match="brdfs must be at least one, on maps of one kind, got"):
+        with pytest.raises(
+            ValueError, match="brdfs must be at least one, all with maps of the same resolution and coordinates, got"
+        ):
             join([basis[0], other])
     with pytest.raises(ValueError, match="got none"):
         join([])
@@ -363,7 +365,7 @@ def test_a_texture_on_one_brdf_multiplies_the_radiance(transport, factored, clos
 
 @pytest.mark.parametrize("terms", [(3,), (1, 1), (2, 2), (1, 1, 1)])
 def test_weights_that_do_not_fit_the_terms_are_refused(terms):
-    with pytest.raises(ValueError, match="terms must be one number for each of 2 weights that add up to the tuple's 3"):
+    with pytest.raises(ValueError, match="terms must hold one number for each of 2 weights and sum to the 3 terms"):
         separable.modulate(jnp.ones((7, 3, 3)), jnp.ones((7, 2, 1)), terms=terms)
 
 

@@ -183,7 +183,7 @@ def test_values_that_are_not_finite_are_refused(factored, field):
 @pytest.mark.parametrize("vertex", [4, -5])
 def test_vertices_that_are_not_there_are_refused(factored, vertex):
     mesh = prt.scene.builtin.plane(cells=1)
-    with pytest.raises(ValueError, match=rf"whole numbers below 4 in one row, got int64 \(2,\): \[ ?0 +{vertex}\]"):
+    with pytest.raises(ValueError, match=rf"array of indices below 4, got int64 \(2,\): \[ ?0 +{vertex}\]"):
         precompute(mesh, factored, keep=4, size=2, vertex=np.array([0, vertex]), progress=False)
 
 
