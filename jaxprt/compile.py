@@ -9,6 +9,7 @@ that stay in the cache, GPUs few large kernels.
 """
 
 import functools
+import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -27,6 +28,12 @@ Fixed = TypeVar("Fixed", bound=PyTree)
 
 _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
+# Memory mappings of this process, one in each line, and the file with their largest number. Only Linux has both.
+_MAPPINGS, _LIMIT = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/max_map_count")
+_FULL = 0.7  # of the largest number of mappings; one picture of twelve parts takes up to 0.4
+_FEW = 50  # traces that need no count; counting takes 20 ms
+_traces = 0  # since the last count
+
 
 def jit(function: Callable, **options: Any) -> Any:
     """`jax.jit` with matrix products that have the full precision of their dtype on every device.
@@ -44,10 +51,26 @@ def jit(function: Callable, **options: Any) -> Any:
 def _exact(function: Callable) -> Callable:
     @functools.wraps(function)
     def traced(*argument, **named):
+        global _traces
+        _traces += 1
         with jax.default_matmul_precision("highest"):
             return function(*argument, **named)
 
     return traced
+
+
+def make_room() -> None:
+    """Forgets all compiled programs of this process if they hold most of the memory mappings that Linux gives it.
+
+    Each loop of a program takes about three mappings of 65,530 (`vm.max_map_count`). Without any left, no program can
+    be compiled, and the process ends. Pictures of many views and scenes come to that, because numbers of points vary.
+    """
+    global _traces
+    if _traces < _FEW or not (_MAPPINGS.exists() and _LIMIT.exists()):
+        return
+    _traces = 0
+    if _MAPPINGS.read_bytes().count(b"\n") > _FULL * int(_LIMIT.read_text()):
+        jax.clear_caches()
 
 
 def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
