@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
-from jaxprt.compile import Between, finished, jit
+from jaxprt.compile import Between, finished, jit, make_room
 from jaxprt.image import rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation, tracing
@@ -151,6 +151,7 @@ def make(
     """
     if type(samples) is not int or samples not in SAMPLES:
         raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
+    make_room()
     samples, fold = SAMPLES[samples]
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
-from jaxprt.compile import Between, make_room
+from jaxprt.compile import Between
 from jaxprt.relit import interpolation, measuring, pictures, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
@@ -257,7 +257,6 @@ class RelitScene(System):
         return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
-        make_room()
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         materials, changed = scene_lamps.split(self.lamps, materials)
