@@ -30,7 +30,7 @@ _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
 # Memory mappings of this process, one in each line, and the file with their largest number. Only Linux has both.
 _MAPPINGS, _LIMIT = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/max_map_count")
-_FULL = 0.7  # of the largest number of mappings; one picture of twelve parts takes up to 0.4
+_FULL = 0.85  # of the largest number of mappings; one part of a picture takes up to 0.05
 _FEW = 50  # traces that need no count; counting takes 20 ms
 _traces = 0  # since the last count
 

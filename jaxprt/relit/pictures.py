@@ -103,6 +103,7 @@ class PictureView(eqx.Module):
         self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree], between: Between
     ) -> Float[Array, "m p c"]:
         """Colors of the points of a part."""
+        make_room()
         surface, eye = self.surface[own.number], self.camera.eye
         vertices = None if own.at_pixels else finished(at_vertices(surface, arriving, eye), between)
         if own.kept is not None:
@@ -151,7 +152,6 @@ def make(
     """
     if type(samples) is not int or samples not in SAMPLES:
         raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
-    make_room()
     samples, fold = SAMPLES[samples]
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):

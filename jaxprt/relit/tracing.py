@@ -24,7 +24,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt.brdf import Lambert
-from jaxprt.compile import jit
+from jaxprt.compile import jit, make_room
 from jaxprt.relit.casting import caster
 from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
 from jaxprt.scene import Mesh
@@ -111,6 +111,7 @@ class Reflections(eqx.Module):
         """
         rows, vertices = [], {}
         for each in self.hit:
+            make_room()
             surface, number = surfaces[each.number], each.number
             light = arriving[0][number], arriving[1][number], lamp
             matte = _is_matte(surface)
