@@ -237,8 +237,8 @@ def test_programs_are_forgotten_when_they_fill_the_memory_mappings(tmp_path, mon
 
     assert after(1000) == 1
     doubled.clear_cache()
-    assert after(80) == 0
-    assert jax.grad(lambda x: doubled(x) + after(80))(1.0) == 2
+    assert after(65) == 0
+    assert jax.grad(lambda x: doubled(x) + after(65))(1.0) == 2
 
 
 def test_nothing_is_forgotten_where_there_is_no_limit(tmp_path, monkeypatch):
