@@ -18,11 +18,11 @@ def execute(path: pathlib.Path) -> None:
     client = NotebookClient(
         notebook,
         kernel_name="python3",
+        store_widget_state=False,
         record_timing=False,
         resources={"metadata": {"path": path.parent}},
     )
     client.execute()
-    notebook.metadata.pop("widgets", None)
     for cell in notebook.cells:
         if "outputs" in cell:
             cell.outputs = [output for output in cell.outputs if _WIDGET not in output.get("data", {})]
