@@ -9,6 +9,7 @@ import pathlib
 import sys
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -16,6 +17,7 @@ import jaxprt as prt
 from jaxprt.relit import Clusters, Harmonics, Lobes
 from jaxprt.relit.exact import exact_picture
 from jaxprt.scene import TexturedMaterial, builtin
+from jaxprt.scene.environment import rotate
 from jaxprt.scene.mesh import ground_plane
 
 FOLDER = pathlib.Path(__file__).parent / "pictures"
@@ -108,22 +110,25 @@ def systems() -> None:
 
 def scenes() -> None:
     """Scenes with their materials, and meshes with one each, by lobes."""
-    pictures = {}
+    pictures, half = {}, jnp.diag(jnp.array([-1.0, 1.0, -1.0]))
+    courtyard = rotate(light("courtyard"), half)  # its bright side is before the objects
     for name in ("Duck", "CesiumMilkTruck", "BoxTextured"):
         scene = prt.load_scene(DATA / "scenes" / f"{name}.glb")
         ground = prt.Part("ground", ground_plane(scene.mesh, vertices=6000), matte(0.5))
         whole = prt.Scene([*scene.parts, ground])
         relit = prt.precompute(whole, system=Lobes(6), path=KEPT / f"{name} on a ground", progress=False)
-        pictures[name] = exposed(relit.picture(light("courtyard"), camera(scene.mesh)))
+        pictures[name] = exposed(relit.picture(courtyard, camera(scene.mesh)))
     for name, file, color, metallic, roughness, azimuth in (
         ("Stanford bunny, gold", "stanford_bunny.ply", (1.0, 0.71, 0.29), 1.0, 0.4, 0.0),
         ("Nefertiti, plaster", "nefertiti.ply", (0.8, 0.76, 0.7), 0.0, 0.8, 0.3),
         ("Suzanne, plastic", "suzanne.obj", (0.1, 0.3, 0.6), 0.0, 0.3, 0.4),
     ):
         mesh = prt.load_mesh(DATA / "meshes" / file)
+        if file == "nefertiti.ply":  # whose third axis points up
+            mesh = prt.scene.mesh.rotate(mesh, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
         material = TexturedMaterial(base_color=color, metallic=metallic, roughness=roughness)
         relit = prt.precompute(standing(mesh, material), system=Lobes(6), path=KEPT / name, progress=False)
-        pictures[name] = exposed(relit.picture(light("courtyard"), camera(mesh, azimuth=azimuth)))
+        pictures[name] = exposed(relit.picture(courtyard, camera(mesh, azimuth=azimuth)))
     sheet("scenes", pictures, columns=3)
 
 
