@@ -9,7 +9,6 @@ import pathlib
 import sys
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -24,6 +23,7 @@ FOLDER = pathlib.Path(__file__).parent / "pictures"
 KEPT = pathlib.Path(__file__).parents[1] / "output" / "gallery"  # what was precomputed, for later runs
 DATA = pathlib.Path(os.environ.get("JAXPRT_DATA", ""))
 EDGE = 384
+HALF = np.diag([-1.0, 1.0, -1.0])  # half a turn, which puts a light's bright side before the objects
 LIGHTS = {
     "Grace Cathedral": "grace_cross.hdr",
     "Eucalyptus Grove": "eucalyptus_rnl_cross.hdr",
@@ -63,10 +63,11 @@ def camera(mesh: prt.scene.Mesh, *, azimuth: float = 0.6, elevation: float = 0.3
     return prt.scene.camera.orbit(mesh, azimuth=azimuth, elevation=elevation, width=EDGE, height=EDGE)
 
 
-def exposed(image) -> np.ndarray:
-    """For the screen, as bright as the picture asks for."""
-    shown = prt.image.display(prt.image.expose(image, stops=prt.image.automatic_exposure(image)))
-    return np.round(255 * np.asarray(shown)).astype(np.uint8)
+def exposed(image, like=None) -> np.ndarray:
+    """For the screen, as bright as the middle of the picture, or of another one, asks for."""
+    middle = slice(EDGE // 4, 3 * EDGE // 4)
+    stops = prt.image.automatic_exposure((image if like is None else like)[middle, middle])
+    return np.round(255 * np.asarray(prt.image.display(prt.image.expose(image, stops=stops)))).astype(np.uint8)
 
 
 def sheet(name: str, pictures: dict[str, np.ndarray], *, columns: int) -> None:
@@ -87,7 +88,7 @@ def systems() -> None:
     """One scene by each system, and exactly, in one light."""
     mesh = prt.load_mesh(DATA / "meshes" / "spot.obj")
     scene = standing(mesh, TexturedMaterial(base_color=(0.6, 0.25, 0.1), metallic=0.0, roughness=0.35))
-    environment, eye, pictures = light("Grace Cathedral"), camera(mesh, azimuth=2.6), {}
+    environment, eye, pictures = rotate(light("Grace Cathedral"), HALF), camera(mesh, azimuth=2.6), {}
     made: dict[str, tuple[prt.relit.recipes.Recipe, int]] = {
         "harmonic, degree 4": (Harmonics(4), 0),
         "separable, 16 terms": (Clusters(16), 0),
@@ -100,18 +101,13 @@ def systems() -> None:
         if bounces == 0 and name.startswith("lobe"):
             exact = exact_picture(relit.scene, relit.shading, [environment], eye, most=2 * EDGE**2)
             pictures["exact (reference)"] = exact.color[0]
-    stops = prt.image.automatic_exposure(pictures["exact (reference)"])  # alike, to compare them
-    shown = {
-        name: np.round(255 * np.asarray(prt.image.display(prt.image.expose(each, stops=stops)))).astype(np.uint8)
-        for name, each in pictures.items()
-    }
+    shown = {name: exposed(each, pictures["exact (reference)"]) for name, each in pictures.items()}
     sheet("systems", shown, columns=3)
 
 
 def scenes() -> None:
     """Scenes with their materials, and meshes with one each, by lobes."""
-    pictures, half = {}, jnp.diag(jnp.array([-1.0, 1.0, -1.0]))
-    courtyard = rotate(light("courtyard"), half)  # its bright side is before the objects
+    pictures, courtyard = {}, rotate(light("courtyard"), HALF)
     for name in ("Duck", "CesiumMilkTruck", "BoxTextured"):
         scene = prt.load_scene(DATA / "scenes" / f"{name}.glb")
         ground = prt.Part("ground", ground_plane(scene.mesh, vertices=6000), matte(0.5))
