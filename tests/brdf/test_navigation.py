@@ -472,7 +472,7 @@ def test_scattered_points_keep_their_triangles(unchecked):
     triangle = make("one triangle")
     np.testing.assert_array_equal(triangle.pairs, [[0, 1], [0, 2], [1, 2]])
     np.testing.assert_array_equal(Line(jnp.arange(3.0)).pairs, [[0, 1], [1, 2]])
-    with pytest.raises(ValueError, match=r"at least two columns.*, got 19 points with 4 first coordinates"):
+    with pytest.raises(ValueError, match=r"at least two columns.*; got 19 points with 4 different first coordinates"):
         columns(ragged)
     with pytest.raises(ValueError, match="at least three pairs of coordinates"):
         columns(np.zeros((2, 2)))

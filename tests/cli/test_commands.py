@@ -216,7 +216,8 @@ def test_every_command_and_option_says_what_it_does():
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback(place):
-    script = "import jaxprt.cli.relight as r, time; print('up', flush=True); r._run = lambda *_: time.sleep(60); "
+    script = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "  # background jobs ignore it
+    script += "import jaxprt.cli.relight as r, time; print('up', flush=True); r._run = lambda *_: time.sleep(60); "
     script += "from jaxprt.cli.main import run; run()"
     process = subprocess.Popen(
         [sys.executable, "-c", script, "relight"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -404,7 +404,7 @@ def test_pictures_that_do_not_fit_are_refused(unchecked):
         raster.rasterize(mesh, camera, samples=2)
     with pytest.raises(ValueError, match=r"camera's 24 x 16 pixels, .* got \[24, 32, 4\]"):
         pixels.shading_points(fragments, mesh, _camera(width=16))
-    with pytest.raises(ValueError, match="of the mesh's 1 triangles, got triangle"):
+    with pytest.raises(ValueError, match="to the mesh's 1 triangles, got triangle"):
         pixels.shading_points(fragments, _mesh(*_soup(0, 1)), camera)
     with pytest.raises(ValueError, match="one per point, got"):
         pixels.resolve(points, jnp.ones((len(points.pixel) + 1, 3)))

@@ -266,7 +266,7 @@ def test_a_scenes_own_lights_are_planned_for(scene, sky):
     ("lights", "options", "message"),
     [
         ([], {}, "environments must be at least one, got none"),
-        ([4, 8], {}, "must be of one size"),
+        ([4, 8], {}, "must all have the same size"),
         ([8], {"error": 0.0}, "error must be positive and finite, got 0"),
         ([8], {"error": np.nan}, "error must be positive and finite, got nan"),
         ([8], {"rate": np.inf}, "rate must be positive and finite, got inf"),

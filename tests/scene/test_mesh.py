@@ -420,7 +420,7 @@ def test_join_renumbers_regions_consecutively_in_order():
 def test_a_face_in_two_regions_cannot_be_split():
     mesh = make_mesh(SQUARE, SQUARE_FACE, region=np.array([0, 0, 0, 1]))
     with pytest.raises(
-        ValueError, match=r"got 1 faces of 2 in several, the first is face 1 in the regions \[0, 0, 1\]"
+        ValueError, match=r"got 1 of 2 faces with corners in several, the first is face 1 in the regions \[0, 0, 1\]"
     ):
         split(mesh)
 

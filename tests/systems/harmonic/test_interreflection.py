@@ -280,7 +280,7 @@ def test_tables_of_another_degree_or_with_parameters_are_refused(mesh, matrix, l
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("options", [{"bounces": -1}, {"bounces": 1.5}, {"size": 12}])
 def test_bounces_and_sizes_out_of_range_are_refused(mesh, matrix, vector, lambert, options):
-    message = "bounces must be a whole number from 0" if "bounces" in options else "size a power of two"
+    message = "bounces must be a whole number of at least 0" if "bounces" in options else "size a power of two"
     with pytest.raises(ValueError, match=message):
         interreflect_diffuse(mesh, vector, ALBEDO, progress=False, **options)
     with pytest.raises(ValueError, match=message):
