@@ -101,7 +101,6 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     found = _describe(view, chosen)
     names = ", ".join(f"{each.name} {len(each.mesh.position)}" for each in view.scene.parts)
     click.echo(f"jaxprt {found['machine']['jaxprt']}: {names} vertices")
-    _warn_of_backs(view)
     made, changing = {}, None
     for system in systems:
         if system == "dynamic":
@@ -260,18 +259,6 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
             if isinstance(value, jax.Array | float | int)
         },
     }
-
-
-def _warn_of_backs(view: View) -> None:
-    """Warns on stderr if the normals of most visible triangles point away, as in an inside-out mesh."""
-    mesh, triangle = view.scene.parts[0].mesh, report.visible(view)
-    corner = np.asarray(mesh.face)[triangle[triangle < len(mesh.face)]]
-    normal, position = (np.asarray(field)[corner].mean(1) for field in (mesh.normal, mesh.position))
-    away = np.sum(normal * (np.asarray(view.camera.eye) - position), 1) < 0
-    if 2 * np.sum(away) > len(away):
-        message = f"{np.sum(away)} of {len(away)} triangles in the picture face away and will be black"
-        remedy = "If the mesh is inside out, with clockwise faces, reverse the corners of each face."
-        click.echo(f"Warning: {message}. {remedy}", err=True)
 
 
 def _text(found: dict[str, Any], path: Path) -> str:

@@ -11,13 +11,14 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
-from jaxprt.relit import lamps, reflection
+from jaxprt.relit import lamps, reflection, warn
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
+from jaxprt.scene.scene import default_camera
 from jaxprt.systems.protocol import Joined
 from jaxprt.visibility import UnfinishedError
 
@@ -56,7 +57,8 @@ def precompute(
             diffuse.
         rays: Number of reflection rays that each vertex or point of a sharp part sends. A part is sharp if its
             reflections are too sharp for the low-order harmonics that represent reflected light. 0 uses harmonics
-            alone. Only used with bounces; see `RelitScene.with_rays`.
+            alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Only used with
+            bounces; see `RelitScene.with_rays`.
         roughness: Smallest and largest roughness that parts with a `TexturedMaterial` or a `BlinnPhong` may have after
             precomputation, in addition to the roughness they have now. Requires `system` to be "lobe" or "harmonic". A
             range costs fitting time and table memory.
@@ -69,7 +71,8 @@ def precompute(
         progress: Whether to show progress bars.
 
     Returns:
-        The precomputed scene, with the methods `radiance` and `picture`.
+        The precomputed scene, with the methods `radiance` and `picture`. A warning names parts that the scene's camera
+        sees mostly from behind, where they are black, and BRDFs that reflect more light than they get.
 
     Raises:
         TypeError: `scene` is not a `Scene`; `system` is not a name, a recipe or a dictionary; `bounces` is not a whole
@@ -105,6 +108,7 @@ def precompute(
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
     mesh = scene.mesh
+    warn.of_backs(scene, mesh, default_camera(scene, mesh))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
@@ -132,6 +136,7 @@ def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) 
         check(recipe, shading)
     except ValueError as error:
         raise ValueError(f"part {part.name!r}: {error}") from None
+    warn.of_gain(part.name, shading, part.material)
     return shading
 
 

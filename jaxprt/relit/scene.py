@@ -19,8 +19,8 @@ from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.surface import Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
-from jaxprt.scene.camera import orbit
 from jaxprt.scene.points import Points
+from jaxprt.scene.scene import default_camera
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import PartBounces
 from jaxprt.systems.bounces.traced import SharpPart
@@ -136,7 +136,7 @@ class RelitScene(System):
         )
         pairs = zip(shading, direct.part, strict=True)
         self.curvature = jnp.asarray([interpolation.curvature(*each) for each in pairs], self.mesh.position.dtype)
-        self.camera = scene.cameras[0] if scene.cameras else orbit(self.mesh, azimuth=0.5, elevation=0.3)
+        self.camera = default_camera(scene, self.mesh)
 
     @property
     def system(self) -> Joined | Total:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene import mesh as meshes
-from jaxprt.scene.camera import Camera
+from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
@@ -192,6 +192,11 @@ class Scene(eqx.Module):
                 for part in self.parts
             ]
         )
+
+
+def default_camera(scene: Scene, mesh: Mesh) -> Camera:
+    """The first camera of a scene. If it has none, one that shows the mesh of all parts from slightly above."""
+    return scene.cameras[0] if scene.cameras else orbit(mesh, azimuth=0.5, elevation=0.3)
 
 
 def numbered(names: Sequence[str]) -> list[str]:

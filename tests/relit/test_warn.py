@@ -1,0 +1,89 @@
+"""Warnings of `precompute`: parts that are seen from behind, and BRDFs that create light."""
+
+import re
+import warnings
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.brdf import GGX, BlinnPhong, Lambert, MetallicRoughness
+from jaxprt.relit import warn
+from jaxprt.relit.channels import of_part
+from jaxprt.scene import Mesh, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene.camera import orbit
+from jaxprt.scene.mesh import make_mesh
+
+BALL = builtin.sphere(rings=8, sectors=16)
+
+
+def inside_out(mesh: Mesh) -> Mesh:
+    return make_mesh(np.asarray(mesh.position), np.asarray(mesh.face)[:, ::-1])
+
+
+def told(function, *arguments) -> list[str]:
+    """The texts of the warnings of a call."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        function(*arguments)
+    return [str(each.message) for each in caught]
+
+
+def seen(*mesh: Mesh, elevation: float = 0.3) -> list[str]:
+    """The warnings of a scene of some meshes, from all around it."""
+    scene = Scene([Part(str(number), each, Lambert()) for number, each in enumerate(mesh)])
+    return told(warn.of_backs, scene, scene.mesh, orbit(scene.mesh, elevation=elevation))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_inside_out_parts_are_named_at_any_size(size):
+    scaled = eqx.tree_at(lambda each: each.position, BALL, BALL.position * size)
+    assert seen(scaled) == []
+    (text,) = seen(inside_out(scaled))
+    assert re.search("sees 100% of part '0' from behind, and backs are black: .* inside out", text)
+
+
+def test_only_the_part_that_is_inside_out_is_named():
+    beside = eqx.tree_at(lambda each: each.position, BALL, BALL.position + np.float32([2.5, 0, 0]))
+    (text,) = seen(BALL, inside_out(beside))
+    assert "part '1'" in text
+
+
+@pytest.mark.parametrize(("elevation", "count"), [(0.5, 0), (-0.5, 1)])
+def test_a_plane_is_named_from_below(elevation, count):
+    assert len(seen(builtin.plane(cells=2), elevation=elevation)) == count
+
+
+def test_faces_of_both_orientations_and_mere_silhouettes_are_not_named():
+    both = make_mesh(
+        np.concatenate([np.asarray(BALL.position)] * 2),
+        np.concatenate([np.asarray(BALL.face), np.asarray(BALL.face)[:, ::-1] + len(BALL.position)]),
+        normal=np.concatenate([np.asarray(BALL.normal), -np.asarray(BALL.normal)]),
+    )
+    assert seen(both) == []
+    assert seen(builtin.chess()) == []
+
+
+@pytest.mark.parametrize(
+    ("brdf", "gain"),
+    [
+        (Lambert(1.0), None),
+        (Lambert((0.2, 1.5, 0.1)), "1.5"),
+        (BlinnPhong(0.8, 0.9, 40.0), "1.27"),
+        (GGX(1.0, 0.05), None),
+        (MetallicRoughness(base_color=(200.0, 30.0, 20.0), metallic=0.0), "19"),
+        (TexturedMaterial(base_color=1.0, metallic=0.0, roughness=0.1), None),
+    ],
+)
+def test_brdfs_that_create_light_are_named(brdf, gain):
+    part = Part("ball", BALL, brdf)
+    text = told(warn.of_gain, part.name, of_part(part), part.material)
+    assert len(text) == (gain is not None)
+    assert gain is None or f"the BRDF of part 'ball' reflects {gain}" in text[0]
+
+
+def test_precompute_warns_of_both():
+    scene = Scene([Part("ball", inside_out(BALL), Lambert(1.5))])
+    with pytest.warns(UserWarning, match="from behind"), pytest.warns(UserWarning, match=r"reflects 1\.5 times"):
+        prt.precompute(scene, system="harmonic", size=2, progress=False)
