@@ -88,7 +88,7 @@ def precompute(
     if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
         raise ValueError(f"size must be a power of two, got {size!r}")
     reflection.check(bounces)
-    if roughness is not None and not (len(roughness) == 2 and 0 <= roughness[0] <= roughness[1] <= 1):
+    if roughness is not None and not (np.shape(roughness) == (2,) and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
     if roughness is not None and system is None:
         raise ValueError(

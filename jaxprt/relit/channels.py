@@ -264,9 +264,10 @@ def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
     low, high = roughness_range(shading)
     inside = (new.roughness >= low - _EQUAL) & (new.roughness <= high + _EQUAL)
     if _known(inside) and not np.all(np.asarray(inside)):
+        given = jax.lax.stop_gradient(new.roughness)
         raise ValueError(
             f"part {name!r} was precomputed for roughness from {low:.3f} to {high:.3f}, got a material from "
-            f"{jnp.min(new.roughness):.3f} to {jnp.max(new.roughness):.3f}: precompute it with a material that covers "
+            f"{jnp.min(given):.3f} to {jnp.max(given):.3f}: precompute it with a material that covers "
             "both ranges"
         )
     return fits & inside

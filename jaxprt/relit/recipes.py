@@ -27,6 +27,7 @@ _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low 
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
 _VARYING = 0.02  # error of harmonic tables over roughness
 _DIFFUSE = 32  # factor on the number of single texels of Lambertian parts
+_PAIRS = 256  # pairs of directions at which BRDFs are tried
 
 
 class Known:
@@ -275,11 +276,30 @@ def check(recipe: Recipe, shading: Shading) -> None:
     """Refuses a part that a recipe does not support.
 
     Raises:
-        ValueError: The roughness of the part varies, but the recipe factors a single BRDF.
+        ValueError: The roughness of the part varies, but the recipe factors a single BRDF; or the part has a BRDF that
+            returns values that are negative, not finite, or without an axis of colors.
     """
+    if shading.blend is None:
+        _check_values(shading.exact)
     if shading.knot and isinstance(recipe, Terms | Clusters):
         low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
         raise ValueError(
             f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
             f"{high:.2f}: use the lobe or the harmonic system"
+        )
+
+
+def _check_values(brdf: Callable) -> None:
+    """Refuses a BRDF by its values at some pairs of directions."""
+    random = np.random.default_rng(0).normal(size=(2, _PAIRS, 3))
+    random[..., 2] = np.abs(random[..., 2])
+    wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.result_type(float))
+    value = np.asarray(brdf(wi, wo))
+    if value.ndim != 2 or len(value) != _PAIRS:
+        raise ValueError(f"the BRDF must return [{_PAIRS}, c] for {_PAIRS} directions, got {list(value.shape)}")
+    wrong = np.flatnonzero(~(np.isfinite(value) & (value >= 0)).all(1))
+    if wrong.size:
+        raise ValueError(
+            f"the BRDF must be finite and not negative, got {value[wrong[0]]} for wi = {np.asarray(wi)[wrong[0]]}, "
+            f"wo = {np.asarray(wo)[wrong[0]]}"
         )

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.scene.mesh import Mesh, bounds
 
+_MOST = 2**31 - 1  # pixels that the rasterizer's 32-bit indices can count
+
 
 def _floating(value) -> Array:
     """Numbers converted to a floating-point array."""
@@ -40,12 +42,15 @@ class Camera(eqx.Module):
 
     def __check_init__(self):
         """Refuses places, directions and angles that are not finite."""
-        for name in ("eye", "target", "up", "field_of_view"):
-            require.finite(f"the camera's {name}", getattr(self, name))
+        for name in ("eye", "target", "up"):
+            require.position(f"the camera's {name}", getattr(self, name))
+        require.finite("the camera's field_of_view", self.field_of_view)
         for name in ("width", "height"):
             value = getattr(self, name)
             if not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"the camera's {name} must be a whole number of pixels, at least 1, got {value!r}")
+        if self.width * self.height > _MOST:
+            raise ValueError(f"a picture must have at most {_MOST} pixels, got {self.width} x {self.height}")
         known = [None if isinstance(x, Tracer) else np.asarray(x) for x in (self.field_of_view, self.eye, self.target)]
         angle, eye, target = known
         if angle is not None and not np.all((angle > 0) & (angle < np.pi)):

@@ -330,6 +330,7 @@ def radiance(
     _check(system)
     require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
     *batch, faces, rows, columns, colors = environment.radiance.shape
+    eye = eye if isinstance(eye, jax.Array) else jnp.asarray(eye, jnp.result_type(float))
     view = system.view(eye, materials)
     if not batch:
         return system.combine(system.shade(system.light(environment), materials), view)

@@ -431,7 +431,7 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for size in (0, 12, -8):
         with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
             prt.precompute(scene(), system="harmonic", size=size)
-    for rough in ((0.5, 0.1), (-0.1, 0.2), (0.1, 1.2), (0.1,), (float("nan"), 1.0)):
+    for rough in ((0.5, 0.1), (-0.1, 0.2), (0.1, 1.2), (0.1,), (float("nan"), 1.0), 0.5):
         with pytest.raises(ValueError, match="roughness must be two numbers from 0 to 1, the smaller one first, got"):
             prt.precompute(scene(), system="harmonic", roughness=rough)
     with pytest.raises(ValueError, match="roughness must be given together with a system"):
@@ -471,6 +471,18 @@ def test_materials_that_a_scene_cannot_have_are_refused(name):
         relit("lobe").radiance(light(), eye=EYE, materials=materials)
 
 
+def test_a_gradient_in_a_roughness_that_was_not_precomputed_says_so():
+    ready = relit("lobe")
+    floor = ready.scene["floor"].material
+
+    def total(roughness):
+        changed = {"floor": eqx.tree_at(lambda each: each.roughness, floor, roughness)}
+        return jnp.sum(ready.radiance(light(), eye=EYE, materials=changed))
+
+    with pytest.raises(ValueError, match=r"'floor' was precomputed for roughness from .* got a material from 0\."):
+        jax.grad(total)(jnp.asarray(1.0))
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_lights_eyes_and_cameras_of_another_kind_are_refused():
     ready = relit("lobe")
@@ -485,5 +497,8 @@ def test_lights_eyes_and_cameras_of_another_kind_are_refused():
         ready.picture(light(), EYE)
     with pytest.raises(ValueError, match="the eye must be one position"):
         ready.view(jnp.ones(2))
+    np.testing.assert_array_equal(
+        ready.radiance(light(), eye=np.asarray(EYE).tolist()), ready.radiance(light(), eye=EYE)
+    )
     with pytest.raises(TypeError, match=r"the view must be of class SceneView, which RelitScene\.view makes"):
         ready.combine(ready.light(light()), EYE)

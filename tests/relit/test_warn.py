@@ -87,3 +87,17 @@ def test_precompute_warns_of_both():
     scene = Scene([Part("ball", inside_out(BALL), Lambert(1.5))])
     with pytest.warns(UserWarning, match="from behind"), pytest.warns(UserWarning, match=r"reflects 1\.5 times"):
         prt.precompute(scene, system="harmonic", size=2, progress=False)
+
+
+@pytest.mark.parametrize("system", ["harmonic", "lobe", "separable"])
+@pytest.mark.parametrize(
+    ("brdf", "message"),
+    [
+        (lambda wi, wo: -wi[..., 2:], "must be finite and not negative"),
+        (lambda wi, wo: 0 * wi[..., 2:] + np.nan, "must be finite and not negative"),
+        (lambda wi, wo: 0.3, r"must return \[256, c\] for 256 directions, got \[\]"),
+    ],
+)
+def test_brdfs_of_wrong_values_are_refused_by_every_system(system, brdf, message):
+    with pytest.raises(ValueError, match=f"part 'ball': the BRDF {message}"):
+        prt.precompute(Scene([Part("ball", BALL, brdf)]), system=system, size=4, progress=False)

@@ -92,6 +92,13 @@ def test_a_camera_keeps_double_precision(x64):
     assert Camera(np.array([0.1, 0, 4]), np.zeros(3), [0, 1, 0], 1, 8, 6).eye.dtype == jnp.float64
 
 
+def test_positions_of_two_numbers_and_pictures_that_cannot_be_counted_are_refused(unchecked):
+    with pytest.raises(ValueError, match=r"the camera's target must be one position, \[3\], got .* \[2\]"):
+        Camera([1.0, 2, 3], [0.0, 0], [0.0, 1, 0], 0.6, 8, 6)
+    with pytest.raises(ValueError, match="at most 2147483647 pixels, got 100000 x 100000"):
+        Camera([1.0, 2, 3], [0.0, 0, 0], [0.0, 1, 0], 0.6, 100000, 100000)
+
+
 @pytest.mark.parametrize("place", range(4))
 def test_places_and_angles_that_are_not_finite_are_refused_by_name_unless_they_are_traced(place):
     value = [[1.0, 2, 3], [0.0, 0, 0], [0.0, 1, 0], 0.6]
