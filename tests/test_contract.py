@@ -199,6 +199,7 @@ HOST = {
     "scene.formats.mitsuba_material": "reads files",
     "scene.formats.file_parts": "NumPy, where data enters",
     "scene.scene.numbered": "names",
+    "scene.scene.default_camera": "measures a mesh on the host",
     "scene.formats.scene_file": "reads files",
     "scene.texture.dpdu": "reads a mesh on the host",
     "scene.texture.handedness": "the same",

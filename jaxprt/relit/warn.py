@@ -20,6 +20,8 @@ _GAIN = 1.02  # mean albedo up to which a BRDF may be 1 and rounded
 def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     """Warns of parts of which a camera sees mostly the back, as in inside-out meshes. Backs are black.
 
+    Parts that emit light are left out: lamps are often seen from behind.
+
     Args:
         scene: The scene.
         mesh: The mesh of all parts, `scene.mesh`.
@@ -33,6 +35,8 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     away = ~front(occluder, np.asarray(mesh.normal), corner, way[met])
     own = np.asarray(mesh.region)[corner[:, 0]]
     for number, part in enumerate(scene.parts):
+        if isinstance(part.material, TexturedMaterial) and np.any(np.asarray(part.material.emissive)):
+            continue
         seen = away[own == number]
         if len(seen) > _SMALLEST * len(way) and np.mean(seen) > 0.5:
             warnings.warn(

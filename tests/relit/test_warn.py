@@ -55,6 +55,11 @@ def test_a_plane_is_named_from_below(elevation, count):
     assert len(seen(builtin.plane(cells=2), elevation=elevation)) == count
 
 
+def test_lamps_may_be_seen_from_behind():
+    scene = Scene([Part("lamp", builtin.plane(cells=2), TexturedMaterial(emissive=2.0))])
+    assert told(warn.of_backs, scene, scene.mesh, orbit(scene.mesh, elevation=-0.5)) == []
+
+
 def test_faces_of_both_orientations_and_mere_silhouettes_are_not_named():
     both = make_mesh(
         np.concatenate([np.asarray(BALL.position)] * 2),
