@@ -14,7 +14,7 @@ from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.brdf.navigation import Family
 from jaxprt.cli.inputs import about
 from jaxprt.cli.report import Made, View
-from jaxprt.relit import regions
+from jaxprt.relit import regions, warn
 from jaxprt.scene import Camera, TexturedMaterial
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import bounces, dynamic, protocol, separable
@@ -66,7 +66,8 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
     changing = [each for each in materials if isinstance(each, CookTorrance)]
     if not changing:
         raise ValueError("the dynamic system needs a part that can change: give --brdf or --material cook-torrance")
-    start = timeit.default_timer()
+    start, mesh = timeit.default_timer(), view.scene.mesh
+    warn.of_backs(view.scene, mesh, view.camera)
     rough = sorted({*ROUGHNESS, *(float(each.roughness) for each in changing)})
     # The model is linear in F0, and so is interpolation between columns, so two values of F0 are enough.
     family = navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), rough))))
@@ -77,7 +78,7 @@ def prepare(view: View, output: Path, *, terms: int, reflections: int | str) -> 
         if not isinstance(each, CookTorrance)
     }
     cost: dict[str, Any] = {"fit_seconds": timeit.default_timer() - start}
-    start, mesh, store = timeit.default_timer(), view.scene.mesh, output / "dynamic"
+    start, store = timeit.default_timer(), output / "dynamic"
     size = next(iter(view.lights.values())).radiance.shape[-2]
     brdfs = [fixed.get(number, members) for number in range(len(materials))]
     transport = dynamic.precompute(mesh, brdfs, size=size, path=store / "direct")

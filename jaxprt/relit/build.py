@@ -108,6 +108,8 @@ def precompute(
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
     mesh = scene.mesh
+    for part, shading in zip(scene.parts, shadings, strict=True):
+        warn.of_gain(part.name, shading, part.material)
     warn.of_backs(scene, mesh, default_camera(scene, mesh))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
@@ -136,7 +138,6 @@ def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) 
         check(recipe, shading)
     except ValueError as error:
         raise ValueError(f"part {part.name!r}: {error}") from None
-    warn.of_gain(part.name, shading, part.material)
     return shading
 
 

@@ -62,5 +62,5 @@ def of_gain(name: str, shading: Shading, material: object) -> None:
         warnings.warn(
             f"the BRDF of part {name!r} reflects {gain:.3g} times the light that it gets, averaged over directions: "
             "surfaces that do not emit reflect at most 1; colors are from 0 to 1",
-            stacklevel=4,
+            stacklevel=3,
         )

@@ -385,14 +385,16 @@ def test_two_skies_of_one_name_are_both_relit(place, glossy):
     assert np.abs(first - second).max() > 0.1
 
 
+@pytest.mark.parametrize("system", [("separable",), ("dynamic", "--brdf", "cook-torrance")])
 @pytest.mark.parametrize(("mesh", "count"), [("mesh.obj", 0), ("inside_out.obj", 1)])
-def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
+def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count, system):
     swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
     (place / "inside_out.obj").write_text(swapped)
     monkeypatch.setattr(prt.separable, "factor", stop)
+    monkeypatch.setattr(prt.dynamic, "separate", stop)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        assert run(place, mesh=mesh, output=tmp_path) == 130
+        assert run(place, "--system", *system, mesh=mesh, output=tmp_path) == 130
     warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Warning: ")]
     assert len(warned) == count
     assert not count or re.search(r"sees 100% of part .* from behind, and backs are black: .* inside out", warned[0])
