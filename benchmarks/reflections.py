@@ -8,12 +8,12 @@ Duck of Khronos' samples on a ground, two sides of chess, and a room. Each is lo
 `roughness` have one roughness on all parts that are not grounds, half of them metals.
 
 Mitsuba traces the same triangles and materials, two bounces too (our rays show one more), twice with unlike seeds, so
-that noise falls out of each squared error. Pixels are means over squares there, and over 16 samples here; `_of_4_samples` are the errors of
-4. `error` is that of the whole picture, `indirect_error` that of light that was reflected at least once, relative to
-that light; both are relative L2 over the pixels that surfaces fill, and the medians over the triples.
-`indirect_fraction` is how much of the picture the indirect part is. `seconds` are of a new picture of 16 samples, rays
-included. Without LLVM of version 17 or newer, which Mitsuba
-needs, there are no errors. A store keeps Mitsuba's pictures too, so that a run that was stopped goes on.
+that noise falls out of each squared error. Pixels are means over squares there, and over 16 samples here;
+`_of_4_samples` are the errors of 4. `error` is that of the whole picture, `indirect_error` that of light that was
+reflected at least once, relative to that light; both are relative L2 over the pixels that surfaces fill, and the
+medians over the triples. `indirect_fraction` is how much of the picture the indirect part is. `seconds` are of a new
+picture of 16 samples, rays included. Without LLVM of version 17 or newer, which Mitsuba needs, there are no errors. A
+store keeps Mitsuba's pictures too, so that a run that was stopped goes on.
 """
 
 import dataclasses
