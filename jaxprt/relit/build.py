@@ -108,8 +108,7 @@ def precompute(
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
     shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
     mesh = scene.mesh
-    for part, shading in zip(scene.parts, shadings, strict=True):
-        warn.of_gain(part.name, shading, part.material)
+    warn.of_gain(scene, shadings)
     warn.of_backs(scene, mesh, default_camera(scene, mesh))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -47,20 +48,20 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
             )
 
 
-def of_gain(name: str, shading: Shading, material: object) -> None:
-    """Warns of a BRDF that reflects more light than it gets. `TexturedMaterial` refuses such colors itself.
+def of_gain(scene: Scene, shadings: Sequence[Shading]) -> None:
+    """Warns of BRDFs that reflect more light than they get. `TexturedMaterial` refuses such colors itself.
 
     Args:
-        name: Name of the part.
-        shading: The `Shading` of the part.
-        material: The material of the part.
+        scene: The scene.
+        shadings: The `Shading` of each part.
     """
-    if isinstance(material, TexturedMaterial):
-        return
-    gain = float(np.max(paths.channels(shading.exact)))
-    if gain > _GAIN:
-        warnings.warn(
-            f"the BRDF of part {name!r} reflects {gain:.3g} times the light that it gets, averaged over directions: "
-            "surfaces that do not emit reflect at most 1; colors are from 0 to 1",
-            stacklevel=3,
-        )
+    for part, shading in zip(scene.parts, shadings, strict=True):
+        if isinstance(part.material, TexturedMaterial):
+            continue
+        gain = float(np.max(paths.channels(shading.exact)))
+        if gain > _GAIN:
+            warnings.warn(
+                f"the BRDF of part {part.name!r} reflects {gain:.3g} times the light that it gets, averaged over "
+                "directions: surfaces that do not emit reflect at most 1; colors are from 0 to 1",
+                stacklevel=3,
+            )

@@ -83,7 +83,7 @@ def test_faces_of_both_orientations_and_mere_silhouettes_are_not_named():
 )
 def test_brdfs_that_create_light_are_named(brdf, gain):
     part = Part("ball", BALL, brdf)
-    text = told(warn.of_gain, part.name, of_part(part), part.material)
+    text = told(warn.of_gain, Scene([part]), [of_part(part)])
     assert len(text) == (gain is not None)
     assert gain is None or f"the BRDF of part 'ball' reflects {gain} times" in text[0]
 
