@@ -1,0 +1,76 @@
+"""Input files: only regular ones that fit into memory, and, for what a scene refers to, only those in its folder."""
+
+import pathlib
+import stat
+
+from jaxprt import require
+
+
+def check(path: pathlib.Path, what: str) -> None:
+    """Refuses what is not a regular file. A pipe in place of a file would block forever.
+
+    Args:
+        path: The file.
+        what: Kind of the file for messages, such as "a mesh file".
+
+    Raises:
+        FileNotFoundError: Nothing has this name.
+        ValueError: It is a directory, a pipe, a device or a socket.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileNotFoundError(f"{path} must be {what}, and there is no such file") from error
+    except ValueError as error:  # a null character
+        raise ValueError(f"{str(path)!r} must be the path of {what}, got one that no file can have") from error
+    if not stat.S_ISREG(mode):
+        raise ValueError(f"{path} must be {what}, got a {'directory' if stat.S_ISDIR(mode) else 'special file'}")
+
+
+def content(path: pathlib.Path, what: str) -> bytes:
+    """The bytes of a regular file.
+
+    Args:
+        path: The file.
+        what: Kind of the file for messages, such as "a mesh file".
+
+    Raises:
+        FileNotFoundError: Nothing has this name.
+        ValueError: It is a directory, a pipe, a device or a socket.
+        MemoryError: The file does not fit into memory.
+    """
+    check(path, what)
+    require.memory(f"the bytes of {path}", path.stat().st_size, "free some memory, or make the file smaller")
+    return path.read_bytes()
+
+
+def inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outside: bool) -> pathlib.Path:
+    """Refuses a file that a scene refers to and that is not in the scene's folder.
+
+    `..`, absolute paths and symbolic links are resolved first. A scene from a stranger could otherwise read any file of
+    the user, whose bytes would become vertices or texels and leave with an exported page.
+
+    Args:
+        path: The file, as the scene refers to it.
+        folder: Folder of the scene.
+        owner: What refers to the file, for the message: "scene.gltf, image 2".
+        outside: Whether files outside of the folder are allowed.
+
+    Returns:
+        The path, unchanged.
+
+    Raises:
+        ValueError: The file is outside of the folder. The message names the file.
+    """
+    if outside:
+        return path
+    try:
+        target, home = path.resolve(), folder.resolve()
+    except (OSError, ValueError, RuntimeError) as error:  # a null character, or links in a circle
+        raise ValueError(f"{owner} must refer to a file, got {str(path)!r}: {error}") from error
+    if not target.is_relative_to(home):
+        raise ValueError(
+            f"{owner} must refer to files in the folder of the scene, {home}, got {target}, which is outside of it: "
+            "move the file into the folder, or call load_scene(path, outside=True) if you trust the scene"
+        )
+    return path
