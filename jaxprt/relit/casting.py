@@ -62,7 +62,7 @@ class Caster:
             start = self.start[corner[:, 0]]
         else:
             corner = first + np.asarray(points.corner).T
-            start = point_starts(self.mesh, Points(jnp.asarray(corner.T), points.weight), self.occluder)
+            start = point_starts(self.mesh, Points(jnp.asarray(corner.T), points.weight))
         ray, own = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
         found, weight = first_fronts(self.occluder, self.normal, start[own], np.ascontiguousarray(way[ray, own]))

@@ -181,7 +181,7 @@ def _judged(
     brdf = brdf if isinstance(brdf, PerVertex) else grid.as_argument(brdf)
     batch = Environment(jnp.stack([light.radiance for light in environments]))
     rays = visibility.Occluder(scene)
-    start, normal = visibility.point_starts(mesh, points, rays), np.asarray(frame[:, 2], np.float32)
+    start, normal = visibility.point_starts(mesh, points), np.asarray(frame[:, 2], np.float32)
     traced, _ = visibility.fractional(rays, start, normal, size=batch.radiance.shape[-2])
 
     def radiance(seen: np.ndarray) -> np.ndarray:

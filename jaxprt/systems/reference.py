@@ -80,7 +80,7 @@ def radiance(
     elif vertex is not None:
         raise ValueError("give either vertices or points, got both")
     else:
-        start = visibility.point_starts(mesh, points, rays)
+        start = visibility.point_starts(mesh, points)
         vertex = np.arange(len(points))
         position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
     position, frame = np.asarray(position), np.asarray(frame)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
-from jaxprt.visibility.occluder import Occluder
+from jaxprt.visibility.occluder import Occluder, offsets
 from jaxprt.visibility.rays import start_points
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
@@ -25,11 +25,12 @@ class DiffuseTracer:
         pool: Threads that trace the rays.
 
     Attributes:
-        nudge: Distance of ray origins from the surface.
+        offset: Distance of ray origins from each triangle of the surface.
         casts: Which triangles of the surface are in the occluder.
         double: Which triangles of the surface have the same corners as another triangle: the two sides of a sheet.
     """
 
+    offset: Float32[np.ndarray, " f"]
     casts: Bool[np.ndarray, " f"]
     double: Bool[np.ndarray, " f"]
 
@@ -38,7 +39,7 @@ class DiffuseTracer:
         # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
-        self.nudge = self._rays.nudge
+        self.offset = offsets(mesh.position, mesh.face)
         count = len(mesh.face)
         corner = np.concatenate([mesh.face, occluder.face + len(mesh.position)])
         place = subdivision.places(np.concatenate([mesh.position, occluder.position]))
@@ -57,6 +58,7 @@ class DiffuseTracer:
         position: Float[np.ndarray, "v 3"],
         normal: Float[np.ndarray, "v 3"],
         around: Int[np.ndarray, "n 3"],
+        offset: Float32[np.ndarray, " n"],
         casting: Int[np.ndarray, "m 3"],
         vertex: Int[np.ndarray, " p"],
     ) -> Float32[np.ndarray, "p l c"]:
@@ -66,6 +68,7 @@ class DiffuseTracer:
             position: Positions of all vertices.
             normal: Normals of all vertices, of any length.
             around: Vertex indices of all triangles around the vertices `vertex`.
+            offset: Distance of ray origins from each of these triangles, that of the triangle which it is part of.
             casting: Vertex indices of the subdivided triangles that belong to the occluder.
             vertex: Indices of the vertices at which radiance is wanted.
 
@@ -80,7 +83,7 @@ class DiffuseTracer:
         place, face = (
             np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
         )
-        start = start_points(mesh, Occluder(_mesh(place, face)))
+        start = start_points(mesh, Occluder(_mesh(place, face)), offset=offset)
         return self._light(start[index[around.size :]], normal[vertex])
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.visibility.occluder import Occluder
+from jaxprt.visibility.occluder import offsets
 
 
 class PointVisibility(eqx.Module):
@@ -42,23 +42,26 @@ class PointVisibility(eqx.Module):
         return self.points.carry(self.vertices.visible(texel), axis=1)
 
 
-def point_starts(mesh: Mesh, points: Points, occluder: Occluder) -> Float32[np.ndarray, "p 3"]:
-    """Origins of rays from surface points, slightly off the triangle on the side of the shading normal.
+def point_starts(mesh: Mesh, points: Points) -> Float32[np.ndarray, "p 3"]:
+    """Origins of rays from surface points, off the triangle by what rounding needs, on the side of the shading normal.
 
     Args:
         mesh: The mesh.
         points: Points on the mesh's triangles.
-        occluder: Geometry that casts shadows.
 
     Raises:
         ValueError: The points do not have three corners.
     """
     if len(points.corner) != 3:
         raise ValueError(f"points must have three corners, got {len(points.corner)}")
-    a, b, c = np.asarray(mesh.position, np.float64)[np.asarray(points.corner)]
+    corner = np.asarray(points.corner)
+    position = np.asarray(mesh.position, np.float32)
+    a, b, c = position[corner].astype(np.float64)
     normal = np.asarray(points.carry(mesh.normal), np.float64)
     facing = np.cross(b - a, c - a)
     length = np.linalg.norm(facing, axis=1, keepdims=True)
     facing = np.where(length > 0, facing / np.where(length > 0, length, 1), normal)
     side = np.where(np.sum(facing * normal, 1, keepdims=True) < 0, -1.0, 1.0)
-    return np.asarray(points.carry(mesh.position) + occluder.nudge * side * facing, np.float32)
+    weight = np.asarray(points.weight, np.float64)  # a rounded sum would move points out of the plane
+    place = np.einsum("kp,kpi->pi", weight / weight.sum(0), np.stack([a, b, c]))
+    return (place + offsets(position, corner.T)[:, None] * side * facing).astype(np.float32)

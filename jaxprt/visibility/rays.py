@@ -18,15 +18,19 @@ from jaxprt.files.arrays import sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import blocks
-from jaxprt.visibility.occluder import Occluder, check
+from jaxprt.visibility.occluder import Occluder, check, offsets
 
-ALGORITHM = 2  # version of the ray casting; raised by a release whose rays give other results
+ALGORITHM = 3  # version of the ray casting; raised by a release whose rays give other results
 ROUNDING = 3e-6  # relative to the norm: larger than the rounding error of single precision
 BLOCK = 64  # vertices in a block: a fraction of a second of work
 LEVELS = 16  # visibility is stored in sixteenths: 4 x 4 rays per texel
 _SIDE = 4
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
-_SINK = 0.02  # largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal
+# Largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal, and of the longest edge of
+# the triangle above.
+_SINK, _SINK_EDGE = 0.02, 1.0
+_BACK = 1.25  # how far rays go back to the vertex, in offsets
+_STEEPEST = 0.25  # smallest cosine between the direction off the surface and the normals of faces around a vertex
 
 
 @dataclass(frozen=True)
@@ -48,29 +52,40 @@ class RayCount:
         return RayCount(self.rays + other.rays, self.texels + other.texels, self.supersampled + other.supersampled)
 
 
-def start_points(mesh: Mesh, occluder: Occluder) -> Float32[np.ndarray, "v 3"]:
+def start_points(
+    mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None
+) -> Float32[np.ndarray, "v 3"]:
     """Origins of the rays of each vertex, slightly off the surface.
 
     The origin lies on the side of all faces around the vertex to which its shading normal points. A face therefore
-    never shadows its own front, however far the shading normal leans. If a vertex lies inside a simplified occluder,
-    its rays start where they leave the occluder. If a vertex touches another surface, its rays start on the open side
-    of that surface, so that light does not leak in from below.
+    never shadows its own front, however far the shading normal leans. The distance from these faces is what rounding
+    needs there. If a vertex lies inside a simplified occluder, its rays start where they leave the occluder. If a
+    vertex touches another surface, its rays start on the open side of that surface, so that light does not leak in
+    from below.
+
+    Args:
+        mesh: The mesh.
+        occluder: Geometry that casts shadows.
+        offset: Distance of the origins from each face of the mesh; None computes it from the face's corners. A face
+            that lies in a larger triangle of the occluder needs the offset of that triangle.
 
     Raises:
         ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
             finite.
     """
     check(mesh, "mesh")
-    position = np.asarray(mesh.position, np.float32)
-    out = _outward(mesh)
-    nudge = np.float32(occluder.nudge)
-    start = position + nudge * out
+    position, face = np.asarray(mesh.position, np.float32), np.asarray(mesh.face)
+    out, steepness = _outward(mesh)
+    distance = offsets(position, np.arange(len(position))[:, None])  # of vertices without faces
+    np.maximum.at(distance, face.ravel(), np.repeat(offsets(position, face) if offset is None else offset, 3))
+    distance = (distance / np.maximum(steepness, _STEEPEST))[:, None].astype(np.float32)
+    start = position + distance * out
     foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
     if foreign.any():
-        start[foreign] = _surface(occluder, position[foreign], out[foreign])
-    own = ~foreign
-    if own.any():
-        start[own] = _off_contact(occluder, position[own], start[own], out[own])
+        start[foreign] = _surface(occluder, position[foreign], out[foreign], distance[foreign])
+    exact = ~foreign
+    if exact.any():
+        start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
     return start
 
 
@@ -288,61 +303,74 @@ def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
     return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
 
 
-def _outward(mesh: Mesh) -> np.ndarray:
+def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors that point off the surface, to the side of each vertex's shading normal.
 
     They average the normals of all faces at the same position. Where vertices are split along a crease, faces across
     the crease count too; otherwise a ray could start inside of them.
+
+    Returns:
+        The vectors, and for each vertex the smallest cosine between its vector and the normals of its faces.
     """
     position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
     facing = _face_normal(position, face)
+    side = [np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)[:, None] for corner in face.T]
     own = np.zeros_like(normal)
-    for corner in face.T:
-        side = np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)
+    for corner, sign in zip(face.T, side, strict=True):
         for axis in range(3):
-            own[:, axis] += np.bincount(corner, facing[:, axis] * side, len(normal))
+            own[:, axis] += np.bincount(corner, (facing * sign)[:, axis], len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
     joint = np.stack([np.bincount(place, own[:, axis]) for axis in range(3)], 1)[place]
     # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     total = np.where(np.sum(joint * own, 1, keepdims=True) > 1e-6 * np.sum(own * own, 1, keepdims=True), joint, own)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal).astype(np.float32)
+    out = np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal)
+    steepness = np.ones(len(normal))
+    for corner, sign in zip(face.T, side, strict=True):
+        # Degenerate faces have no normal and need no distance.
+        cosine = np.where(np.any(facing, axis=1), np.sum(facing * sign * out[corner], 1), 1.0)
+        np.minimum.at(steepness, corner, cosine)
+    return out.astype(np.float32), steepness
 
 
-def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray) -> np.ndarray:
+def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Ray origins of vertices that are not vertices of the occluder, which then only approximates the mesh."""
-    triangle, distance, _ = occluder.hit(position - np.float32(occluder.nudge) * out, out)
+    triangle, distance, _ = occluder.hit(position - offset * out, out)
+    corner = occluder.position[occluder.face[triangle]]
+    edge = np.linalg.norm(corner - np.roll(corner, 1, 1), axis=2).max(1)
+    sink = np.minimum(_SINK * occluder.diagonal, _SINK_EDGE * edge)
     facing = _face_normal(occluder.position, occluder.face)[triangle]
-    leaving = (triangle >= 0) & (distance < _SINK * occluder.diagonal) & (np.sum(facing * out, 1) > 0)
-    depth = np.where(leaving, distance, 0) + occluder.nudge
+    leaving = (triangle >= 0) & (distance < sink) & (np.sum(facing * out, 1) > 0)
+    depth = np.where(leaving, distance + occluder.offset[triangle], offset[:, 0])
     return (position + depth[:, None] * out).astype(np.float32)
 
 
-def _off_contact(occluder: Occluder, position: np.ndarray, start: np.ndarray, out: np.ndarray) -> np.ndarray:
+def _off_contact(
+    occluder: Occluder, position: np.ndarray, start: np.ndarray, out: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
     """Moves ray origins that were pushed through a touching surface back to its open side, by reflection.
 
     A ray traced back towards the vertex meets a touching surface from behind, and the vertex's own faces from the
     front. Rays beside the vertex find a touching surface even where it passes through the vertex.
     """
     facing = _face_normal(occluder.position, occluder.face)
-    nudge = np.float32(occluder.nudge)
     side = np.cross(out, np.eye(3, dtype=np.float32)[np.argmin(np.abs(out), 1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     result = start.copy()
     open_start = np.ones(len(start), bool)
-    for offset in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
-        probe = start + nudge / 2 * offset
-        triangle, distance, _ = occluder.hit(probe, -out)
-        found = np.flatnonzero(open_start & (triangle >= 0) & (distance < 1.01 * nudge))
-        if not found.size:
+    for beside in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
+        triangle, distance, _ = occluder.hit(start + offset / 2 * beside, -out)
+        # Distances of a few spacings of float32 are themselves rounded by one or two.
+        met = np.flatnonzero(open_start & (triangle >= 0) & (distance < _BACK * offset[:, 0]))
+        if not met.size:
             continue
-        back = facing[triangle[found]]
-        corner = occluder.position[occluder.face[triangle[found]]]
+        back = facing[triangle[met]]
+        corner = occluder.position[occluder.face[triangle[met]]]
         # The two sides of a seam may differ by rounding.
-        own = np.abs(corner - position[found, None]).max(2).min(1, initial=np.inf) <= nudge / 8
-        touching = ~own & (np.sum(back * out[found], 1) < 0)
-        found, back, corner = found[touching], back[touching], corner[touching]
-        height = np.sum((corner[:, 0] - start[found]) * back, 1, keepdims=True)
-        result[found] = start[found] + 2 * height * back
-        open_start[found] = False
+        seam = np.abs(corner - position[met, None]).max(2).min(1, initial=np.inf) <= offset[met, 0] / 4
+        touching = ~seam & (np.sum(back * out[met], 1) < 0)
+        met, back, corner = met[touching], back[touching], corner[touching]
+        height = np.sum((corner[:, 0] - start[met]) * back, 1, keepdims=True)
+        result[met] = start[met] + 2 * height * back
+        open_start[met] = False
     return result

@@ -30,7 +30,7 @@ _HIDDEN = 4  # points inside of triangles per shadow that is just large enough t
 _FINEST = 0.01  # smaller errors do not increase the number of points inside of triangles
 _SHARE = 0.7  # share of the squared error whose triangles are divided before rays are traced again
 _TOGETHER = 0.5  # A triangle's edge is cut if its squared difference is at least this share of the triangle's largest.
-_SHORTEST = 8  # length of the shortest edge that is cut, relative to the offset of ray origins from the surface
+_SHORTEST = 256  # length of the shortest edge that is cut, relative to the offset of ray origins from the surface
 _ROUNDING = 1e-5  # relative difference that rounding may cause
 
 
@@ -135,13 +135,13 @@ class _Surface:
         face: Vertex indices of each triangle.
         light: Radiance at the vertices.
         error: Squared error of interpolation under each light, averaged over each triangle.
-        shortest: Length of the shortest edge that is cut.
+        offset: Distance of ray origins from each triangle.
     """
 
     def __init__(self, mesh: Mesh, tracer: DiffuseTracer, points: int):
         self.position, self.normal = np.asarray(mesh.position), np.asarray(mesh.normal, np.float64)
         self.face = np.asarray(mesh.face, np.int64)
-        self.shortest = _SHORTEST * tracer.nudge
+        self.offset = tracer.offset
         self._tracer, self._casts = tracer, tracer.casts
         self.light = tracer.at_vertices()
         self._key = np.zeros(0, np.int64)  # keys of the edges whose midpoints are known, in ascending order
@@ -175,7 +175,9 @@ class _Surface:
         self.position = np.concatenate([self.position, subdivision.middle(self.position, division.parent)])
         self._points = subdivision.relocate(self._points, self.face, division)
         self.face = division.face
-        self.error, self._casts = self.error[division.origin], self._casts[division.origin]
+        self.error, self._casts, self.offset = (
+            value[division.origin] for value in (self.error, self._casts, self.offset)
+        )
         self._measure(np.flatnonzero((np.bincount(division.origin) > 1)[division.origin]))
 
     def _square(self) -> Float[np.ndarray, " v l"]:
@@ -218,7 +220,8 @@ class _Surface:
         rest[changed] = False
         casting = np.concatenate([self.face[rest], smaller[np.repeat(self._casts[changed], 4)]])
         new = np.flatnonzero(~np.isin(edge, self._key))
-        light = self._tracer.at(position, normal, smaller, casting, len(self.position) + new)
+        offset = np.repeat(self.offset[changed], 4)
+        light = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
         # Drop the edges that have been cut.
         keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
@@ -242,14 +245,16 @@ class _Surface:
         casting = np.concatenate([around[self._casts[triangle]] + count, self.face[self._casts]])
         position = np.concatenate([self.position, position])
         normal = np.concatenate([self.normal, normal, np.repeat(normal, 2, 0)])
-        return self._tracer.at(position, normal, around + count, casting, count + np.arange(len(place)))
+        offset = self.offset[triangle]
+        return self._tracer.at(position, normal, around + count, offset, casting, count + np.arange(len(place)))
 
 
 def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, room: int) -> Bool[np.ndarray, " e"]:
     """Edges to cut next: those of the triangles with the largest errors, within the allowed number of vertices."""
     total = squares.sum(0)
     unmet = total > error**2
-    priority = np.where(edges.length[edges.longest] > surface.shortest, squares[:, unmet].max(1), 0)
+    shortest = _SHORTEST * surface.offset
+    priority = np.where(edges.length[edges.longest] > shortest, squares[:, unmet].max(1), 0)
     # At a shadow boundary, halving the edges removes half of the squared error.
     wanted = min(_SHARE * total.max(), 2 * (total.max() - error**2))
     order = np.argsort(-priority, kind="stable")[: np.count_nonzero(priority)]
@@ -257,7 +262,8 @@ def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, 
     scale = surface.scale()[unmet]
     apart = np.sum(surface.differences(surface.face[order])[:, :, unmet] ** 2, -1) / np.where(scale > 0, scale, 1)
     apart = apart.max(-1)
-    cut = (apart >= _TOGETHER * apart.max(1, keepdims=True)) & (edges.length[edges.number[order]] > surface.shortest)
+    cut = apart >= _TOGETHER * apart.max(1, keepdims=True)
+    cut &= edges.length[edges.number[order]] > shortest[order, None]
 
     def closed(count: int) -> np.ndarray:
         marked = np.zeros(len(edges.length), bool)

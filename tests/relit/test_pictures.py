@@ -357,6 +357,6 @@ def test_points_that_are_none_are_refused():
     square, points = make_mesh(SQUARE, face), on_triangles(face, np.array([0]), inside)
     with pytest.raises(ValueError, match="either vertices or points"):
         prt.reference.radiance(square, SHARP, light(), eye=CAMERA.eye, vertex=np.array([0]), points=points)
-    alone, rays = Points(jnp.zeros((1, 1), int), jnp.ones((1, 1))), visibility.Occluder(square)
+    alone = Points(jnp.zeros((1, 1), int), jnp.ones((1, 1)))
     with pytest.raises(ValueError, match="three corners"):
-        visibility.point_starts(square, alone, rays)
+        visibility.point_starts(square, alone)

@@ -11,8 +11,9 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxprt import visibility
 from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
-from jaxprt.visibility import Occluder, exhaustive, fractional, start_points
+from jaxprt.visibility import Occluder, exhaustive, fractional, point_starts, start_points
 
 # Rays are nudged off the surface and sampled 4 x 4 to a texel: what an edge may move when all is scaled.
 RESAMPLED = 0.01
@@ -207,6 +208,53 @@ def test_vertices_without_faces_change_nothing(place):
 def test_scaling_leaves_visibility_as_it_is(make, scale):
     mesh = make()
     assert difference(trace(moved(mesh, scale=scale)), trace(mesh)) < RESAMPLED
+
+
+@pytest.mark.parametrize("exponent", [-12, 10])
+def test_scaling_by_a_power_of_two_changes_no_bit(exponent):
+    mesh = scene()
+    np.testing.assert_array_equal(trace(moved(mesh, scale=2.0**exponent)), trace(mesh))
+
+
+def hills(radius):
+    """A ring of walls around the origin, below the horizon of what lies at a height of 0."""
+    angle = np.linspace(0, 2 * np.pi, 33)[:-1]
+    ring = radius * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], 1)
+    start, stop = np.arange(32), (np.arange(32) + 1) % 32
+    face = np.concatenate([np.stack([start, stop, stop + 32], 1), np.stack([start, stop + 32, start + 32], 1)])
+    return make_mesh(np.concatenate([ring - [0, 0.01 * radius, 0], ring]), face)
+
+
+@pytest.mark.parametrize("radius", [50.0, 2e3, 2e4, 1e6])
+def test_a_far_backdrop_changes_nothing(radius):
+    # A book half a millimeter above a table: what is under it sees nothing of the sky, however large the scene is.
+    table = moved(builtin.plane(cells=24), scale=0.6)
+    box = trimesh.creation.box(extents=(0.2, 0.03, 0.14))
+    book = make_mesh(np.array(box.vertices) + [0.003, 0.0155, 0.002], np.array(box.faces))
+    near = join([table, book])
+    seen = trace(near, vertex=slice(len(table.position)))
+    under = (np.abs(np.asarray(table.position)) < [0.09, 1, 0.06]).all(1)
+    assert under.sum() > 4
+    assert not seen[under].any()
+    np.testing.assert_array_equal(trace(join([near, hills(radius)]), vertex=slice(len(table.position))), seen)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-5])
+def test_a_sheet_shadows_a_table_of_size_two_however_near_it_is(gap):
+    table = moved(builtin.plane(cells=8))
+    sheet = moved(table, scale=0.5, shift=[0, gap, 0])
+    seen = trace(join([table, sheet]))[: len(table.position)]
+    inside = (np.abs(np.asarray(table.position)[:, ::2]) < 0.49).all(1)
+    assert inside.sum() == 9
+    assert not seen[inside].any()
+
+
+def test_points_of_pixels_start_as_near_to_their_triangle_as_rounding_allows():
+    table, far = moved(builtin.plane(cells=1)), hills(2e4)
+    for mesh in (table, join([table, far])):
+        corner = np.asarray(mesh.face)[:2].T
+        points = Points(jnp.asarray(corner), jnp.full(corner.shape, 1 / 3))
+        np.testing.assert_allclose(point_starts(mesh, points)[:, 1], 8 * np.spacing(np.float32(1)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-13, 1e14, 1e30])

@@ -160,8 +160,8 @@ def test_what_lies_inside_of_another_surface_is_divided_down_to_the_length_of_ra
     small = make_mesh(1e-2 * np.asarray(ground().position), np.asarray(ground().face))
     moved = make_mesh(np.asarray(small.position) + [0.3, 0, 0], np.asarray(small.face))
     with pytest.warns(UserWarning, match="leave an error of"):
-        mesh = refine(moved, error=0.02, vertices=20_000, environments=[sun], occluder=wall, progress=False)
-    assert len(moved.position) < len(mesh.position) < 20_000
+        mesh = refine(moved, error=0.002, vertices=40_000, environments=[sun], occluder=wall, progress=False)
+    assert len(moved.position) < len(mesh.position) < 40_000
 
 
 @pytest.mark.parametrize(

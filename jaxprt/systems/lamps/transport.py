@@ -27,6 +27,7 @@ from jaxprt import require, visibility
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
+from jaxprt.visibility.occluder import offsets
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lamps": 1}
@@ -223,7 +224,8 @@ class _Job(visibility.rays.VisibilityJob):
     def _seen(self, start: np.ndarray, normal: np.ndarray, samples: _Samples) -> tuple[np.ndarray, int]:
         """The integrals at the given points, and the number of rays traced."""
         way = samples.place - start[:, None]
-        square = np.maximum(np.sum(way**2, -1), np.float32(self.rays.nudge) ** 2)
+        # A point light on a surface is as far from it as rays start.
+        square = np.maximum(np.sum(way**2, -1), offsets(start, np.arange(len(start))[:, None])[:, None] ** 2)
         unit = way / np.sqrt(square)[..., None]
         size = np.linalg.norm(samples.area, axis=1)
         facing = np.where(size > 0, np.maximum(-np.einsum("vsc,sc->vs", unit, samples.area), 0), 1)
