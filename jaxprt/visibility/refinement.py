@@ -175,9 +175,8 @@ class _Surface:
         self.position = np.concatenate([self.position, subdivision.middle(self.position, division.parent)])
         self._points = subdivision.relocate(self._points, self.face, division)
         self.face = division.face
-        self.error, self._casts, self.offset = (
-            value[division.origin] for value in (self.error, self._casts, self.offset)
-        )
+        self.error, self._casts = self.error[division.origin], self._casts[division.origin]
+        self.offset = self.offset[division.origin]
         self._measure(np.flatnonzero((np.bincount(division.origin) > 1)[division.origin]))
 
     def _square(self) -> Float[np.ndarray, " v l"]:
