@@ -39,7 +39,7 @@ class DiffuseTracer:
         # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
-        self.offset = offsets(mesh.position, mesh.face)
+        self.offset = offsets(np.asarray(mesh.position), np.asarray(mesh.face))
         count = len(mesh.face)
         corner = np.concatenate([mesh.face, occluder.face + len(mesh.position)])
         place = subdivision.places(np.concatenate([mesh.position, occluder.position]))
