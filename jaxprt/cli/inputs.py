@@ -18,7 +18,7 @@ from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
-from jaxprt.scene.scene import numbered
+from jaxprt.scene.scene import centered, numbered
 
 # Rotations that bring an axis of the file to +y.
 UPRIGHT = {
@@ -142,7 +142,7 @@ def about(angle: float) -> Any:
 
 def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
     """The scene, its lights, and a camera that sees everything except the ground."""
-    looked, lit = scene(options), lights(options, size=size)
+    looked, lit = centered(scene(options)), lights(options, size=size)
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
     # The board of the embedded scene and the ground may extend beyond the picture.
     alone = not told_apart(options.files)[0]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jaxprt.compile import jit
 from jaxprt.image import raster
 from jaxprt.image.raster import SAMPLES, Fragments
-from jaxprt.scene.camera import Camera
+from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
 
 SMOOTH = math.cos(math.radians(10))  # smallest cosine between mean normals of triangles that may share a point
@@ -49,6 +49,7 @@ class Pixels(eqx.Module):
     background: Float[Array, "h w"]
 
 
+@in_common_coordinates
 def shading_points(
     fragments: Fragments, mesh: Mesh, camera: Camera, *, uneven: Bool[Array, " f"] | None = None
 ) -> Pixels:

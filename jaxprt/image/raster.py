@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.compile import jit
 from jaxprt.image import depths
-from jaxprt.scene.camera import Camera
+from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
 
 FACES = (1 << 24) - 1  # largest number of triangles whose indices float32 represents exactly
@@ -48,6 +48,7 @@ class Fragments(eqx.Module):
     depth: Float[Array, "h w *s"]
 
 
+@in_common_coordinates
 @functools.partial(jit, static_argnames="samples")
 def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     """Finds the nearest triangle at the center of each pixel, or at four samples of each pixel.
@@ -81,12 +82,14 @@ def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     return Fragments(triangle, _barycentric(triangle, x, y, q, camera), depth)
 
 
+@in_common_coordinates
 @jit
 def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w *s"]:
     """Whether each pixel or sample shows the front of a surface; backs are black. `front_faces` defines the front."""
     return front_faces(mesh, camera)[fragments.triangle] & (fragments.triangle >= 0)
 
 
+@in_common_coordinates
 @jit
 def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     """Whether the camera sees the front of each triangle: the side to which its shading normals point.
@@ -109,6 +112,7 @@ def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     return (jnp.sign(side) * distance >= -plain) | (side == 0)
 
 
+@in_common_coordinates
 @jit
 def ray_direction(camera: Camera) -> Float[Array, "h w 3"]:
     """Unit directions in world coordinates from the eye through the center of every pixel."""
@@ -118,13 +122,14 @@ def ray_direction(camera: Camera) -> Float[Array, "h w 3"]:
     return jnp.stack([(x * axis[0, i] + y * axis[1, i] + axis[2, i]) / length for i in range(3)], -1)
 
 
+@in_common_coordinates
 @jit
 def view_axes(camera: Camera) -> Float[Array, "3 3"]:
     """The camera's right, up and forward directions in world coordinates, as rows of unit vectors.
 
     If `up` is zero or parallel to the view, the world axis farthest from the view direction is used instead.
     """
-    forward = _unit(camera.target - camera.eye)
+    forward = _unit(jnp.asarray(camera.target) - camera.eye)
     fallback = jnp.eye(3, dtype=forward.dtype)[jnp.argmin(jnp.abs(forward))]
     right = jnp.cross(forward, _unit(camera.up))
     parallel = jnp.sum(right**2) < jnp.finfo(forward.dtype).eps

@@ -65,7 +65,7 @@ class Pixels(eqx.Module):
     """The pixels that count, and which vertices each of them shows.
 
     Attributes:
-        eye: Position of the camera of each picture.
+        eye: Position of the camera of each picture, relative to the mesh's origin, as systems take it.
         vertex: The three vertices of the triangle at each pixel. Indices of picture n start at n * vertices.
         weight: Their barycentric weights, times the exposure.
         value: Value of each pixel.
@@ -112,7 +112,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
         raise ValueError("pictures must show the mesh in a pixel that counts, got none")
     if not np.any(value):
         raise ValueError("pictures must not be black wherever they count")
-    eye = jnp.stack([each.camera.eye for each in pictures])
+    eye = jnp.stack([each.camera.local(mesh.origin).eye for each in pictures])
     return Pixels(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
 
 

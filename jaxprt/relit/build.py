@@ -18,7 +18,7 @@ from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
-from jaxprt.scene.scene import default_camera
+from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import Joined
 from jaxprt.visibility import UnfinishedError
 
@@ -106,22 +106,23 @@ def precompute(
         bounces = wanted.bounces if bounces is None else bounces
     size = 64 if size is None else size
     recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
-    shadings = [_checked(part, recipes[part.name], roughness) for part in scene.parts]
-    mesh = scene.mesh
-    warn.of_gain(scene, shadings)
-    warn.of_backs(scene, mesh, default_camera(scene, mesh))
+    near = centered(scene)
+    shadings = [_checked(part, recipes[part.name], roughness) for part in near.parts]
+    mesh = near.mesh
+    warn.of_gain(near, shadings)
+    warn.of_backs(scene, scene.mesh, default_camera(scene, scene.mesh))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems, unfinished = [], []
-    for part, shading, target in zip(scene.parts, shadings, targets, strict=True):
+    for part, shading, target in zip(near.parts, shadings, targets, strict=True):
         try:
             systems.append(recipes[part.name].make(shading, target))
         except UnfinishedError as others:  # Go on with the next part of the scene.
             unfinished.append(others)
     if unfinished:
         raise UnfinishedError("; ".join(map(str, unfinished)))
-    lit = lamps.make(scene, shadings, systems, targets)
+    lit = lamps.make(near, shadings, systems, targets, scene.point_lights)
     reflected = None
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.

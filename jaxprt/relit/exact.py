@@ -21,6 +21,7 @@ from jaxprt.relit.channels import Shading, at_points, exact_at
 from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points, on_triangles
+from jaxprt.scene.scene import centered
 from jaxprt.systems import reference
 from jaxprt.visibility import blocks
 
@@ -101,6 +102,7 @@ def exact_pixels(
         between: Function that is called after each stage and after each block of 64 points, by several threads. If it
             raises an exception, the computation stops.
     """
+    scene, camera = _near(scene, camera)
     mesh, lights = scene.mesh, Environment(jnp.stack([each.radiance for each in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
     fragments = finished(rasterize(mesh, fine), between)
@@ -169,6 +171,7 @@ def exact_picture(
     """
     if most < 1:
         raise ValueError(f"most must be at least 1 point, got {most}")
+    asked, (scene, camera) = camera, _near(scene, camera)
     shown = finished(_Shown.of(scene, camera), between)
     smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
@@ -199,7 +202,12 @@ def exact_picture(
     way = raster.ray_direction(camera)
     skies = [background(each, way) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, skies, strict=True)]
-    return ExactPicture(camera, np.stack(pictures))
+    return ExactPicture(dataclasses.replace(asked, width=camera.width, height=camera.height), np.stack(pictures))
+
+
+def _near(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
+    """The scene and the camera relative to the scene's origin."""
+    return centered(scene), camera.local(scene.parts[0].mesh.origin)
 
 
 def _sum(

@@ -84,15 +84,20 @@ class SceneLamps(eqx.Module):
 
 
 def make(
-    scene: Scene, shadings: Sequence[Shading], systems: Sequence[System], targets: Sequence[Target]
+    scene: Scene,
+    shadings: Sequence[Shading],
+    systems: Sequence[System],
+    targets: Sequence[Target],
+    point_lights: tuple[PointLight, ...],
 ) -> SceneLamps | None:
     """Precomputes the transport from the lamps of a scene to all its parts; None if there are no lamps.
 
     Args:
-        scene: The scene.
+        scene: The scene, with its origin at zero.
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         systems: The systems of the parts. If one has a table of lobes, it is used.
         targets: For each part, what casts shadows, and where and how to compute.
+        point_lights: The point lights of the scene, in the coordinates of its file.
     """
     emitting = [number for number, each in enumerate(shadings) if each.emitted is not None]
     if not emitting and not scene.point_lights:
@@ -106,7 +111,7 @@ def make(
         else:
             rows.append(LitByLamps(transport, _table(shading, system, target)))
     area = tuple(jnp.asarray(areas(shadings[number].mesh), jnp.result_type(float)) for number in emitting)
-    return SceneLamps(tuple(rows), tuple(emitting), area, scene.point_lights)
+    return SceneLamps(tuple(rows), tuple(emitting), area, point_lights)
 
 
 def _table(shading: Shading, system: System, target: Target) -> lobe.LobeBrdf:

@@ -21,6 +21,7 @@ from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
 from jaxprt.relit.channels import at_points
 from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
 from jaxprt.scene import Camera, Environment, Mesh
+from jaxprt.scene.camera import localized
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.protocol import System
 
@@ -153,6 +154,7 @@ def make(
     if type(samples) is not int or samples not in SAMPLES:
         raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
     samples, fold = SAMPLES[samples]
+    mesh, camera = localized(mesh, camera)
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):
         pixels, rows = _placed(mesh, surfaces, camera, samples, between)
@@ -171,7 +173,7 @@ def make(
             looks = (at_points(surface.part, surface.shading, surface.material, each) for each in points)
             asked += [tracing.Asked(number, *each) for each in zip((look.blend for look in looks), points, strict=True)]
     canvas = lay_out(pixels, [each.index for each in parts], camera)
-    reflected = tracing.trace(mesh, surfaces, asked, camera.eye, keep=keep) if asked else None
+    reflected = tracing.trace(mesh, surfaces, asked, jnp.asarray(camera.eye), keep=keep) if asked else None
     return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp, reflected, fold)
 
 

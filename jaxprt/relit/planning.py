@@ -26,6 +26,7 @@ from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
 from jaxprt.scene import Environment, Scene
+from jaxprt.scene.scene import centered
 from jaxprt.visibility import blocks
 
 ERROR = 0.05  # that is asked for where none is given
@@ -173,6 +174,7 @@ def plan(
             then gives the smallest error that can be met.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    scene = centered(scene)
     environments = lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
     size = checked(environments, asked, rate)

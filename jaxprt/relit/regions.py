@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.image import rasterize, shading_points
 from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
 from jaxprt.scene import Camera, Environment, Mesh
+from jaxprt.scene.camera import localized
 from jaxprt.scene.points import Points
 from jaxprt.systems.protocol import System
 
@@ -41,7 +42,7 @@ class RegionsView(eqx.Module):
         arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
         for number, points in enumerate(self.points):
             system = self.system.at(points)
-            view = system.view(self.camera.eye, self.materials) if self.kept is None else self.kept[number]
+            view = system.view(jnp.asarray(self.camera.eye), self.materials) if self.kept is None else self.kept[number]
             rows.append(system.combine(arriving, view))
         return drawn(self.canvas, rows, environment)
 
@@ -61,6 +62,7 @@ def of_regions(
         samples: Number of coverage samples of each pixel: 4 or 1.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
     """
+    mesh, camera = localized(mesh, camera)
     pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
     region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
     owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
@@ -75,5 +77,5 @@ def of_regions(
         place[own] = np.arange(len(own))
     corner = jnp.asarray(place[face])
     points = tuple(tuple(points_of(pixels, corner, 0, each) for each in row) for row in index)
-    kept = tuple(system.at(each).view(camera.eye, materials) for each in points) if keep else None
+    kept = tuple(system.at(each).view(jnp.asarray(camera.eye), materials) for each in points) if keep else None
     return RegionsView(system, materials, camera, lay_out(pixels, list(index), camera), points, kept)

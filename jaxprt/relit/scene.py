@@ -19,8 +19,10 @@ from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.surface import Surface
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
+from jaxprt.scene import mesh as meshes
+from jaxprt.scene import origin as origins
+from jaxprt.scene import scene as scenes
 from jaxprt.scene.points import Points
-from jaxprt.scene.scene import default_camera
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import PartBounces
 from jaxprt.systems.bounces.traced import SharpPart
@@ -75,6 +77,7 @@ class RelitScene(System):
         lamps: Emitting parts and point lights; None if there are none. `bounces` does not include their light.
         mesh: The mesh of all parts, with the original normals (without normal maps).
         camera: The first camera of the scene. If it has none, a camera that shows the whole scene from slightly above.
+            Cameras, eyes and point lights are in the coordinates of the scene's file.
         curvature: How fast the radiance of each part varies with direction, from
             `jaxprt.relit.interpolation.curvature`.
         points: Points on each part at which radiance is computed; None for the vertices.
@@ -136,7 +139,7 @@ class RelitScene(System):
         )
         pairs = zip(shading, direct.part, strict=True)
         self.curvature = jnp.asarray([interpolation.curvature(*each) for each in pairs], self.mesh.position.dtype)
-        self.camera = default_camera(scene, self.mesh)
+        self.camera = scenes.default_camera(scene, self.mesh)
 
     @property
     def system(self) -> Joined | Total:
@@ -163,6 +166,7 @@ class RelitScene(System):
             ValueError: There is no part of the given name, or a material needs something that was not precomputed; see
                 `jaxprt.relit.channels.appearance`.
         """
+        eye = origins.local("the eye", eye, self.mesh.origin)
         materials = scene_lamps.split(self.lamps, materials)[0]
         every = self._all(materials)
         counts = [len(part.mesh.position) for part in self.scene.parts]
@@ -202,7 +206,24 @@ class RelitScene(System):
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
         given, changed = scene_lamps.split(self.lamps, materials)
-        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(given), **changed})
+        eye = origins.local("the eye", eye, self.mesh.origin)
+        return protocol.radiance(
+            self.centered(), environment, eye=eye, materials={**self.appearances(given), **changed}
+        )
+
+    def centered(self) -> "RelitScene":
+        """The same scene in coordinates relative to its origin, `mesh.origin`, for eyes inside of `jax.jit`.
+
+        A scene whose origin is zero is returned unchanged.
+        """
+        origin = self.mesh.origin
+        if origin == origins.ZERO:
+            return self
+        moved = scenes.centered(self.scene), meshes.centered(self.mesh), self.camera.local(origin)
+        result = eqx.tree_at(lambda each: (each.scene, each.mesh, each.camera), self, moved)
+        if self.lamps is None:
+            return result
+        return eqx.tree_at(lambda each: each.lamps.point_lights, result, result.scene.point_lights)
 
     def picture(
         self,
@@ -315,8 +336,9 @@ class RelitScene(System):
             ValueError: There are no lights, lights of different sizes, or a light that is not finite.
         """
         lights = measuring.lights_of(self.scene) if environments is None else environments
-        alone = RelitScene(self.scene, self.direct, self.shading)
-        return measuring.measure(alone.picture, self.camera, self.direct, self.system, self.scene, self.shading, lights)
+        near = self.centered()
+        alone = RelitScene(near.scene, self.direct, self.shading)
+        return measuring.measure(alone.picture, near.camera, self.direct, self.system, near.scene, self.shading, lights)
 
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
         """Evaluates materials at the vertices, so that this is done once for many views.

@@ -10,6 +10,7 @@ from jaxprt.image import raster
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Camera, Mesh, Scene, TexturedMaterial
+from jaxprt.scene.camera import localized
 from jaxprt.visibility import Occluder
 from jaxprt.visibility.hits import front
 
@@ -28,9 +29,10 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
         mesh: The mesh of all parts, `scene.mesh`.
         camera: The camera.
     """
-    way = raster.ray_direction(dataclasses.replace(camera, width=_RAYS, height=_RAYS))
+    mesh, near = localized(mesh, camera)
+    way = raster.ray_direction(dataclasses.replace(near, width=_RAYS, height=_RAYS))
     way, occluder = np.asarray(way, np.float32).reshape(-1, 3), Occluder(mesh)
-    triangle, *_ = occluder.hit(np.tile(np.asarray(camera.eye, np.float32), (len(way), 1)), way)
+    triangle, *_ = occluder.hit(np.tile(np.asarray(near.eye, np.float32), (len(way), 1)), way)
     met = np.flatnonzero(triangle >= 0)
     corner = occluder.facing(triangle[met], way[met])
     away = ~front(occluder, np.asarray(mesh.normal), corner, way[met])

@@ -1,5 +1,11 @@
 """The pinhole camera."""
 
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
+from typing import TypeVar, cast
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +13,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
-from jaxprt.scene.mesh import Mesh, bounds
+from jaxprt.scene import origin as origins
+from jaxprt.scene.mesh import Mesh, bounds, centered
 
+Function = TypeVar("Function", bound=Callable)
 _MOST = 2**31 - 1  # pixels that the rasterizer's 32-bit indices can count
 
 
@@ -25,7 +33,8 @@ class Camera(eqx.Module):
     ValueError. Inside `jax.jit` values are not known and therefore not checked.
 
     Attributes:
-        eye: Position in world units.
+        eye: Position in world units, in the coordinates of the scene's file. Coordinates above 64 that float32 would
+            round stay in a NumPy array in float64, and so for the target.
         target: Point at the center of the picture, in world units.
         up: Direction that points up in the picture; not parallel to the view direction.
         field_of_view: Full vertical angle of view in radians, between 0 and pi.
@@ -33,8 +42,8 @@ class Camera(eqx.Module):
         height: Picture height in pixels.
     """
 
-    eye: Float[Array, "3"] = eqx.field(converter=_floating)
-    target: Float[Array, "3"] = eqx.field(converter=_floating)
+    eye: Float[Array | np.ndarray, "3"] = eqx.field(converter=origins.coordinates)
+    target: Float[Array | np.ndarray, "3"] = eqx.field(converter=origins.coordinates)
     up: Float[Array, "3"] = eqx.field(converter=_floating)
     field_of_view: Float[Array, ""] = eqx.field(converter=_floating)
     width: int = eqx.field(static=True)
@@ -57,6 +66,46 @@ class Camera(eqx.Module):
             raise ValueError(f"the camera's field_of_view must be between 0 and pi, in radians, got {angle}")
         if eye is not None and target is not None and np.array_equal(eye, target):
             raise ValueError(f"the camera's eye and target must be different points, got {eye} for both")
+
+    def local(self, origin: origins.Origin) -> "Camera":
+        """The same camera with eye and target relative to an origin, such as `mesh.origin`; moved in float64."""
+        if origin == origins.ZERO:
+            return self
+        eye, target = (origins.local(f"the camera's {name}", getattr(self, name), origin) for name in ("eye", "target"))
+        return dataclasses.replace(self, eye=eye, target=target)
+
+
+def localized(mesh: Mesh, camera: Camera) -> tuple[Mesh, Camera]:
+    """A mesh and a camera in common coordinates near zero.
+
+    The mesh's origin becomes zero and the camera relative to it. A camera at large coordinates and a mesh without
+    origin are in common coordinates already.
+    """
+    return centered(mesh), camera.local(mesh.origin)
+
+
+def in_common_coordinates(function: Function) -> Function:
+    """Decorates a function of a mesh and a camera: outside `jax.jit`, it moves both near zero.
+
+    A function of a camera alone gets one whose eye is at zero if its coordinates are in float64: directions only need
+    differences, which float32 would lose.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def moved(*argument, **named):
+        bound = signature.bind(*argument, **named)
+        given, camera = bound.arguments, bound.arguments["camera"]
+        if not isinstance(camera, Camera):
+            return function(*argument, **named)
+        if "mesh" not in signature.parameters:
+            exact = any(isinstance(each, np.ndarray) for each in (camera.eye, camera.target))
+            given["camera"] = camera.local(tuple(np.asarray(camera.eye, float).tolist())) if exact else camera
+        elif isinstance(given["mesh"], Mesh):
+            given["mesh"], given["camera"] = localized(given["mesh"], camera)
+        return function(*bound.args, **bound.kwargs)
+
+    return cast(Function, moved)
 
 
 def orbit(
@@ -98,14 +147,14 @@ def orbit(
         raise ValueError(f"azimuth must be finite, got {azimuth}")
     low, high = bounds(mesh)
     center = (low + high) / 2
-    corner = np.asarray(mesh.position, np.float64)[np.unique(mesh.face)]
+    corner = np.asarray(mesh.position, np.float64)[np.unique(mesh.face)] + mesh.origin
     radius = np.linalg.norm(corner - center, axis=1).max() or 1.0
     half = np.arctan(np.tan(field_of_view / 2) * min(1.0, width / height))
     around = np.array([np.sin(azimuth), np.cos(azimuth)])
     back = np.array([around[0] * np.cos(elevation), np.sin(elevation), around[1] * np.cos(elevation)])
     up = np.array([-around[0] * np.sin(elevation), np.cos(elevation), -around[1] * np.sin(elevation)])
-    eye, target, up, angle = (
-        jnp.asarray(value, mesh.position.dtype)
-        for value in (center + radius / np.sin(half) * back, center, up, field_of_view)
-    )
+    up, angle = (jnp.asarray(value, mesh.position.dtype) for value in (up, field_of_view))
+    eye, target = center + radius / np.sin(half) * back, center
+    if mesh.origin == origins.ZERO:
+        eye, target = (jnp.asarray(value, mesh.position.dtype) for value in (eye, target))
     return Camera(eye, target, up, angle, width, height)

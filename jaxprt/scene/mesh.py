@@ -1,5 +1,6 @@
 """Triangle meshes: construction from files and arrays, joining, splitting, rotation, and a ground plane."""
 
+import dataclasses
 import pathlib
 from collections.abc import Sequence
 
@@ -10,11 +11,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
+from jaxprt.scene import origin as origins
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry
+from jaxprt.scene.normals import vertex_normals
 from jaxprt.sphere import directions
 
-_CREASE = np.cos(np.radians(40))  # smallest cosine between a shared normal and that of each split vertex
 _GAP = 5e-4  # gap above the ground, relative to the diagonal; larger than the offset of ray origins
 _BLOCK = 8192
 _ORTHOGONAL = 1e-4  # rounding error of R R^T for a float32 rotation
@@ -25,13 +27,17 @@ class Mesh(eqx.Module):
     """A triangle mesh with one shading frame per vertex.
 
     Attributes:
-        position: Vertex positions in world units.
+        position: Vertex positions in world units, relative to the origin.
         face: Vertex indices of each triangle, counterclockwise as seen from the front.
         normal: Unit shading normals.
         tangent: Unit tangents, orthogonal to the normals.
         region: Index of the material region that each vertex belongs to, from 0.
         texture: Texture coordinates (u, v) of each vertex, with (0, 0) at the lower left corner of the image; None if
             there are none.
+        origin: Where position (0, 0, 0) is in the coordinates of the mesh's file. It is zero unless the mesh is farther
+            from zero than 64 times its size, as at map coordinates, which float32 would round. A `Scene`, cameras, eyes
+            and lamps that are given to it keep the coordinates of the file. Functions on meshes and systems take eyes
+            and points relative to the origin.
     """
 
     position: Float[Array, "v 3"]
@@ -40,17 +46,19 @@ class Mesh(eqx.Module):
     tangent: Float[Array, "v 3"]
     region: Int[Array, " v"]
     texture: Float[Array, "v 2"] | None = None
+    origin: origins.Origin = eqx.field(static=True, default=origins.ZERO)
 
 
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
 
-    Vertices and faces keep the order of the file, and no vertices are merged. Polygons are divided into fans of
-    triangles. An OBJ vertex is split where its corners differ in normal or texture coordinates. All meshes of a glTF
-    file's default scene are transformed by their nodes and joined, and its tangents are kept. Texture coordinates are 0
-    where only some geometries of the file have them or they are not finite. All faces of an OBJ material or group must
-    have them; if they refer to texture coordinates that do not exist, the material is loaded without them, with a
-    warning.
+    Positions are read in double precision. If the mesh is far from zero, they become relative to `Mesh.origin` before
+    they are rounded to float32. Vertices and faces keep the order of the file, and no vertices are merged. Polygons are
+    divided into fans of triangles. An OBJ vertex is split where its corners differ in normal or texture coordinates.
+    All meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept.
+    Texture coordinates are 0 where only some geometries of the file have them or they are not finite. All faces of an
+    OBJ material or group must have them; if they refer to texture coordinates that do not exist, the material is loaded
+    without them, with a warning.
 
     Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
     weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
@@ -106,7 +114,7 @@ def make_mesh(
         name: Name of the mesh in error messages.
 
     Returns:
-        The mesh, in float32 and int32.
+        The mesh, in float32 and int32. If it is far from zero, its positions are relative to `Mesh.origin`.
 
     Raises:
         ValueError: An array has a wrong shape or type, there are no vertices or faces, a position or texture coordinate
@@ -130,6 +138,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     """
     if not meshes:
         raise ValueError("meshes must hold at least one mesh, got none")
+    meshes = aligned(meshes)
     region, face = [], []
     first_region = first_vertex = 0
     for mesh in meshes:
@@ -148,7 +157,30 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     if any(mesh.texture is not None for mesh in meshes):
         each = [np.zeros((len(mesh.position), 2)) if mesh.texture is None else mesh.texture for mesh in meshes]
         texture = jax.device_put(np.concatenate(each).astype(position.dtype))
-    return Mesh(position, face, normal, tangent, region, texture)
+    return Mesh(position, face, normal, tangent, region, texture, meshes[0].origin)
+
+
+def aligned(meshes: Sequence[Mesh]) -> list[Mesh]:
+    """The same meshes with one origin: that of all if they have the same, or else that of the joined mesh."""
+    if len({mesh.origin for mesh in meshes}) < 2:
+        return list(meshes)
+    corner = [np.stack(bounds(mesh)) for mesh in meshes]
+    origin = origins.of(np.concatenate(corner))
+    return [relative(mesh, origin) for mesh in meshes]
+
+
+def relative(mesh: Mesh, origin: origins.Origin) -> Mesh:
+    """The same mesh with positions relative to another origin, moved in float64."""
+    if mesh.origin == origin:
+        return mesh
+    shift = np.asarray(mesh.origin) - np.asarray(origin)
+    position = jax.device_put((np.asarray(mesh.position, np.float64) + shift).astype(mesh.position.dtype))
+    return dataclasses.replace(mesh, position=position, origin=origin)
+
+
+def centered(mesh: Mesh) -> Mesh:
+    """The mesh with its origin moved to zero: positions stay as they are."""
+    return mesh if mesh.origin == origins.ZERO else dataclasses.replace(mesh, origin=origins.ZERO)
 
 
 def split(mesh: Mesh) -> list[Mesh]:
@@ -176,7 +208,7 @@ def split(mesh: Mesh) -> list[Mesh]:
         )
         texture = None if mesh.texture is None else jax.device_put(np.asarray(mesh.texture)[own])
         own_face, zero = (jax.device_put(each) for each in (own_face, np.zeros(len(own), np.int32)))
-        parts.append(Mesh(position, own_face, normal, tangent, zero, texture))
+        parts.append(Mesh(position, own_face, normal, tangent, zero, texture, mesh.origin))
     return parts
 
 
@@ -194,7 +226,8 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
         jnp.matmul(each, jnp.asarray(matrix.T, each.dtype), precision="highest")
         for each in (mesh.position, mesh.normal, mesh.tangent)
     )
-    return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture)
+    x, y, z = (matrix @ np.asarray(mesh.origin)).tolist()
+    return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z))
 
 
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
@@ -257,9 +290,12 @@ def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> M
 
 
 def bounds(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Lowest and highest coordinates of the bounding box, in float64. Vertices without faces do not count."""
+    """Lowest and highest coordinates of the bounding box, in float64 and in the coordinates of the mesh's file.
+
+    Vertices without faces do not count.
+    """
     corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)].reshape(-1, 3)
-    return corner.min(0), corner.max(0)
+    return corner.min(0) + mesh.origin, corner.max(0) + mesh.origin
 
 
 def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
@@ -270,12 +306,14 @@ def grid_face(*, rows: int, columns: int) -> Int[np.ndarray, "f 3"]:
 
 def _make(position, face, normal, tangent, region, texture, *, name: str, welded: bool) -> Mesh:
     position = _array(position, "position", (None, 3), name)
-    with np.errstate(over="ignore"):  # overflow of float32 is reported below
-        position = position.astype(np.float32)
     count = len(position)
     face = _array(face, "face", (None, 3), name, whole=True)
     region = np.zeros(count, np.int32) if region is None else _array(region, "region", (count,), name, whole=True)
     _check(position, face, region, name)
+    used = np.zeros(count, bool)
+    used[face.ravel()] = True
+    origin = origins.of(position[used])
+    position = (position.astype(np.float64) - origin).astype(np.float32)
     if texture is not None:
         texture = jax.device_put(_finite(texture, "texture", (count, 2), name).astype(np.float32))
     given = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
@@ -283,13 +321,13 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     bad = ~(np.isfinite(length) & (length > 0))
     given = np.where(bad, 0, given) / np.where(bad, 1, length)
     if bad.any():
-        given = np.where(bad, _vertex_normal(position.astype(np.float64), face, welded), given)
+        given = np.where(bad, vertex_normals(position.astype(np.float64), face, welded), given)
     brought = np.zeros((count, 3)) if tangent is None else _array(tangent, "tangent", (count, 3), name)
     brought = brought.astype(np.float64)
     brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
     normal, tangent = _frame(given, brought)
     face, region = (jax.device_put(each.astype(np.int32)) for each in (face, region))
-    return Mesh(jax.device_put(position), face, normal, tangent, region, texture)
+    return Mesh(jax.device_put(position), face, normal, tangent, region, texture, origin)
 
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
@@ -342,39 +380,6 @@ def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
     unit = [directions.normalize(block) for block in normal]
     across = [directions.frame(n, t)[:, 0] for n, t in zip(unit, tangent, strict=True)]
     return tuple(jax.device_put(np.concatenate(block)[:count]) for block in (unit, across))
-
-
-def _vertex_normal(position: np.ndarray, face: np.ndarray, welded: bool) -> np.ndarray:
-    """Unit normals: means of face normals, weighted by their angles at the vertex."""
-    corner = position[face]
-    edge = np.roll(corner, -1, 1) - corner
-    cross = np.cross(edge[:, 0], edge[:, 1])
-    area = np.linalg.norm(cross, axis=1)
-    # The normal of a face thinner than the resolution of float32 is only rounding error.
-    thickness = 2 * np.spacing(np.abs(corner).max((1, 2)).astype(np.float32)).astype(np.float64)
-    thin = area <= thickness * np.linalg.norm(edge, axis=2).max(1)
-    unit = cross / np.where(area > 0, area, 1)[:, None]
-    angle = np.arctan2(area[:, None], -(edge * np.roll(edge, 1, 1)).sum(2))
-    weighted = (np.where(thin[:, None], 0, angle)[:, :, None] * unit[:, None]).reshape(-1, 3)
-
-    def mean(index, count):
-        total = np.stack([np.bincount(index, weighted[:, axis], count) for axis in range(3)], -1)
-        length = np.linalg.norm(total, axis=1, keepdims=True)
-        return np.where(length > 1e-6, total / np.maximum(length, 1e-6), 0)
-
-    vertex = face.ravel()
-    normal = mean(vertex, len(position))
-    if welded:
-        _, place = np.unique(position, axis=0, return_inverse=True)
-        shared = mean(place.reshape(-1)[vertex], place.max() + 1)[place.reshape(-1)]
-        smooth = (shared * normal).sum(1, keepdims=True) > _CREASE
-        normal = np.where(smooth, shared, normal)
-    # Where face normals cancel, any of them is used, thin faces last.
-    order = np.argsort(~thin, kind="stable")
-    some = np.tile([0.0, 1.0, 0.0], (len(position), 1))
-    order = order[area[order] > 0]
-    some[face[order]] = unit[order, None]
-    return np.where((normal == 0).all(1, keepdims=True), some, normal)
 
 
 def areas(mesh: Mesh) -> Float[np.ndarray, " v"]:

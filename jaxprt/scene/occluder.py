@@ -1,10 +1,12 @@
 """Simplified meshes that cast shadows in place of the original mesh."""
 
+import dataclasses
+
 import fast_simplification
 import numpy as np
 import scipy
 
-from jaxprt.scene.mesh import Mesh, bounds, join, make_mesh
+from jaxprt.scene.mesh import Mesh, bounds, centered, join, make_mesh
 
 _UNIT = 1000.0  # meshes are scaled to this diagonal, because thresholds are absolute: the first is 1.5e-6 of it
 
@@ -49,7 +51,9 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
     parts = [_part(mesh, solid[twin])] if twin.any() else []
     if not twin.all():
         parts.append(_collapse(mesh, solid[~twin], max(4, faces - int(np.count_nonzero(twin)))))
-    return join(parts)
+    result = join(parts)  # in coordinates relative to the mesh's origin
+    x, y, z = np.add(result.origin, mesh.origin).tolist()
+    return dataclasses.replace(result, origin=(x, y, z))
 
 
 def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
@@ -61,7 +65,7 @@ def _part(mesh: Mesh, chosen: np.ndarray) -> Mesh:
 
 def _collapse(mesh: Mesh, chosen: np.ndarray, faces: int) -> Mesh:
     """`simplify` for some faces, no two of which coincide."""
-    low, high = bounds(mesh)
+    low, high = bounds(centered(mesh))
     unit = _UNIT / (float(np.linalg.norm(high - low)) or 1.0)
     place = np.column_stack([(np.asarray(mesh.position, np.float64) - low) * unit, mesh.region])
     place, index = np.unique(place, axis=0, return_inverse=True)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene import mesh as meshes
+from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.material import Surface, TexturedMaterial
@@ -95,6 +96,12 @@ class Part(eqx.Module):
         return self.material.at(first, second, color=color, handedness=side, slopes=slopes)
 
 
+def _place(value: Any) -> Array | np.ndarray:
+    """Three coordinates, or one number for three."""
+    value = origins.coordinates(value)
+    return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
+
+
 def _three(value: Any) -> Array:
     """A number or three numbers as an array of shape [3]."""
     value = jnp.asarray(value, jnp.result_type(float))
@@ -106,7 +113,8 @@ class PointLight(eqx.Module):
 
     Attributes:
         name: Name of the light, different from those of all parts and other point lights of the scene.
-        position: Position in world units.
+        position: Position in world units, in the coordinates of the scene's file. Coordinates above 64 that float32
+            would round stay in a NumPy array in float64.
         intensity: Radiant intensity, in units of radiance times squared world units.
 
     Raises:
@@ -115,7 +123,7 @@ class PointLight(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    position: Float[Array, "3"] = eqx.field(converter=_three)
+    position: Float[Array | np.ndarray, "3"] = eqx.field(converter=_place)
     intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
 
     def __check_init__(self):
@@ -133,8 +141,22 @@ def _tuple(items: Any) -> tuple:
     return tuple(items)
 
 
+def _aligned(parts: Any) -> tuple:
+    """Parts whose meshes have one origin. Values that are not parts pass; the scene refuses them."""
+    parts = _tuple(parts)
+    if not all(isinstance(part, Part) for part in parts):
+        return parts
+    moved = meshes.aligned([part.mesh for part in parts])
+    return tuple(
+        part if mesh is part.mesh else eqx.tree_at(lambda each: each.mesh, part, mesh)
+        for part, mesh in zip(parts, moved, strict=True)
+    )
+
+
 class Scene(eqx.Module):
     """A scene: parts with their materials, cameras, and lights.
+
+    The meshes of all parts have the same origin. Cameras and point lights are in the coordinates of the file.
 
     Attributes:
         parts: The parts, in order.
@@ -147,7 +169,7 @@ class Scene(eqx.Module):
         ValueError: There are no parts, or two parts or point lights have the same name.
     """
 
-    parts: tuple[Part, ...] = eqx.field(converter=_tuple)
+    parts: tuple[Part, ...] = eqx.field(converter=_aligned)
     cameras: tuple[Camera, ...] = eqx.field(converter=_tuple, default=())
     environments: tuple[Environment, ...] = eqx.field(converter=_tuple, default=())
     point_lights: tuple[PointLight, ...] = eqx.field(converter=_tuple, default=())
@@ -192,6 +214,21 @@ class Scene(eqx.Module):
                 for part in self.parts
             ]
         )
+
+
+def centered(scene: Scene) -> Scene:
+    """The scene with its origin moved to zero: what is computed inside needs no coordinates of the file."""
+    origin = scene.parts[0].mesh.origin
+    if origin == origins.ZERO:
+        return scene
+    parts = [eqx.tree_at(lambda each: each.mesh, part, meshes.centered(part.mesh)) for part in scene.parts]
+    lamps = [
+        eqx.tree_at(
+            lambda each: each.position, lamp, origins.local(f"point light {lamp.name!r}", lamp.position, origin)
+        )
+        for lamp in scene.point_lights
+    ]
+    return Scene(parts, [camera.local(origin) for camera in scene.cameras], scene.environments, lamps)
 
 
 def default_camera(scene: Scene, mesh: Mesh) -> Camera:

@@ -226,7 +226,7 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
     parts = [_subdivided_part(*each) for each in zip(scene.parts, parents, faces, strict=True)]
-    return Scene(parts, scene.cameras, scene.environments)
+    return Scene(parts, scene.cameras, scene.environments, scene.point_lights)
 
 
 def divide(scene: Scene, *, edge: float) -> Scene:
@@ -277,7 +277,8 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
 
     texture = None if mesh.texture is None else jax.device_put(_rows(mesh.texture, parents))
     frame = appended(mesh.normal, new.normal), appended(mesh.tangent, new.tangent)
-    return Mesh(jax.device_put(position), triangle, *frame, jax.device_put(_first(mesh.region, parents)), texture)
+    region = jax.device_put(_first(mesh.region, parents))
+    return Mesh(jax.device_put(position), triangle, *frame, region, texture, mesh.origin)
 
 
 def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:

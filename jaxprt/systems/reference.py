@@ -12,8 +12,9 @@ from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished, jit, mapped
+from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive
@@ -44,7 +45,7 @@ def radiance(
             horizon are not used. A new function object, such as a lambda in a loop, is compiled again. `PerVertex`
             holds one BRDF for each vertex of the mesh, or each point.
         light: The environment, or a batch of them along leading axes.
-        eye: Position of the viewer in world units.
+        eye: Position of the viewer in world units, in the coordinates of the mesh's file.
         occluder: Mesh that casts shadows; the mesh itself if None.
         vertex: Indices of the vertices to evaluate, or a mask; all if None.
         points: Points on triangles of the mesh at which radiance is evaluated instead of vertices. Each has its own
@@ -72,7 +73,8 @@ def radiance(
     require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     require.finite("the light", light.radiance)
     require.position("the eye", eye)
-    rays = visibility.Occluder(mesh if occluder is None else occluder)
+    eye = origins.local("the eye", eye, mesh.origin)
+    rays = visibility.Occluder(mesh if occluder is None else relative(occluder, mesh.origin))
     if points is None:
         start = visibility.start_points(mesh, rays)
         vertex = visibility.rays.chosen(mesh, vertex)
@@ -121,7 +123,7 @@ def integrate(
         frame: Shading frames; rows are tangent, bitangent, normal.
         brdf: BRDF (wi, wo) -> value [*b c] in 1/sr that is a callable pytree, as the models are, or `PerVertex`.
         light: The environment, or a batch of them along leading axes.
-        eye: Position of the viewer in world units.
+        eye: Position of the viewer in world units, in the coordinates of the mesh's file.
         error: Largest relative error of the radiance of each vertex due to integration of BRDF x cosine.
 
     Returns:

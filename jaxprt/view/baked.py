@@ -95,7 +95,8 @@ def _file(scene: RelitScene, color: Float[np.ndarray, "v 3"], eye: list[float], 
         }
         name = f"{part.name}, baked for one light and one view"
         meshes.append({"name": name, "primitives": [primitive]})
-        nodes.append({"name": name, "mesh": len(meshes) - 1})
+        place = {"translation": list(mesh.origin)} if any(mesh.origin) else {}
+        nodes.append({"name": name, "mesh": len(meshes) - 1, **place})
     unlit = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
     head = {
         "asset": {"version": "2.0", "generator": "jaxprt", "extras": {"baked": True, "eye": eye, "exposure": exposure}},

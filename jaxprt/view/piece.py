@@ -100,6 +100,7 @@ def export(
     path = pathlib.Path(path)
     if path.suffix.lower() != ".html":
         raise ValueError(f"path must end in .html, got {path.name!r}")
+    scene = scene.centered()
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     bits = bits_of(scene)

@@ -38,7 +38,9 @@ class Stages:
 
     def __init__(self, systems: Mapping[str, RelitScene], environments: Mapping[str, Environment]):
         """Stores the systems and lights. More lights may be added later."""
-        self.systems = dict(systems)
+        # The browser draws in float32: positions, eyes and targets are relative to the scene's origin.
+        systems = {name: scene.centered() for name, scene in systems.items()}
+        self.systems = systems
         self.name, self.lights = list(environments), list(environments.values())
         # Scenes without bounces; and without lamps too, to compare with exact pictures.
         given = {name: (each.scene, each.direct, each.shading) for name, each in systems.items()}

@@ -5,6 +5,7 @@ construct themselves.
 """
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
@@ -15,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, UInt8
 
 from jaxprt.files.arrays import sketch
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene import origin as origins
+from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder, check, offsets
@@ -182,7 +184,14 @@ class VisibilityJob(blocks.Job):
     @classmethod
     def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
         """Makes a job for some vertices of a mesh, or all for None. If `occluder` is None, the mesh shadows itself."""
-        shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else occluder)
+        shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else relative(occluder, mesh.origin))
+        if mesh.origin != origins.ZERO:
+            warnings.warn(
+                f"the mesh is far from zero, and its positions are relative to mesh.origin, {mesh.origin}: give its "
+                "systems eyes and points relative to it, such as camera.local(mesh.origin).eye; jaxprt.precompute "
+                "takes scenes and the coordinates of their files",
+                stacklevel=4,
+            )
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
         # Padding to a power of two keeps the number of compiled shapes small.

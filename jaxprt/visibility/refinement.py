@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxprt.scene import light_samples, subdivision
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.subdivision import Division, Edges
 from jaxprt.visibility import blocks
 from jaxprt.visibility.diffuse import DiffuseTracer
@@ -74,7 +74,9 @@ def refine(
     compare the endpoints of each edge instead.
     """
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
-    return subdivision.subdivide(mesh, divisions(mesh, mesh if occluder is None else occluder, **options))
+    return subdivision.subdivide(
+        mesh, divisions(mesh, mesh if occluder is None else relative(occluder, mesh.origin), **options)
+    )
 
 
 def divisions(

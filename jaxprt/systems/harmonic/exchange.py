@@ -72,7 +72,10 @@ def export_transfer(
         value = convention.written(np.asarray(transport.vector), axis=0).transpose(2, 0, 1)
         value = value if convention.over_pi else value * np.asarray(np.pi, value.dtype)
         value = value[np.asarray(mesh.face)] if corners else value
-    position = np.asarray(mesh.position) @ convention.turn.T.astype(np.float32)
+    position = np.asarray(mesh.position)
+    if any(mesh.origin):  # in the coordinates of the mesh's file, which float32 would round
+        position = position.astype(np.float64) + mesh.origin
+    position = position @ convention.turn.T.astype(position.dtype)
     name = json.dumps(dataclasses.asdict(convention))
     if kind == ".npy":
         np.save(path, value)
@@ -130,7 +133,8 @@ def import_transfer(
     require.finite(f"the coefficients of {source}", value)
     turn = convention.turn.astype(np.float32)
     if "position" in held:
-        _same(f"positions of {source}", held["position"] @ turn, np.asarray(mesh.position))
+        place = np.asarray(held["position"], np.float64) @ convention.turn - mesh.origin
+        _same(f"positions of {source}", place, np.asarray(mesh.position))
     if what == "matrices":
         frame = directions.frame(mesh.normal, mesh.tangent)
         if "frame" in held:
@@ -211,12 +215,14 @@ def _write_ply(path, position: np.ndarray, face: np.ndarray, value: np.ndarray, 
     """Writes a binary PLY file with one property for each coefficient and color."""
     count, terms, colors = value.shape
     names = [f"sh_{i}_{c}" for i in range(terms) for c in range(colors)]
-    properties = [f"property float {name}" for name in (*"xyz", *names)]
+    number = "double" if position.dtype == np.float64 else "float"
+    properties = [f"property {number} {axis}" for axis in "xyz"] + [f"property float {name}" for name in names]
     head = ["ply", "format binary_little_endian 1.0", f"comment {_COMMENT}{convention}", f"element vertex {count}"]
     head += [*properties, f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
     corner = np.zeros(len(face), [("count", "u1"), ("vertex", "<i4", (3,))])
     corner["count"], corner["vertex"] = 3, face
-    rows = np.concatenate([position, value.reshape(count, -1)], 1).astype("<f4")
+    rows = np.empty(count, [("position", "<f8" if number == "double" else "<f4", 3), ("value", "<f4", terms * colors)])
+    rows["position"], rows["value"] = position, value.reshape(count, -1)
     pathlib.Path(path).write_bytes("\n".join(head).encode() + rows.tobytes() + corner.tobytes())
 
 
@@ -234,7 +240,7 @@ def _read_ply(path) -> dict[str, np.ndarray]:
     value = np.stack([np.asarray(data[f"sh_{i}_{c}"], np.float32) for i in range(terms) for c in range(colors)], 1)
     held = {
         "coefficient": value.reshape(-1, terms, colors),
-        "position": np.stack([np.asarray(data[axis], np.float32) for axis in "xyz"], 1),
+        "position": np.stack([data[axis] for axis in "xyz"], 1),
     }
     head = pathlib.Path(path).read_bytes().split(b"end_header")[0].decode("ascii", "replace").splitlines()
     said = [line.partition(_COMMENT)[2] for line in head if line.startswith(f"comment {_COMMENT}")]

@@ -11,10 +11,10 @@ normals point, and not on the other. Lamps are cut into pieces with separate int
 surfaces show the lamp's shape.
 """
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +25,8 @@ from jaxtyping import Array, Float
 
 from jaxprt import require, visibility
 from jaxprt.files.arrays import Layout, sketch
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene import origin as origins
+from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
 from jaxprt.visibility.occluder import offsets
 
@@ -108,6 +109,7 @@ def precompute(
         raise ValueError(f"pieces must be a power of two, and at most the {samples} samples, got {pieces}")
     for number, each in enumerate(lamps):
         require.kind(f"lamp {number}", each, Mesh, PointLight, source="jaxprt.load_mesh")
+    lamps = [_relative(lamp, mesh.origin) for lamp in lamps]
     coarse, fine = (_Samples.of(lamps, count, pieces) for count in (samples, _FINER * samples))
     lamp = [number for number, each in enumerate(lamps) for _ in range(pieces if isinstance(each, Mesh) else 1)]
     job = _Job.make(mesh, occluder, vertex, 1, coarse=coarse, fine=fine)
@@ -115,6 +117,13 @@ def precompute(
     solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(each.T)) for each in np.moveaxis(found, 2, 0))
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)
     return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(lamp))
+
+
+def _relative(lamp: Mesh | PointLight, origin: origins.Origin) -> Mesh | PointLight:
+    """A lamp with positions relative to the origin of the mesh that it lights."""
+    if isinstance(lamp, Mesh):
+        return relative(lamp, origin)
+    return dataclasses.replace(lamp, position=origins.local(f"point light {lamp.name!r}", lamp.position, origin))
 
 
 class _Samples(NamedTuple):
@@ -183,7 +192,7 @@ def _halved(place: np.ndarray, pieces: int) -> list[np.ndarray]:
     return parts
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class _Job(visibility.rays.VisibilityJob):
     """Job that computes the visible parts of lamps for blocks of vertices; see `blocks.Job`."""
 
