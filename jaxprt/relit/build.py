@@ -110,6 +110,7 @@ def precompute(
     shadings = [_checked(part, recipes[part.name], roughness) for part in near.parts]
     mesh = near.mesh
     warn.of_gain(near, shadings)
+    warn.of_shells(near)
     warn.of_backs(scene, scene.mesh, default_camera(scene, scene.mesh))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}

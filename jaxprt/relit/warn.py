@@ -1,4 +1,7 @@
-"""Warnings about scenes that are drawn as asked and yet look wrong: inside-out meshes, and BRDFs that create light."""
+"""Warnings about scenes that are drawn as asked and yet look wrong.
+
+Meshes may be inside out, a part may enclose the others and hide the light, and BRDFs may create light.
+"""
 
 import dataclasses
 import warnings
@@ -9,13 +12,16 @@ import numpy as np
 from jaxprt.image import raster
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
-from jaxprt.scene import Camera, Mesh, Scene, TexturedMaterial
+from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial
 from jaxprt.scene.camera import localized
+from jaxprt.scene.mesh import bounds
 from jaxprt.visibility import Occluder
 from jaxprt.visibility.hits import front
 
 _RAYS = 64  # along an edge of the picture
 _SMALLEST = 0.01  # share of the picture's rays that a part must meet: at silhouettes, normals may face away
+_POINTS = 64  # vertices of other parts that tell whether a part encloses them
+_HIDDEN = 0.99  # share of the upper hemisphere that an enclosing part hides
 _GAIN = 1.02  # mean albedo up to which a BRDF may be 1 and rounded
 
 
@@ -37,17 +43,75 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     corner = occluder.facing(triangle[met], way[met])
     away = ~front(occluder, np.asarray(mesh.normal), corner, way[met])
     own = np.asarray(mesh.region)[corner[:, 0]]
+    shells = enclosing(scene)
     for number, part in enumerate(scene.parts):
-        if isinstance(part.material, TexturedMaterial) and np.any(np.asarray(part.material.emissive)):
-            continue
         seen = away[own == number]
-        if len(seen) > _SMALLEST * len(way) and np.mean(seen) > 0.5:
-            warnings.warn(
-                f"a camera at {tuple(np.round(np.asarray(camera.eye, float), 3).tolist())} sees {np.mean(seen):.0%} of "
-                f"part {part.name!r} from behind, and backs are black: if its mesh is inside out, with clockwise "
-                "faces, reverse the corners of each face",
-                stacklevel=3,
-            )
+        if _emits(part) or len(seen) <= _SMALLEST * len(way) or np.mean(seen) <= 0.5:
+            continue
+        if number in shells and not _has_lamps(scene):
+            continue  # `of_shells` says more
+        remedy = "if its mesh is inside out, with clockwise faces, reverse the corners of each face"
+        if number in shells:
+            remedy = "it encloses the scene, so give a camera inside of it"
+        warnings.warn(
+            f"a camera at {tuple(np.round(np.asarray(camera.eye, float), 3).tolist())} sees {np.mean(seen):.0%} of "
+            f"part {part.name!r} from behind, and backs are black: {remedy}",
+            stacklevel=3,
+        )
+
+
+def of_shells(scene: Scene) -> None:
+    """Warns of parts that enclose all others, such as a sky dome: no light of the environment gets in.
+
+    Scenes with lamps are left out, because these may be inside.
+
+    Args:
+        scene: The scene.
+    """
+    if _has_lamps(scene):
+        return
+    for number in enclosing(scene):
+        warnings.warn(
+            f"part {scene.parts[number].name!r} encloses the scene and hides the light of the environment from it, so "
+            "everything inside is black: remove this part from the scene, and if it is a sky dome, load its picture as "
+            "the environment",
+            stacklevel=3,
+        )
+
+
+def enclosing(scene: Scene) -> list[int]:
+    """Indices of the parts that hide the upper hemisphere from the other parts, however their faces are turned."""
+    meshes = [part.mesh for part in scene.parts]
+    low, high = (np.stack(corner) for corner in zip(*map(bounds, meshes), strict=True))
+    result = []
+    for number, mesh in enumerate(meshes):
+        rest = [other for other in range(len(meshes)) if other != number]
+        around = (low[number] <= low[rest])[:, ::2].all(1) & (high[number] >= high[rest]).all(1)
+        if not rest or not around.all():
+            continue
+        step = max(1, sum(len(meshes[other].position) for other in rest) // _POINTS)
+        start = np.concatenate([np.asarray(meshes[other].position) for other in rest])[::step]
+        way = _upper(_RAYS)
+        point, ray = (index.ravel() for index in np.indices((len(start), len(way))))
+        if np.mean(Occluder(mesh).blocked(start.astype(np.float32), way, point, ray)) > _HIDDEN:
+            result.append(number)
+    return result
+
+
+def _has_lamps(scene: Scene) -> bool:
+    return bool(scene.point_lights) or any(_emits(part) for part in scene.parts)
+
+
+def _emits(part: Part) -> bool:
+    return isinstance(part.material, TexturedMaterial) and bool(np.any(np.asarray(part.material.emissive)))
+
+
+def _upper(count: int) -> np.ndarray:
+    """Directions that are spread evenly over the upper hemisphere, on a spiral."""
+    height = (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], 1).astype(np.float32)
 
 
 def of_gain(scene: Scene, shadings: Sequence[Shading]) -> None:

@@ -60,6 +60,43 @@ def test_lamps_may_be_seen_from_behind():
     assert told(warn.of_backs, scene, scene.mesh, orbit(scene.mesh, elevation=-0.5)) == []
 
 
+def dome(*, radius=50.0, lowest=-1.0, outward=False) -> Mesh:
+    """The part of a sphere above a height, relative to its radius."""
+    position, face = np.asarray(BALL.position) * radius, np.asarray(BALL.face)
+    face = face[(position[face][:, :, 1] >= lowest * radius - 1e-3).all(1)]
+    return make_mesh(position, face if outward else face[:, ::-1])
+
+
+def shells(*mesh: Mesh, material=None, **more) -> list[str]:
+    """The warnings of shells and of backs in a scene of some meshes."""
+    scene = Scene([Part(str(number), each, material or Lambert()) for number, each in enumerate(mesh)], **more)
+    camera = orbit(scene.mesh, elevation=0.3)
+    return told(warn.of_shells, scene) + told(warn.of_backs, scene, scene.mesh, camera)
+
+
+@pytest.mark.parametrize("lowest", [-1.0, 0.0])
+@pytest.mark.parametrize("outward", [False, True])
+def test_a_dome_is_said_to_hide_the_light_however_it_is_turned(lowest, outward):
+    floor = eqx.tree_at(lambda each: each.position, builtin.plane(cells=2), builtin.plane(cells=2).position * 20)
+    (text,) = shells(BALL, floor, dome(lowest=lowest, outward=outward))
+    assert re.search("part '2' encloses the scene and hides the light of the environment from it", text)
+
+
+def test_ceilings_and_open_cups_enclose_nothing():
+    plane, cup = builtin.plane(cells=2), dome(radius=4.0)
+    ceiling = make_mesh(np.asarray(plane.position) * 9 + [0, 3, 0], np.asarray(plane.face))
+    height = np.asarray(cup.position)[np.asarray(cup.face)][..., 1].max(1)
+    cup = make_mesh(np.asarray(cup.position), np.asarray(cup.face)[height < 3])
+    for meshes in ([BALL], [BALL, ceiling], [BALL, cup]):
+        assert not any("encloses" in text for text in shells(*meshes))
+
+
+def test_a_room_with_a_lamp_asks_for_a_camera_inside():
+    lamp = prt.scene.PointLight("bulb", [0.0, 3.0, 0.0], 1.0)
+    (text,) = shells(BALL, dome(radius=5.0), point_lights=[lamp])
+    assert re.search("part '1' from behind, and backs are black: it encloses the scene, so give a camera inside", text)
+
+
 def test_faces_of_both_orientations_and_mere_silhouettes_are_not_named():
     both = make_mesh(
         np.concatenate([np.asarray(BALL.position)] * 2),
