@@ -28,8 +28,8 @@ check: $(VENV)/.setup-test ## format, lint and types
 test: check ## check, then all tests, doctests and notebooks at a small size; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)
 
-test-long: $(VENV)/.setup-test ## what only a long run can show; CONTRIBUTING.md lists it
-	$(BIN)/python -m pytest -m long $(ARGS)
+test-long: $(VENV)/.setup-test ## what only a long run can show, with the optimization that users get; CONTRIBUTING.md lists it
+	XLA_FLAGS="" $(BIN)/python -m pytest -m long $(ARGS)
 
 bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
 	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \

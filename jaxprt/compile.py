@@ -9,7 +9,9 @@ that stay in the cache, GPUs few large kernels.
 """
 
 import functools
+import os
 import pathlib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -17,6 +19,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import Primitive
@@ -33,6 +36,16 @@ _MAPPINGS, _LIMIT = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/
 _FULL = 0.85  # of the largest number of mappings; one part of a picture takes up to 0.05
 _FEW = 50  # traces that need no count; counting takes 20 ms
 _traces = 0  # since the last count
+
+# jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103); requirements exclude it. A flag avoids the faulty fusion.
+_WRONG, _CURE = "0.10.2", "--xla_cpu_experimental_ynn_fusion_type="
+_CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
+if jaxlib.__version__ == _WRONG and _CURE not in os.environ.get("XLA_FLAGS", ""):
+    warnings.warn(
+        f"jaxlib {_WRONG} computes wrong sums on CPUs (jax-ml/jax#39103): install another version, or set the "
+        f"environment variable XLA_FLAGS={_CURE} before Python starts",
+        stacklevel=2,
+    )
 
 
 def jit(function: Callable, **options: Any) -> Any:
@@ -57,6 +70,22 @@ def _exact(function: Callable) -> Callable:
             return function(*argument, **named)
 
     return traced
+
+
+def wrong_sums() -> int:
+    """Number of rows in which this machine's compiler gets a small sum of squares wrong; 0 from a correct compiler.
+
+    The sum is that of three products of a matrix, squared, at numbers of rows where a compiler was wrong in silence. It
+    compiles two programs.
+    """
+    matrix = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
+    squares = jax.jit(jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2)))
+    wrong = 0
+    for count in _CANARIES:
+        row = np.random.default_rng(1).normal(size=(count, 3)).astype(np.float32)
+        expected = np.sum((row.astype(np.float64) @ matrix.astype(np.float64).T) ** 2, 1)
+        wrong += int(np.sum(~(np.abs(np.asarray(squares(row)) - expected) <= 1e-3 * expected)))
+    return wrong
 
 
 def make_room() -> None:

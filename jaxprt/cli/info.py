@@ -1,7 +1,9 @@
 """The command `jaxprt info`: describes the content of files."""
 
+import importlib.metadata
 import json
 import math
+import platform
 import re
 import warnings
 from pathlib import Path
@@ -9,9 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import click
+import jax
 import numpy as np
 
-from jaxprt import brdf
+from jaxprt import brdf, compile
 from jaxprt.cli import inputs, materials, options
 from jaxprt.cli.options import option
 from jaxprt.files import read_image
@@ -23,11 +26,15 @@ from jaxprt.sphere import cubemap
 _BRIGHTEST = (1, 10, 100)  # numbers of brightest texels whose share of the light is reported
 _MERL = np.array([90, 90, 180], "<i4").tobytes()
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+_WRONG = (
+    "the compiler of this installation must compute right sums, got wrong ones (see jax-ml/jax#39103): install another "
+    "version of jaxlib"
+)
 _NAMES = 6  # most names of a file's materials that the text lists
 
 
 @click.command(cls=options.Command, short_help="Describe meshes, scenes, environments, BRDFs and stores.")
-@click.argument("files", metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1, required=True)
+@click.argument("files", metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1)
 @option(
     "--light-size",
     group="Light",
@@ -41,13 +48,22 @@ _NAMES = 6  # most names of a file's materials that the text lists
 def command(**given: Any) -> None:
     """Describe the content of files: meshes and scenes, environments, BRDFs, and folders written by jaxprt.
 
+    Without files, describe the installation: versions, the device, and whether its compiler computes right sums.
+
     \b
     Examples:
+      jaxprt info
       jaxprt info scene.glb grace.hdr
       jaxprt info lafortune.json ngan2005_wardduer.fit gold-paint.binary
       jaxprt info kept out/ --json
     """  # noqa: D301
     chosen = SimpleNamespace(**given)
+    if not chosen.files:
+        here = installation()
+        options.tell(here, _installed(here), as_json=chosen.as_json)
+        if here["wrong_sums"]:
+            raise ValueError(_WRONG)
+        return
     found, refused = [], []
     for path in chosen.files:
         try:
@@ -57,6 +73,26 @@ def command(**given: Any) -> None:
     options.tell(found, "\n".join(map(_text, found)), as_json=chosen.as_json)
     if refused:
         raise ValueError("\n".join(refused))
+
+
+def installation() -> dict[str, Any]:
+    """Describes this installation, as JSON: versions, the device, and wrong sums of its compiler."""
+    device = jax.devices()[0]
+    versions = {name: importlib.metadata.version(name) for name in ("jaxprt", "jax", "jaxlib", "numpy", "embreex")}
+    return {
+        "python": platform.python_version(),
+        **versions,
+        "device": device.device_kind,
+        "platform": device.platform,
+        "wrong_sums": compile.wrong_sums(),
+    }
+
+
+def _installed(here: dict[str, Any]) -> str:
+    names = ("jaxprt", "jax", "jaxlib", "numpy", "embreex")
+    versions = ", ".join(f"{name} {here[name]}" for name in names)
+    sums = f"{here['wrong_sums']} wrong sums" if here["wrong_sums"] else "right"
+    return f"{versions}, Python {here['python']}\ndevice {here['platform']}, {here['device']}\ncompiler {sums}"
 
 
 def about(path: Path, light_size: int) -> dict[str, Any]:

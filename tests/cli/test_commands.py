@@ -1,5 +1,6 @@
 """The commands `plan`, `measure`, `info` and `completion`, and what all of them are given."""
 
+import importlib.metadata
 import inspect
 import json
 import os
@@ -103,6 +104,16 @@ def test_the_fit_of_a_brdf_is_measured_on_a_sphere(place, capsys):
     assert "takes environments only, got a mesh: use --brdf" in capsys.readouterr().err
     assert main("measure", "--fit", "lambert", "--system", "clusters") == 2
     assert "--fit needs --system separable, harmonic, lobe, got clusters" in capsys.readouterr().err
+
+
+def test_info_without_files_says_that_the_compiler_of_users_computes_right_sums():
+    users = {**os.environ, "XLA_FLAGS": ""}  # with the optimization that tests leave out
+    result = subprocess.run(
+        [sys.executable, "-m", "jaxprt", "info", "--json"], env=users, capture_output=True, text=True, check=True
+    )
+    told = json.loads(result.stdout)
+    assert told["wrong_sums"] == 0
+    assert told["jaxlib"] == importlib.metadata.version("jaxlib") != "0.10.2"
 
 
 def test_info_says_what_meshes_and_environments_hold(place, capsys):

@@ -18,7 +18,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
 from jaxprt.scene import Environment, Mesh, builtin
-from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.scene.mesh import grid_face, join, make_mesh
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.sphere import directions
 from jaxprt.systems import protocol
@@ -69,12 +69,28 @@ def mesh(name: str) -> Mesh:
     """Scenes: a sphere on a ground (two regions), an open sphere of as many vertices, and one triangle."""
     if name == "triangle":
         return make_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]]))
+    if name.isdecimal():
+        return hills(int(name))
     if name == "ball":
         return builtin.sphere(rings=10, sectors=11)
     ball = builtin.sphere(rings=6, sectors=10)
     floor = builtin.plane(cells=6)
     floor = eqx.tree_at(lambda m: m.position, floor, floor.position * 2 - jnp.array([0.0, 1.01, 0.0]))
     return join([ball, floor])
+
+
+def hills(count: int) -> Mesh:
+    """A hilly ground of exactly `count` vertices: a grid, and triangles above it."""
+    side = int(np.sqrt(count))
+    x, z = np.meshgrid(*[np.linspace(-2, 2, side)] * 2)
+    height = 0.2 * np.sin(5 * x) * np.cos(4 * z)
+    ground = make_mesh(np.stack([x, height, z], -1).reshape(-1, 3), grid_face(rows=side, columns=side))
+    rest = count - side**2
+    if not rest:
+        return ground
+    corner = np.random.default_rng(0).uniform(-1, 1, (rest, 3)) + [0, 2, 0]
+    face = np.minimum(np.arange(rest // 3 * 3 + 3 * (rest % 3 > 0)), rest - 1).reshape(-1, 3)
+    return join([ground, make_mesh(corner, face, region=np.zeros(rest, int))])
 
 
 @functools.cache
@@ -412,6 +428,28 @@ def test_a_mesh_of_one_triangle_is_lit(name):
     assert color.shape == (3, 3)
     assert np.isfinite(color).all()
     assert color.any() == (not name.startswith("bounces"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("count", [32_769, 40_000])
+@each_system
+def test_sizes_at_which_a_compiler_was_wrong_agree_with_float64(name, count):
+    # jaxlib 0.10.2 summed wrongly at these numbers of rows, with the optimization that users get.
+    system, materials, _ = made(name, str(count))
+    assert system.vertices == count
+    single = jax.jit(lambda s, e, m: prt.radiance(s, e, eye=EYE, materials=m))(system, light(), materials)
+    assert single.dtype == jnp.float32
+    with jax.enable_x64(True):
+        eye, *double = jax.tree.map(exact, (EYE, system, light(), materials))
+        expected = np.asarray(jax.jit(lambda s, e, m: prt.radiance(s, e, eye=eye, materials=m))(*double))
+    assert expected.dtype == np.float64
+    assert np.abs(single - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+def exact(value: Any) -> Any:
+    """An array of floating point in float64; other leaves unchanged."""
+    floating = isinstance(value, jax.Array | np.ndarray) and jnp.issubdtype(value.dtype, jnp.floating)
+    return value.astype(jnp.float64) if floating else value
 
 
 def devices(count: int) -> list[jax.Device]:
