@@ -37,7 +37,7 @@ _FULL = 0.85  # of the largest number of mappings; one part of a picture takes u
 _FEW = 50  # traces that need no count; counting takes 20 ms
 _traces = 0  # since the last count
 
-# jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103). Requirements exclude it; a flag avoids the faulty fusion.
+# jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103). Requirements exclude it; a flag avoids these fusions.
 _WRONG, _CURE = "0.10.2", "--xla_cpu_experimental_ynn_fusion_type="
 _CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
 if jaxlib.__version__ == _WRONG and _CURE not in os.environ.get("XLA_FLAGS", ""):
