@@ -33,6 +33,7 @@ _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 _SINK, _SINK_EDGE = 0.02, 1.0
 _BACK = 1.25  # how far rays go back to the vertex, in offsets
 _STEEPEST = 0.25  # smallest cosine between the direction off the surface and the normals of faces around a vertex
+_TURNS = 16  # steps that turn this direction off faces which it grazes
 
 
 @dataclass(frozen=True)
@@ -316,30 +317,70 @@ def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors that point off the surface, to the side of each vertex's shading normal.
 
     They average the normals of all faces at the same position. Where vertices are split along a crease, faces across
-    the crease count too; otherwise a ray could start inside of them.
+    the crease count too; otherwise a ray could start inside of them. Where the mean grazes a face, or is behind it, the
+    vector is turned off that face.
 
     Returns:
-        The vectors, and for each vertex the smallest cosine between its vector and the normals of its faces.
+        The vectors, and for each vertex the smallest cosine between its vector and the normals of the faces that count.
     """
     position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
     facing = _face_normal(position, face)
-    side = [np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)[:, None] for corner in face.T]
-    own = np.zeros_like(normal)
-    for corner, sign in zip(face.T, side, strict=True):
-        for axis in range(3):
-            own[:, axis] += np.bincount(corner, (facing * sign)[:, axis], len(normal))
+    sided = np.stack(
+        [np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)[:, None] * facing for corner in face.T]
+    )
+    own = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
-    joint = np.stack([np.bincount(place, own[:, axis]) for axis in range(3)], 1)[place]
+    joint = _added(place, own, len(normal))[place]
     # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
-    total = np.where(np.sum(joint * own, 1, keepdims=True) > 1e-6 * np.sum(own * own, 1, keepdims=True), joint, own)
+    shared = np.sum(joint * own, 1) > 1e-6 * np.sum(own * own, 1)
+    total = np.where(shared[:, None], joint, own)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     out = np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal)
-    steepness = np.ones(len(normal))
-    for corner, sign in zip(face.T, side, strict=True):
-        # Degenerate faces have no normal and need no distance.
-        cosine = np.where(np.any(facing, axis=1), np.sum(facing * sign * out[corner], 1), 1.0)
-        np.minimum.at(steepness, corner, cosine)
-    return out.astype(np.float32), steepness
+    # Vertices with the same faces have the same vector: number them, and keep the faces with an area.
+    joined = np.where(shared, place, len(normal) + np.arange(len(normal)))
+    _, first, group = np.unique(joined, return_index=True, return_inverse=True)
+    solid = np.any(facing, axis=1)
+    steepness, turned = _off_faces(out[first], group[face[solid].T.ravel()], sided[:, solid].reshape(-1, 3))
+    return turned[group].astype(np.float32), steepness[group]
+
+
+def _off_faces(out: np.ndarray, group: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turns vectors off the faces that they graze, by steps towards the normal of the worst face.
+
+    Args:
+        out: Unit vectors.
+        group: Index of the vector of each corner of a face.
+        facing: Unit normal of the face of each corner, on the vector's side.
+
+    Returns:
+        For each vector the smallest cosine with the normals of its faces, and the turned vectors.
+    """
+
+    def smallest(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        cosine, least = np.sum(facing * vector[group], 1), np.ones(len(vector))
+        np.minimum.at(least, group, cosine)
+        return cosine, least
+
+    cosine, least = smallest(out)
+    grazing = least < _STEEPEST
+    if not grazing.any():
+        return least, out
+    touched = grazing[group]
+    group, facing = group[touched], facing[touched]
+    best, vector, steepness = out.copy(), out.copy(), np.where(grazing, least, 1.0)
+    for _ in range(_TURNS):
+        cosine, now = smallest(vector)
+        better = grazing & (now > steepness)
+        best[better], steepness[better] = vector[better], now[better]
+        worst = cosine <= now[group]
+        vector[group[worst]] += 0.5 * facing[worst]
+        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
+    return np.where(grazing, steepness, least), best
+
+
+def _added(index: np.ndarray, vector: np.ndarray, count: int) -> np.ndarray:
+    """Sums of vectors by index."""
+    return np.stack([np.bincount(index, vector[:, axis], count) for axis in range(3)], 1)
 
 
 def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray, offset: np.ndarray) -> np.ndarray:
