@@ -99,11 +99,14 @@ def _read(
     if form is None:
         got = f"one that starts with {start[:8]!r}" if start else "an empty file"
         raise ValueError(f"{name} must be an EXR, HDR, PNG, JPEG, TIFF, PFM or BMP image, got {got}")
-    if form == "openexr":
-        return read_exr(path, name)
-    if form == "hdr":
-        return read_radiance(path, name)
-    return _read_other(path, name, form, decoded=decoded)
+    try:
+        if form == "openexr":
+            return read_exr(path, name)
+        if form == "hdr":
+            return read_radiance(path, name)
+        return _read_other(path, name, form, decoded=decoded)
+    except MemoryError as error:  # NumPy's does not name the file, where a process may use less than is free.
+        raise error if name in str(error) else MemoryError(f"{name} must fit into memory, got: {error}") from error
 
 
 def _read_other(
@@ -140,7 +143,8 @@ def _read_other(
     whole = spec.format.basetype in (OpenImageIO.UINT8, OpenImageIO.UINT16)
     gamma = _check_color(path, name, form, attributes, whole=whole) if decoded is None else None
     colors = image[..., : spec.nchannels - (spec.nchannels in (2, 4))]
-    linear = str(attributes.get("oiio:ColorSpace", "")).lower().startswith("lin")
+    # The gamma of PNG files says more; OpenImageIO takes one of 0 for a linear file.
+    linear = form != "png" and str(attributes.get("oiio:ColorSpace", "")).lower().startswith("lin")
     if whole and gamma is not None:
         for rows in pixels.row_blocks(colors):
             rows **= np.float32(gamma)

@@ -2,9 +2,9 @@
 
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-import OpenImageIO
 
 from jaxprt import require
 
@@ -67,13 +67,11 @@ def row_blocks(image: np.ndarray) -> Iterator[np.ndarray]:
         yield image[first : first + step]
 
 
-def read_block(
-    reader: OpenImageIO.ImageInput, rows: range, *, part: int = 0, channels: range, form: str = "float"
-) -> np.ndarray:
+def read_block(reader: Any, rows: range, *, part: int = 0, channels: range, form: str = "float") -> np.ndarray:
     """Some rows of an image file that OpenImageIO reads, of scan lines or of tiles, at the finest level.
 
     Args:
-        reader: The opened file.
+        reader: The opened file, an `OpenImageIO.ImageInput`.
         rows: Rows in the coordinates of the file. The first must be the first of a row of tiles.
         part: Number of the image in the file.
         channels: Channels.
@@ -99,11 +97,11 @@ def read_block(
     return np.asarray(block).reshape(len(rows), spec.width, len(channels))
 
 
-def read_rows(reader: OpenImageIO.ImageInput, image: np.ndarray) -> None:
+def read_rows(reader: Any, image: np.ndarray) -> None:
     """Reads all rows of the first image of a file, block by block, into an array.
 
     Args:
-        reader: The opened file.
+        reader: The opened file, an `OpenImageIO.ImageInput`.
         image: The array [h, w, c] to fill, of all channels of the file.
 
     Raises:

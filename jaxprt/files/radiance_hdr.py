@@ -181,16 +181,19 @@ def _read_pixels(content: bytes, header: _Header, name: str) -> Float32[np.ndarr
     Consecutive repetitions have the digits of n to the base 256, the lowest first. No run crosses a scan line.
     """
     count = header.length * header.width
-    stored = (len(content) - header.start) // 4
-    unit = np.frombuffer(content, np.uint8, 4 * min(stored, count), header.start).reshape(-1, 4)
+    stored = len(content) - header.start
+    unit = np.frombuffer(content, np.uint8, stored // 4 * 4, header.start).reshape(-1, 4)
     marker = (unit[:, 0] == 1) & (unit[:, 1] == 1) & (unit[:, 2] == 1)
-    expanded = None
     if marker.any():
         pixels.check_memory(name, header.length, header.width, 3, decoder=40 * len(unit) + 4 * count)
         expanded = _expand(unit, marker, header)
-    if expanded is not None:
-        unit = expanded
-    elif stored < count:
+        # In a flat file a dark pixel of a careless writer may look like a run.
+        whole = expanded is not None or stored == 4 * count
+        unit = unit if expanded is None else expanded
+    else:
+        whole = stored >= 4 * count
+        unit = unit[:count]
+    if not whole:
         raise ValueError(
             f"{name} must be an undamaged hdr file, got pixels or runs of pixels that do not fill {header.length} "
             f"lines of {header.width}"
