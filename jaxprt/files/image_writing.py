@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxprt.files import outputs, pixels
 
 _PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"  # the last chunk, with its checksum
+_INCOMPLETE = "the file is incomplete; the disk may be full"
 _BLOCK = 2**21  # values that are compared per step
 
 
@@ -74,7 +75,7 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
         with new.open("rb") as file:
             file.seek(-len(_PNG_END), os.SEEK_END)
             if file.read() != _PNG_END:  # The pixels can be read without it, but not by every program.
-                raise OSError("the file is incomplete")
+                raise OSError(_INCOMPLETE)
 
 
 def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
@@ -97,19 +98,19 @@ def _compare(path: pathlib.Path, values: np.ndarray, form: str) -> None:
     reader = OpenImageIO.ImageInput.open(str(path), config)
     if reader is None:
         OpenImageIO.geterror()  # Otherwise it is printed at the end of the program.
-        raise OSError("the file is incomplete")
+        raise OSError(_INCOMPLETE)
     try:
         spec = reader.spec()
         if (spec.height, spec.width, spec.nchannels) != values.shape:
-            raise OSError("the file is incomplete")
+            raise OSError(_INCOMPLETE)
         step = max(16, _BLOCK // (spec.width * spec.nchannels) // 16 * 16)  # EXR has blocks of 16 rows.
         for first in range(0, spec.height, step):
             rows = range(first, min(first + step, spec.height))
             block = pixels.read_block(reader, rows, channels=range(spec.nchannels), form=form)
             same = block.view(np.uint8) == np.ascontiguousarray(values[rows.start : rows.stop]).view(np.uint8)
             if not same.all():
-                raise OSError("the file is incomplete")
+                raise OSError(_INCOMPLETE)
     except ValueError as error:
-        raise OSError("the file is incomplete") from error
+        raise OSError(_INCOMPLETE) from error
     finally:
         reader.close()
