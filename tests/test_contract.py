@@ -214,6 +214,7 @@ HOST = {
     "scene.environment.environment_from_image": "checks values",
     "scene.environment.layout_of": "reads the shape of an image file",
     "scene.environment.resample": "NumPy in float64, where data enters",
+    "scene.resampling": "the same",
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",
     "sphere.harmonics.degree_of": "arithmetic on shapes",

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxprt.cli import inputs, options, play, relight, sizes
 from jaxprt.cli.options import option
+from jaxprt.files import outputs
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
 from jaxprt.view import export, export_baked
@@ -146,6 +147,6 @@ def probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -
         tool: {name: np.asarray(light_probe(light, tool=tool), float).tolist() for name, light in lights.items()}
         for tool in tools
     }
-    path.write_text(json.dumps(found, indent=2) + "\n")
+    outputs.write(path, json.dumps(found, indent=2) + "\n")
     words = f", nine colors of each of {', '.join(lights)} for {', '.join(tools)}"
     return {"path": str(path), "kind": "probes", "bytes": path.stat().st_size, "words": words}

@@ -17,6 +17,7 @@ import jaxprt
 from jaxprt.cli import animation, inputs, materials, options, report, sizes
 from jaxprt.cli.options import option
 from jaxprt.cli.report import Made, View
+from jaxprt.files import outputs
 from jaxprt.relit.planning import Plan
 from jaxprt.visibility import blocks
 
@@ -122,7 +123,7 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
         found["table"] = [row for system in tabled for row in report.table(system, view, vertex, right)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS reports bytes, Linux KiB
-    (chosen.output / "report.json").write_text(json.dumps(options.finite(found), indent=2) + "\n")
+    outputs.write(chosen.output / "report.json", json.dumps(options.finite(found), indent=2) + "\n")
     return found
 
 

@@ -1,13 +1,17 @@
-"""Image files. OpenEXR reads and writes EXR; OpenImageIO handles all other formats."""
+"""Reading of image files. EXR and Radiance pictures have files of their own; OpenImageIO reads all other formats."""
 
 import pathlib
 import tempfile
 import typing
+import warnings
 
 import numpy as np
-import OpenEXR
 import OpenImageIO
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Float32
+
+from jaxprt.files import color_spaces, inputs, pixels
+from jaxprt.files.exr import read_exr
+from jaxprt.files.radiance_hdr import read_radiance
 
 _MAGIC = (
     (b"\x76\x2f\x31\x01", "openexr"),
@@ -20,45 +24,48 @@ _MAGIC = (
     (b"Pf", "pnm"),
     (b"BM", "bmp"),
 )
-# Sets of channels that are read from EXR files; the first that matches is used. Alpha is read too if there is one.
-_CHANNELS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
-# A larger size is taken for a broken header: 16384 x 32768 pixels are 6 GB as float32 RGB.
-_MAX_PIXELS = 2**29
+_PNG_START = 2**20  # Chunks before the pixels are within these bytes, apart from absurd ones.
 
 
 def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     """Reads an image file as linear values.
 
     The format (EXR, Radiance HDR, PNG, JPEG, TIFF, PFM or BMP) is recognized from the first bytes of the file, not from
-    its name. Integer formats (PNG, JPEG, ...) are decoded from sRGB unless the file states that it is linear. Files of
-    floating-point numbers are used as they are. Primaries and the exposure in HDR headers are not applied; they are
-    among the returned attributes. Of an EXR file only the first part is read, at the finest level. If its data window
-    is smaller than the display window, the rest is black; data outside of the display window is cut off. Alpha is not
-    applied; it is the last of two or four channels.
+    its name. The pixels are turned as the file's orientation demands. Alpha is not applied; it is the last of two or
+    four channels.
+
+    * Radiance HDR: pixels are divided by the exposures and color corrections of the header, and converted from its
+      primaries to Rec. 709.
+    * EXR: the first part with RGB channels, or else with Y, is read at the finest level. Its chromaticities, color
+      interop ID or ACES container flag are converted to Rec. 709. If its data window is smaller than the display
+      window, the rest is black; data outside of the display window is cut off. Where white points differ, white stays
+      white (Bradford's matrix).
+    * Integer formats (PNG, JPEG, ...): values are decoded from sRGB, unless a PNG file states another gamma, or the
+      file states that it is linear. Other primaries and ICC profiles are not converted, with a warning.
+    * Floating-point TIFF and PFM files: values are used as they are.
 
     Args:
         path: The file.
 
     Returns:
-        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels, and the attributes of the header. For
-        EXR environment maps the attribute ``envmap`` is "latlong" or "cube".
+        The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels, and the attributes of the header, which
+        describe the file before conversion. For EXR environment maps the attribute ``envmap`` is "latlong" or "cube".
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The path is a directory, or the file is empty, damaged, of an unknown format, or has other channels.
+        ValueError: The path is not a regular file, or the file is empty, damaged, of an unknown format, has other
+            channels, or more than 2^28 pixels.
+        MemoryError: The pixels do not fit into memory.
     """
     path = pathlib.Path(path).absolute()
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if not path.is_file():
-        raise ValueError(f"{path} must be an image file, got a {'directory' if path.is_dir() else 'special file'}")
-    return _read(path, decoded=None)
+    inputs.check(path, "an image file")
+    return _read(path, str(path), decoded=None)
 
 
 def decode_image(content: bytes, *, name: str, decoded: bool = True) -> Float32[np.ndarray, "h w c"]:
     """Reads an image file whose content is in memory, such as one inside of a GLB file.
 
-    Formats and channels are those of `read_image`.
+    Formats, channels, limits and orientation are those of `read_image`.
 
     Args:
         content: The bytes of the file.
@@ -70,178 +77,96 @@ def decode_image(content: bytes, *, name: str, decoded: bool = True) -> Float32[
         The pixels with 1 (gray), 2 (gray, alpha), 3 (RGB) or 4 (RGBA) channels.
 
     Raises:
-        ValueError: The content is empty, damaged, of an unknown format, or has other channels.
+        ValueError: The content is empty, damaged, of an unknown format, or has other channels or too many pixels.
+        MemoryError: The pixels do not fit into memory.
     """
     # OpenImageIO can read from memory only in C++, so a temporary file is used.
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "image"
         path.write_bytes(content)
         try:
-            return _read(path, decoded=decoded)[0]
-        except ValueError as error:
+            return _read(path, name, decoded=decoded)[0]
+        except ValueError as error:  # Messages of the decoders name the temporary file.
             raise ValueError(str(error).replace(str(path), name)) from error
 
 
-def _read(path: pathlib.Path, *, decoded: bool | None) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+def _read(
+    path: pathlib.Path, name: str, *, decoded: bool | None
+) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     with path.open("rb") as file:
-        start = file.read(2048)
+        start = file.read(16)
     form = next((form for magic, form in _MAGIC if start.startswith(magic)), None)
     if form is None:
         got = f"one that starts with {start[:8]!r}" if start else "an empty file"
-        raise ValueError(f"{path} must be an EXR, HDR, PNG, JPEG, TIFF, PFM or BMP image, got {got}")
-    if form == "openexr":
-        return _read_exr(path)
-    if form == "hdr" and b"32-bit_rle_xyze" in start:
-        raise ValueError(f"{path} must hold RGB (32-bit_rle_rgbe), got XYZ (32-bit_rle_xyze): convert it first")
-    return _read_other(path, form, decoded=decoded)
-
-
-def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
-    """Writes linear values to an EXR file of 32-bit floats with lossless compression.
-
-    Args:
-        path: The file. An existing file is replaced.
-        image: Linear values with 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
-
-    Raises:
-        ValueError: The image is empty, not of a floating-point type, or has another number of channels.
-        OSError: The file cannot be written.
-    """
-    names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
-    _check_folder(path)
-    # OpenEXR silently writes wrong values for arrays that are not contiguous.
-    values = np.asarray(image, np.float32)
-    channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
-
-
-def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
-    """Writes an image that is already encoded for display to an 8-bit PNG file.
-
-    Args:
-        path: The file. An existing file is replaced.
-        image: Display values with 1, 3 or 4 channels. 0 is black and 1 is white; other values are clamped.
-
-    Raises:
-        ValueError: The image is empty, not of a floating-point type, has another number of channels, or holds NaN.
-        OSError: The file cannot be written.
-    """
-    _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
-    _check_folder(path)
-    values = np.asarray(image, np.float64)
-    wrong = np.argwhere(np.isnan(values).any(axis=-1))
-    if len(wrong):
-        raise ValueError(f"image must not hold NaN, got {len(wrong)} such pixels, first at {tuple(map(int, wrong[0]))}")
-    values = np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
-    height, width, count = values.shape
-    spec = OpenImageIO.ImageSpec(width, height, count, "uint8")
-    spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = OpenImageIO.ImageOutput.create("png")
-    assert output is not None  # OpenImageIO's wheels include PNG.
-    if not (output.open(str(path), spec) and output.write_image(values) and output.close()):
-        raise OSError(f"{path}: {output.geterror() or 'cannot be written'}")
-
-
-def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
-    if image.dtype.kind != "f":
-        raise ValueError(f"image must be of floating point, with 1 for white in pictures, got {image.dtype}")
-    if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
-        raise ValueError(f"image must be [h, w, c] with c one of {list(names)} and no empty axis, got {image.shape}")
-    return names[image.shape[-1]]
-
-
-def _check_folder(path: str | pathlib.Path) -> None:
-    folder = pathlib.Path(path).absolute().parent
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{path}: there is no folder {folder}")
-
-
-def _check_size(path: pathlib.Path, height: int, width: int) -> None:
-    if height < 1 or width < 1 or height * width > _MAX_PIXELS:
-        raise ValueError(f"{path} must have 1 to {_MAX_PIXELS} pixels, got {width} x {height}")
-
-
-def _read_exr(path: pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+        raise ValueError(f"{name} must be an EXR, HDR, PNG, JPEG, TIFF, PFM or BMP image, got {got}")
     try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            header = dict(file.parts[0].header)
-    except Exception as error:
-        raise ValueError(f"{path} must be an undamaged EXR file, got: {error}") from error
-    if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-        raise ValueError(f"{path} must be an EXR image of scan lines or tiles, got {header['type'].name}")
-    (x0, y0), (x1, y1) = (corner.tolist() for corner in header["dataWindow"])
-    (left, top), (right, bottom) = (corner.tolist() for corner in header["displayWindow"])
-    _check_size(path, y1 - y0 + 1, x1 - x0 + 1)
-    _check_size(path, bottom - top + 1, right - left + 1)
-    found = {channel.name: channel for channel in header["channels"]}
-    names = next((names for names in _CHANNELS if set(names) <= set(found)), None)
-    if names is None or {"RY", "BY"} & set(found):
-        raise ValueError(f"{path} must have channels R, G, B or Y and perhaps A, got {', '.join(found)}")
-    if any(found[name].xSampling != 1 or found[name].ySampling != 1 for name in names):
-        raise ValueError(f"{path} must have all its channels at full resolution, got subsampled ones")
-    if x0 > right or y0 > bottom or x1 < left or y1 < top:
-        raise ValueError(
-            f"{path} must have a data window that overlaps its display window, got {x0}..{x1}, {y0}..{y1} outside of it"
-        )
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            if not file.parts:  # OpenEXR has already printed the reason.
-                raise ValueError("pixels that cannot be read")
-            channels = file.parts[0].channels
-            data = np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)
-    except Exception as error:
-        raise ValueError(f"{path} must be an undamaged EXR file, got: {error}") from error
-    if data.shape[:2] != (y1 - y0 + 1, x1 - x0 + 1):
-        raise ValueError(f"{path} must hold {x1 - x0 + 1} x {y1 - y0 + 1} pixels, got {data.shape[1::-1]}")
-    image = np.zeros((bottom - top + 1, right - left + 1, len(names)), np.float32)
-    rows = slice(max(y0, top), min(y1, bottom) + 1)
-    columns = slice(max(x0, left), min(x1, right) + 1)
-    image[_shift(rows, top), _shift(columns, left)] = data[_shift(rows, y0), _shift(columns, x0)]
-    if "envmap" in header:
-        header["envmap"] = header["envmap"].name.removeprefix("ENVMAP_").lower()
-    return image, header
-
-
-def _shift(span: slice, origin: int) -> slice:
-    return slice(span.start - origin, span.stop - origin)
+        if form == "openexr":
+            return read_exr(path, name)
+        if form == "hdr":
+            return read_radiance(path, name)
+        return _read_other(path, name, form, decoded=decoded)
+    except MemoryError as error:  # NumPy's does not name the file, where a process may use less than is free.
+        raise error if name in str(error) else MemoryError(f"{name} must fit into memory, got: {error}") from error
 
 
 def _read_other(
-    path: pathlib.Path, form: str, *, decoded: bool | None
+    path: pathlib.Path, name: str, form: str, *, decoded: bool | None
 ) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise colors come premultiplied by alpha.
     reader = OpenImageIO.ImageInput.open(str(path), config)
     if reader is None:
-        raise ValueError(f"{path} must be an undamaged {form} file, got: {OpenImageIO.geterror()}")
+        raise ValueError(f"{name} must be an undamaged {form} file, got: {OpenImageIO.geterror()}")
     try:
+        if reader.format_name() != form:
+            raise ValueError(
+                f"{name} must be an undamaged {form} file, got one that only a {reader.format_name()} reader takes"
+            )
         spec = reader.spec()
-        _check_size(path, spec.height, spec.width)
-        if spec.nchannels > 4 or spec.depth > 1:
-            raise ValueError(f"{path} must have 1 to 4 channels and be flat, got {spec.nchannels}, depth {spec.depth}")
-        image = reader.read_image("float")
-        # Some readers return incomplete data and only report an error.
-        error = reader.geterror()
-        if image is None or error:
-            raise ValueError(f"{path} must be an undamaged {form} file, got: {error or 'no pixels'}")
+        pixels.check_size(name, spec.height, spec.width)
+        if not 1 <= spec.nchannels <= 4 or spec.depth > 1:
+            raise ValueError(f"{name} must have 1 to 4 channels and be flat, got {spec.nchannels}, depth {spec.depth}")
+        # Decoders of interlaced and progressive files, and of strips, hold all values in the file's type.
+        native = spec.height * spec.width * spec.nchannels * spec.format.size()
+        pixels.check_memory(name, spec.height, spec.width, spec.nchannels, decoder=2 * native)
+        image = np.empty((spec.height, spec.width, spec.nchannels), np.float32)
+        try:
+            pixels.read_rows(reader, image)
+        except ValueError as error:
+            raise ValueError(f"{name} must be an undamaged {form} file, got: {error}") from error
     finally:
         reader.close()
     attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
-    if attributes.get("Orientation", 1) != 1:
-        raise ValueError(f"{path} must be stored upright (orientation 1), got orientation {attributes['Orientation']}")
-    image = np.asarray(image, np.float32).reshape(spec.height, spec.width, spec.nchannels)
-    space = str(attributes.get("oiio:ColorSpace", ""))
+    stated = attributes.get("Orientation", 1)
+    # Exif has no other orientations than 1 to 8; viewers show files with others as they are.
+    orientation = stated if isinstance(stated, int) and 1 <= stated <= 8 else 1
     whole = spec.format.basetype in (OpenImageIO.UINT8, OpenImageIO.UINT16)
-    if whole and (decoded if decoded is not None else not space.lower().startswith("lin")):
-        colors = spec.nchannels - (spec.nchannels in (2, 4))
-        image[..., :colors] = _decode_srgb(image[..., :colors])
-    return image, attributes
+    gamma = _check_color(path, name, form, attributes, whole=whole) if decoded is None else None
+    colors = image[..., : spec.nchannels - (spec.nchannels in (2, 4))]
+    # The gamma of PNG files says more; OpenImageIO takes one of 0 for a linear file.
+    linear = form != "png" and str(attributes.get("oiio:ColorSpace", "")).lower().startswith("lin")
+    if whole and gamma is not None:
+        for rows in pixels.row_blocks(colors):
+            rows **= np.float32(gamma)
+    elif whole and (decoded if decoded is not None else not linear):
+        pixels.decode_srgb(colors)
+    return pixels.upright(image, orientation), attributes
 
 
-def _decode_srgb(value: np.ndarray) -> np.ndarray:
-    """Decodes sRGB values to linear ones (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+def _check_color(
+    path: pathlib.Path, name: str, form: str, attributes: dict[str, typing.Any], *, whole: bool
+) -> float | None:
+    """The exponent that decodes the values of a PNG file; None for sRGB. Warns of colors that are not converted."""
+    gamma, words = None, ""
+    if form == "png":
+        with path.open("rb") as file:
+            gamma, words = color_spaces.png_color(file.read(_PNG_START))
+    if not words and "ICCProfile" in attributes:
+        profile = np.asarray(attributes["ICCProfile"]).astype(np.uint8).tobytes()
+        words = color_spaces.icc_difference(profile, curves=whole)
+        title = str(attributes.get("ICCProfile:profile_description", ""))
+        words += f" ({title})" if words and title else ""
+    if words:
+        how = "sRGB" if whole else "linear Rec. 709"
+        warnings.warn(f"{name} has {words}, which is not converted: its values are taken as {how}", stacklevel=5)
+    return gamma

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Float64
 from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.files import images
+from jaxprt.scene import resampling
 from jaxprt.sphere import cubemap
 
 # Arrangement of the six faces in each layout: its height and width in faces; the row and column of each face (+x, -x,
@@ -27,9 +28,8 @@ _CUBES = {
     "horizontal-strip": ((1, 6), tuple((0, i) for i in range(6)), _PLAIN),
     "openexr-cube": ((6, 1), tuple((i, 0) for i in range(6)), _OPENEXR_STEP),
 }
-_AROUND = 4096  # smallest number of parts around the horizon
-_PARTS = 8  # A pixel is divided into at most this many parts per direction; larger pixels are subdivided first.
-_CHUNK = 2**20  # parts of pixels per step
+_AROUND = 4096  # smallest number of parts around the horizon into which a latlong picture is divided
+_CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
@@ -78,8 +78,12 @@ def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | 
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is damaged, not an image, of an unknown layout, or holds NaN or infinity.
+        TypeError: The size is not a whole number.
+        ValueError: The file is damaged, not an image, of an unknown layout, or holds NaN or infinity; or the size is
+            below 1.
+        MemoryError: The image or the cubemap does not fit into memory.
     """
+    _check_size((1, 1, 3), "latlong", size)  # before the file is read
     image, attributes = images.read_image(path)
     layout = layout or layout_of(image, attributes, str(path))
     return environment_from_image(image, size=size, layout=layout, name=str(path))
@@ -104,7 +108,10 @@ def environment_from_image(
         Light in three colors.
 
     Raises:
-        ValueError: The image has an unknown layout or number of channels, or holds NaN or infinity.
+        TypeError: The size is not a whole number.
+        ValueError: The image has an unknown layout or number of channels, or holds NaN or infinity; or the size is
+            below 1.
+        MemoryError: The cubemap does not fit into memory.
     """
     image = np.asarray(image)
     layout = layout or layout_of(image, {}, name)
@@ -138,17 +145,18 @@ def resample(
         Mean radiance of each texel.
 
     Raises:
-        ValueError: The layout is unknown or cannot have the image's shape.
+        TypeError: The size is not a whole number.
+        ValueError: The layout is unknown or cannot have the image's shape, or the size is below 1.
+        MemoryError: The cubemap does not fit into memory.
     """
     _check_layout(image, layout, "image")
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
+    _check_size(image.shape, layout, size)
     if layout in _CUBES:
         face = _cut_faces(image, layout)
-        return _resample_cube(face, _box_edge(face.shape[1], on_edge=layout == "openexr-cube"), size)
+        return resampling.from_cube(face, resampling.box_edge(face.shape[1], on_edge=layout == "openexr-cube"), size)
     on_edge = layout == "openexr-latlong"
-    latitude, longitude = (-_box_edge(count, on_edge=on_edge) for count in image.shape[:2])
-    return _resample_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size)
+    latitude, longitude = (-resampling.box_edge(count, on_edge=on_edge) for count in image.shape[:2])
+    return resampling.from_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size, around=_AROUND)
 
 
 @functools.partial(jit, static_argnames="samples")
@@ -255,34 +263,41 @@ def _check_layout(image: np.ndarray, layout: str, name: str) -> None:
             )
 
 
+def _check_size(shape: tuple[int, ...], layout: str, size: int) -> None:
+    """Refuses sizes that are not whole numbers, and cubemaps that do not fit into memory, before anything is made."""
+    if isinstance(size, bool) or not isinstance(size, int | np.integer):
+        raise TypeError(f"size must be a whole number, got {size!r}")
+    if size < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+    rows = _CUBES[layout][0][0] if layout in _CUBES else None
+    needed = resampling.bytes_needed(shape, int(size), faces_down=rows, around=_AROUND)
+    require.memory(f"a cubemap of 6 x {size} x {size} texels", needed, "choose a smaller size")
+
+
 def _clean(image: np.ndarray, name: str) -> np.ndarray:
-    """Three finite, non-negative channels."""
+    """Three finite, non-negative channels. Large images are not copied unless they have negative values."""
     channels = image.shape[-1]
     if channels > 4:
         raise ValueError(f"{name} must have 1 to 4 channels, got {channels}")
-    image = image[..., :3] if channels > 2 else np.repeat(image[..., :1], 3, axis=-1)
-    wrong = np.argwhere(~np.isfinite(image).all(axis=-1))
-    if len(wrong):
+    image = image[..., :3] if channels > 2 else image[..., :1]
+    step = max(1, _CHUNK // image.shape[1])
+    blocks = [image[first : first + step] for first in range(0, len(image), step)]
+    if not all(np.isfinite(block).all() for block in blocks):
+        wrong = np.argwhere(~np.isfinite(image).all(axis=-1))
         row, column = wrong[0]
         raise ValueError(
             f"{name} must hold finite radiance, got NaN or infinity in {len(wrong)} pixels, "
             f"the first at row {row}, column {column}"
         )
-    negative = (image < 0).any(axis=-1)
-    if negative.any():
+    negative = sum(int((block < 0).any(axis=-1).sum()) for block in blocks)
+    if negative:
         warnings.warn(
-            f"{name}: {negative.sum()} of {negative.size} pixels are negative, the lowest {image.min():.3g}; "
-            "they are set to 0",
+            f"{name}: {negative} of {image.shape[0] * image.shape[1]} pixels are negative, the lowest "
+            f"{image.min():.3g}; they are set to 0",
             stacklevel=4,
         )
-    return np.maximum(image, 0)
-
-
-def _box_edge(count: int, *, on_edge: bool) -> np.ndarray:
-    """Edges of the boxes around equidistant samples on [-1, 1]. With `on_edge` the outer samples are at the ends."""
-    if not on_edge or count == 1:
-        return np.linspace(-1, 1, count + 1)
-    return np.clip((2 * np.arange(count + 1) - 1) / (count - 1) - 1, -1, 1)
+        image = np.maximum(image, 0)
+    return np.broadcast_to(image, (*image.shape[:2], 3))
 
 
 def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
@@ -290,91 +305,3 @@ def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
     n = image.shape[0] // rows
     cut = [image[i * n : (i + 1) * n, j * n : (j + 1) * n] for i, j in corners]
     return np.stack([face[::down, ::right] for face, (down, right) in zip(cut, steps, strict=True)])
-
-
-def _resample_cube(face: np.ndarray, edge: np.ndarray, size: int) -> np.ndarray:
-    """Exact area means: pixels, texels and their overlaps are all rectangles on a face."""
-    texel_edge = np.linspace(-1, 1, size + 1)
-    cut = np.union1d(edge, texel_edge)
-    pixel = np.searchsorted(edge, (cut[1:] + cut[:-1]) / 2) - 1
-    start = np.searchsorted(cut, texel_edge[:-1])
-    weight = _solid_angle(cut)
-
-    def total(value):
-        return np.add.reduceat(np.add.reduceat(value, start, axis=0), start, axis=1)
-
-    area = total(weight)
-    result = np.empty((6, size, size, face.shape[-1]))
-    for f in range(6):
-        for c in range(face.shape[-1]):
-            result[f, :, :, c] = total(face[f, :, :, c][np.ix_(pixel, pixel)] * weight) / area
-    return result
-
-
-def _resample_latlong(image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
-    """Distributes small parts of the pixels to texels, given the edges of the pixels' rows and columns."""
-    # A texel is at least 2 / (3 size) wide, in the corners of a face. About eight parts should fall across it.
-    around = max(12 * size * 2 * np.pi, _AROUND)
-    parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
-    repeat = [-(-count // _PARTS) for count in parts]
-    image = image.repeat(repeat[0], axis=0).repeat(repeat[1], axis=1)
-    rows, columns = (-(-count // times) for count, times in zip(parts, repeat, strict=True))
-    latitude = _subdivide(_subdivide(latitude, repeat[0]), rows).reshape(-1)
-    longitude = _subdivide(_subdivide(longitude, repeat[1]), columns).reshape(-1)
-
-    # Axes: rows of pixels, rows of parts, columns of pixels, columns of parts. The samples of a pixel lie on a
-    # sheared lattice: on a regular one, all samples along a texel's edge would fall on the same side of it.
-    height, width = (
-        -np.diff(np.sin(latitude)).reshape(-1, rows, 1, 1),
-        -np.diff(longitude).reshape(-1, columns),
-    )
-    across, down = (np.arange(columns) + 0.5) / columns, (np.arange(rows)[:, None, None] + 0.5) / rows
-    latitude = latitude[:-1].reshape(-1, rows, 1, 1) + np.diff(latitude).reshape(-1, rows, 1, 1) * across
-    longitude = longitude[:-1].reshape(-1, columns) - width * down
-
-    flux, weight = np.zeros((image.shape[-1], 6 * size**2)), np.zeros(6 * size**2)
-    step = max(1, _CHUNK // (width.size * rows))
-    for first in range(0, image.shape[0], step):
-        row = slice(first, first + step)
-        index = _texel_index(latitude[row], longitude, size).ravel()
-        area = height[row] * width
-        weight += np.bincount(index, area.ravel(), minlength=weight.size)
-        for c, radiance in enumerate(np.moveaxis(image[row, None, :, None], -1, 0)):
-            flux[c] += np.bincount(index, (radiance * area).ravel(), minlength=weight.size)
-    mean = (flux / weight).reshape(-1, 6, size, size)
-
-    # Parts approximate the texels' areas. The resulting change of the integral, about 0.1 %, is spread over the sphere.
-    after = (mean * _solid_angle(np.linspace(-1, 1, size + 1))).sum((1, 2, 3))
-    before = flux.sum(axis=1)
-    scale = np.divide(before, after, out=np.ones_like(before), where=after != 0)
-    return np.moveaxis(mean * scale[:, None, None, None], 0, -1)
-
-
-def _solid_angle(edge: np.ndarray) -> np.ndarray:
-    """Solid angles of the rectangles of a grid on a face, given its lines, which are the same for rows and columns."""
-    corner = np.arctan2(edge[:, None] * edge, np.sqrt(1 + edge[:, None] ** 2 + edge**2))
-    return np.diff(np.diff(corner, axis=0), axis=1)
-
-
-def _subdivide(edge: np.ndarray, parts: int) -> np.ndarray:
-    """Divides every interval into equal parts."""
-    fraction = np.arange(parts) / parts
-    inner = edge[:-1, None] * (1 - fraction) + edge[1:, None] * fraction
-    return np.append(inner.ravel(), edge[-1])
-
-
-def _texel_index(latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
-    """Flat indices of the texels at given latitudes and longitudes, which are broadcast."""
-    # On the four side faces, each spans a quarter turn and the column depends only on the longitude.
-    turn = np.round(longitude / (np.pi / 2)).astype(int)
-    offset = longitude - turn * (np.pi / 2)
-    side = np.array([4, 0, 5, 1])[turn % 4]  # +z, +x, -z, -x
-    height = np.tan(latitude)
-    row = -height / np.cos(offset)
-    cap = np.abs(row) > 1
-    flat = 1 / height
-    column = np.where(cap, np.sin(longitude) * np.abs(flat), np.tan(offset))
-    row = np.where(cap, np.cos(longitude) * flat, row)
-    face = np.where(cap, np.where(height > 0, 2, 3), side)
-    i, j = (np.clip((size / 2 * (x + 1)).astype(int), 0, size - 1) for x in (row, column))
-    return (face * size + i) * size + j

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.files import outputs
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Mesh
 from jaxprt.view.stages import counterclockwise
@@ -62,7 +63,7 @@ def export_baked(
         raise ValueError(f"the light must be one environment, got a batch of {len(color)}")
     color = np.maximum(np.broadcast_to(color, (len(color), 3)), 0)
     exposure = max(float(color.max(initial=0)), 1e-30)
-    path.write_bytes(_file(scene, color / np.float32(exposure), np.asarray(eye, float).tolist(), exposure))
+    outputs.write(path, _file(scene, color / np.float32(exposure), np.asarray(eye, float).tolist(), exposure))
     return exposure
 
 

@@ -434,12 +434,20 @@ class Blur {
   }
 }
 
-// Radiance HDR: lines of RGBE, plain or by runs, from the top left.
+// Radiance HDR: lines of RGBE, plain or by runs of either kind, from the top left. Pixels divided by the exposures are radiance.
 function readHdr(data) {
   const text = new TextDecoder("latin1").decode(data.subarray(0, 4096)), size = /\n\s*\n?-Y (\d+) \+X (\d+)\n/.exec(text);
   if (!text.startsWith("#?") || !size || !text.includes("32-bit_rle_rgbe")) throw new Error("must be a Radiance HDR environment with its first line on top (EXR files need Python)");
   const height = Number(size[1]), width = Number(size[2]);
   if (width !== 2 * height) throw new Error(`must be twice as wide as high, got ${width} x ${height} pixels`);
+  const head = text.slice(0, size.index), factor = [1, 1, 1];
+  if (/^PRIMARIES=/m.test(head)) throw new Error("must have the primaries of Rec. 709 and not state others, which need Python");
+  for (const [, value] of head.matchAll(/^(?:EXPOSURE|COLORCORR)=(.*)$/gm)) {
+    const number = value.trim().split(/\s+/).map(Number);
+    for (let c = 0; c < 3; c++) factor[c] /= number[number.length > 1 ? c : 0];
+  }
+  if (!factor.every((value) => value > 0 && value < Infinity)) throw new Error("must have positive exposures, got others");
+  if (width * height > 2 ** 26) throw new Error(`must have at most ${2 ** 26} pixels, got ${width} x ${height}`);
   const pixel = new Float32Array(3 * width * height), line = new Uint8Array(4 * width);
   let place = size.index + size[0].length;
   for (let y = 0; y < height; y++) {
@@ -452,11 +460,16 @@ function readHdr(data) {
         place += run ? 1 : length;
       }
     } else {
-      if (place + 4 * width > data.length) throw new Error("must be a whole Radiance HDR file, got a part of one");
-      line.set(data.subarray(place, place + 4 * width));
-      place += 4 * width;
+      // 1, 1, 1, n repeats the pixel before n times; consecutive ones are the digits of n to the base 256.
+      for (let x = 0, unit = 1; x < width; place += 4) {
+        if (place + 4 > data.length) throw new Error("must be a whole Radiance HDR file, got a part of one");
+        const repeats = x > 0 && data[place] === 1 && data[place + 1] === 1 && data[place + 2] === 1, count = repeats ? unit * data[place + 3] : 1;
+        if (x + count > width) throw new Error("must be a whole Radiance HDR file, got a damaged one");
+        unit = repeats ? 256 * unit : 1;
+        for (const end = x + count; x < end; x++) line.set(repeats ? line.subarray(4 * x - 4, 4 * x) : data.subarray(place, place + 4), 4 * x);
+      }
     }
-    for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) pixel[3 * (y * width + x) + c] = line[4 * x + 3] ? line[4 * x + c] * 2 ** (line[4 * x + 3] - 136) : 0;
+    for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) pixel[3 * (y * width + x) + c] = line[4 * x + 3] ? factor[c] * line[4 * x + c] * 2 ** (line[4 * x + 3] - 136) : 0;
   }
   return { pixel, width, height };
 }

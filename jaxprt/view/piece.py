@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxprt import require
+from jaxprt.files import outputs
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
@@ -117,7 +118,7 @@ def export(
         page = _page(session, reduced, lights, kept, error=error, title=path.stem)
         least = len(page)
         if least <= most:
-            path.write_bytes(page)
+            outputs.write(path, page)
             return Piece(path, least, size.edge, texels, size.degree, error)
     raise ValueError(
         f"most must be at least about {least} bytes, the size of the page with the coarsest visibility, got {most}"

@@ -216,7 +216,7 @@ class Session:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(buffers[0])
             light = load_environment(path, size=self.stages.size)
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, MemoryError) as error:
             raise ValueError(str(error).replace(path, file.name)) from None
         finally:
             os.unlink(path)

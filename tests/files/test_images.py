@@ -1,22 +1,18 @@
+import os
 import pathlib
+import struct
+import zlib
 
-import jax.numpy as jnp
 import numpy as np
-import OpenEXR
 import OpenImageIO
 import pytest
 
-from jaxprt.files import decode_image, read_image, write_exr, write_png
+from jaxprt import require
+from jaxprt.files import decode_image, exr, pixels, read_image, write_exr, write_png
 
 
 def random_image(*shape, seed=0):
     return np.random.default_rng(seed).random(shape).astype(np.float32)
-
-
-def write_exr_channels(path, channels, **header):
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
-    with OpenEXR.File(header, dict(channels)) as file:  # It changes the dictionary.
-        file.write(str(path))
 
 
 def write_oiio(path, image, form):
@@ -37,44 +33,6 @@ def test_exr_returns_what_was_written_bit_by_bit(tmp_path, channels):
     assert "envmap" not in attributes
 
 
-def test_exr_of_arrays_that_are_not_contiguous_or_not_numpy_is_written_rightly(tmp_path):
-    image = random_image(6, 8, 3)
-    for i, view in enumerate((image.transpose(1, 0, 2), image[::-1, ::2], image[..., ::-1], jnp.asarray(image))):
-        write_exr(tmp_path / f"{i}.exr", view)
-        np.testing.assert_array_equal(read_image(tmp_path / f"{i}.exr")[0], view)
-
-
-def test_exr_channels_are_found_in_any_order_and_type(tmp_path):
-    red, green, blue = (np.ascontiguousarray(random_image(4, 4, 3)[..., i]) for i in range(3))
-    half = {"R": red.astype(np.float16), "G": green.astype(np.float16), "B": blue.astype(np.float16)}
-    write_exr_channels(tmp_path / "half.exr", half)
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "half.exr")[0], np.stack(list(half.values()), -1).astype(np.float32)
-    )
-    write_exr_channels(tmp_path / "mixed.exr", {"Z": red, "B": blue, "A": half["R"], "G": green, "R": red})
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "mixed.exr")[0], np.stack([red, green, blue, half["R"].astype(np.float32)], -1)
-    )
-
-
-def test_cropped_exr_is_placed_in_its_display_window(tmp_path):
-    image = random_image(4, 5, 1)
-    windows = {
-        "dataWindow": (np.array([3, -1], np.int32), np.array([7, 2], np.int32)),
-        "displayWindow": (np.array([1, 0], np.int32), np.array([6, 4], np.int32)),
-    }
-    write_exr_channels(tmp_path / "crop.exr", {"Y": np.ascontiguousarray(image[..., 0])}, **windows)
-    expected = np.zeros((5, 6, 1), np.float32)
-    expected[0:3, 2:6] = image[1:4, 0:4]
-    np.testing.assert_array_equal(read_image(tmp_path / "crop.exr")[0], expected)
-
-
-def test_mip_mapped_tiles_are_read_at_the_finest_level(data):
-    image, attributes = read_image(data / "env" / "KernerEnvCube.exr")
-    assert image.shape == (1536, 256, 4)
-    assert attributes["envmap"] == "cube"
-
-
 @pytest.mark.parametrize("name", ["image.png", "image.tif", "image.bmp"])
 def test_whole_numbers_are_decoded_from_srgb(tmp_path, name):
     linear = random_image(9, 6, 3)
@@ -90,13 +48,6 @@ def test_floats_are_taken_as_they_are(tmp_path, name, relative):
     read = read_image(tmp_path / name)[0]
     assert np.abs(read - image).max() <= relative * image.max()
     assert read[0].mean() == pytest.approx(image[0].mean(), rel=0.01)
-
-
-def test_png_holds_the_display_values_clamped_and_rounded(tmp_path):
-    image = np.linspace(-0.5, 1.5, 60, dtype=np.float32).reshape(4, 5, 3)
-    write_png(tmp_path / "image.png", image)
-    expected = np.round(np.clip(image, 0, 1) * 255)
-    np.testing.assert_allclose(encode_srgb(read_image(tmp_path / "image.png")[0]) * 255, expected, atol=1e-3)
 
 
 def test_alpha_neither_changes_the_colors_nor_is_decoded(tmp_path):
@@ -158,7 +109,7 @@ def test_headers_that_ask_for_something_else_are_refused(tmp_path):
     whole = (tmp_path / "image.hdr").read_bytes()
     path = tmp_path / "changed.hdr"
     for old, new, message in (
-        (b"-Y 8 +X 16", b"+Y 8 +X 16", "orientation"),
+        (b"-Y 8 +X 16", b"-Y 8 +Y 16", "resolution"),
         (b"rle_rgbe", b"rle_xyze", "XYZ"),
         (b"-Y 8 +X 16", b"-Y 60000 +X 60000", "must"),
     ):
@@ -166,30 +117,6 @@ def test_headers_that_ask_for_something_else_are_refused(tmp_path):
         path.write_bytes(whole.replace(old, new))
         with pytest.raises(ValueError, match=message):
             read_image(path)
-
-
-def test_exr_without_color_channels_is_refused_and_its_channels_named(tmp_path):
-    plane = np.ascontiguousarray(random_image(4, 4, 1)[..., 0])
-    write_exr_channels(tmp_path / "depth.exr", {"Z": plane, "left.R": plane})
-    with pytest.raises(ValueError, match=r"depth\.exr must have channels R, G, B or Y .* got .*left\.R"):
-        read_image(tmp_path / "depth.exr")
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_unwritable_images_are_refused(tmp_path):
-    for write in (write_exr, write_png):
-        with pytest.raises(ValueError, match=r"image must be of floating point, with 1 for white .*, got uint8"):
-            write(tmp_path / "image", np.full((4, 4, 3), 255, np.uint8))
-        with pytest.raises(ValueError, match=r"\(4, 4, 2\)"):
-            write(tmp_path / "image", random_image(4, 4, 2))
-        with pytest.raises(ValueError, match=r"\(0, 4, 3\)"):
-            write(tmp_path / "image", random_image(0, 4, 3))
-        with pytest.raises(FileNotFoundError, match="no folder"):
-            write(tmp_path / "missing" / "image", random_image(4, 4, 3))
-    image = random_image(4, 4, 3)
-    image[1, 2, 0] = np.nan
-    with pytest.raises(ValueError, match=r"1 such pixels, first at \(1, 2\)"):
-        write_png(tmp_path / "image.png", image)
 
 
 def test_a_path_may_be_relative(tmp_path, monkeypatch):
@@ -210,3 +137,119 @@ def test_images_in_memory_are_decoded_as_files_are_or_left_as_they_are_stored(tm
     for damaged in (b"", b"no picture", content[:30]):
         with pytest.raises(ValueError, match=r"image 3 of a\.glb must be an (undamaged|EXR)"):
             decode_image(damaged, name="image 3 of a.glb")
+
+
+def tagged(content, orientation, form):
+    """A picture with an Exif orientation, or with the same tag of TIFF."""
+    exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+    if form == "png":
+        return content[:33] + png_chunk(b"eXIf", exif) + content[33:]
+    block = b"Exif\0\0" + exif
+    return content[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + content[2:]
+
+
+def png_chunk(name, data):
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+# Where the corners of the stored picture a b / c d are to be shown, from the table of Exif 2.32, section 4.6.4.
+SHOWN = {1: "ab cd", 2: "ba dc", 3: "dc ba", 4: "cd ab", 5: "ac bd", 6: "ca db", 7: "db ca", 8: "bd ac"}
+
+
+@pytest.mark.parametrize("form", ["jpeg", "png", "tiff"])
+def test_pictures_are_turned_as_their_orientation_demands(tmp_path, form):
+    level = {"a": 0.1, "b": 0.35, "c": 0.65, "d": 0.9}
+    path = tmp_path / f"image.{form}"
+    for orientation, words in SHOWN.items():
+        stored = np.array([[level["a"], level["b"]], [level["c"], level["d"]]])
+        # 16 rows and 32 columns: each corner fills blocks of JPEG.
+        stored = np.repeat((255 * stored.repeat(8, 0).repeat(16, 1)).round().astype(np.uint8)[..., None], 3, 2)
+        buffer = OpenImageIO.ImageBuf(np.ascontiguousarray(stored))
+        if form == "tiff":
+            buffer.specmod().attribute("Orientation", orientation)
+        assert buffer.write(str(path), form)
+        if form != "tiff":
+            path.write_bytes(tagged(path.read_bytes(), orientation, form))
+        read = decode_image(path.read_bytes(), name="image", decoded=False)
+        assert read.shape == ((16, 32, 3) if orientation < 5 else (32, 16, 3))
+        np.testing.assert_array_equal(encode_srgb(read_image(path)[0]).round(3), read.round(3))
+        corner = [read[i, j, 0] for i in (0, -1) for j in (0, -1)]
+        np.testing.assert_allclose(corner, [level[x] for x in words.replace(" ", "")], atol=0.01)
+
+
+def test_orientations_that_do_not_exist_are_ignored(tmp_path):
+    path = tmp_path / "image.png"
+    write_png(path, random_image(4, 6, 3))
+    upright = read_image(path)[0]
+    path.write_bytes(tagged(path.read_bytes(), 9, "png"))
+    np.testing.assert_array_equal(read_image(path)[0], upright)
+
+
+def huge_png(width, height):
+    """A black picture, compressed to a thousandth. The sum at its end is wrong, but nothing reads so far."""
+    packer = zlib.compressobj()
+    lines = bytes((3 * width + 1) * 100)
+    first, again = (packer.compress(lines) + packer.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    data = first + again * (height // 100 - 1) + packer.flush()
+    return b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", data) + png_chunk(b"IEND", b"")
+
+
+def test_pictures_of_too_many_pixels_are_refused_by_their_header(tmp_path):
+    path = tmp_path / "huge.png"
+    path.write_bytes(huge_png(30_000, 15_000))
+    message = r"must have 1 to 268435456 pixels, got 30000 x 15000 \(width x height\): reduce its size"
+    with pytest.raises(ValueError, match=rf"huge\.png {message}"):
+        read_image(path)
+    with pytest.raises(ValueError, match=rf"image 2 of a\.glb {message}"):
+        decode_image(path.read_bytes(), name="image 2 of a.glb")
+
+
+@pytest.mark.parametrize("form", ["png", "tif", "jpg", "bmp", "hdr", "pfm", "exr"])
+def test_pictures_that_do_not_fit_into_memory_are_refused_before_they_are_read(tmp_path, monkeypatch, form):
+    path = tmp_path / f"image.{form}"
+    assert OpenImageIO.ImageBuf(random_image(300, 400, 3)).write(str(path))
+    shape = read_image(path)[0].shape
+    # The pixels, 1.44 MB, and half as much for what is needed besides.
+    monkeypatch.setattr(require, "available_memory", lambda: 10_000_000)
+    message = r"400 x 300 pixels \(width x height\) of 3 channels take 0\.0 GB, and 0\.0 GB are free; free some memory"
+    with pytest.raises(MemoryError, match=message):
+        read_image(path)
+    monkeypatch.setattr(require, "available_memory", lambda: 100_000_000)
+    assert read_image(path)[0].shape == shape == (300, 400, 3)
+
+
+@pytest.mark.parametrize("form", ["png", "tif", "jpg", "bmp", "hdr", "pfm", "exr"])
+def test_reading_in_blocks_of_rows_gives_what_reading_at_once_gives(tmp_path, monkeypatch, form):
+    path = tmp_path / f"image.{form}"
+    assert OpenImageIO.ImageBuf(random_image(50, 31, 3)).write(str(path))
+    whole = read_image(path)[0]
+    for values in (1, 31 * 3 * 7):
+        monkeypatch.setattr(pixels, "_VALUES", values)
+        monkeypatch.setattr(exr, "_LINES", 16)
+        np.testing.assert_array_equal(read_image(path)[0], whole)
+
+
+def test_ctrl_c_interrupts_reading_between_blocks(tmp_path, monkeypatch):
+    path = tmp_path / "image.png"
+    write_png(path, random_image(50, 31, 3))
+    rows = []
+
+    def interrupted(reader, block, **options):
+        rows.append(block)
+        if len(rows) == 3:
+            raise KeyboardInterrupt
+        return np.zeros((len(block), 31, 3), np.float32)
+
+    monkeypatch.setattr(pixels, "_VALUES", 31 * 3 * 7)
+    monkeypatch.setattr(pixels, "read_block", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        read_image(path)
+    assert rows == [range(0, 7), range(7, 14), range(14, 21)]
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    for path in (tmp_path / "pipe.png", pathlib.Path("/dev/zero")):
+        with pytest.raises(ValueError, match=f"{path.name} must be an image file, got a special file"):
+            read_image(path)

@@ -1,4 +1,5 @@
 import re
+import tracemalloc
 import warnings
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from jaxprt import require
 from jaxprt.files import write_exr, write_png
 from jaxprt.scene import environment
 from jaxprt.scene.environment import Environment
@@ -296,8 +298,86 @@ def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible
         environment.environment_from_image(np.ones((0, 0, 3), np.float32), layout="latlong")
     with pytest.raises(ValueError, match="size must be at least 1, got 0"):
         environment.environment_from_image(np.ones((2, 4, 3), np.float32), size=0)
+    with pytest.raises(ValueError, match="size must be at least 1, got -3"):
+        environment.load_environment(tmp_path / "photo.png", size=-3)
     with pytest.raises(FileNotFoundError, match="missing"):
         environment.load_environment(tmp_path / "missing.exr")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("size", [True, False, 2.5, 64.0, "64", None, np.float32(3), [4], np.array([4])])
+def test_sizes_that_are_no_whole_numbers_are_refused(tmp_path, size):
+    image = np.ones((2, 4, 3), np.float32)
+    write_exr(tmp_path / "sky.exr", image)
+    for make, light in (
+        (environment.load_environment, tmp_path / "sky.exr"),
+        (environment.environment_from_image, image),
+        (environment.resample, image),
+    ):
+        with pytest.raises(TypeError, match=r"size must be a whole number, got"):
+            make(light, size=size)
+
+
+@pytest.mark.usefixtures("few_parts", "unchecked")
+def test_sizes_may_be_numpys_whole_numbers():
+    light = environment.environment_from_image(np.ones((2, 4, 3), np.float32), size=np.int64(4))
+    assert light.radiance.shape == (6, 4, 4, 3)
+
+
+@pytest.mark.parametrize("size", [100_000, 2**40])
+def test_cubemaps_that_do_not_fit_into_memory_are_refused_before_anything_is_made(tmp_path, size):
+    image = np.ones((2, 4, 3), np.float32)
+    write_exr(tmp_path / "sky.exr", image)
+    message = rf"a cubemap of 6 x {size} x {size} texels take \d+\.\d GB, and .* are free; choose a smaller size"
+    with pytest.raises(MemoryError, match=message):
+        environment.load_environment(tmp_path / "sky.exr", size=size)
+    for layout, shape in (("latlong", (2, 4, 3)), ("openexr-latlong", (3, 5, 3)), ("vertical-cross", (4, 3, 3))):
+        with pytest.raises(MemoryError, match=message):
+            environment.environment_from_image(np.ones(shape, np.float32), layout=layout, size=size)
+        with pytest.raises(MemoryError, match=message):
+            environment.resample(np.ones(shape, np.float32), layout=layout, size=size)
+
+
+@pytest.mark.usefixtures("few_parts")
+@pytest.mark.parametrize(("layout", "shape"), [("latlong", (300, 600)), ("vertical-strip", (1800, 300))])
+def test_resampling_takes_no_more_memory_than_is_asked_for(monkeypatch, layout, shape):
+    """NumPy reports its arrays to tracemalloc."""
+    asked = []
+    monkeypatch.setattr(require, "memory", lambda what, needed, *_, **__: asked.append(needed))
+    image = np.random.default_rng(0).random((*shape, 3)).astype(np.float32)
+    tracemalloc.start()
+    try:
+        environment.resample(image, layout=layout, size=64)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 0.1 * asked[0] < peak < asked[0]
+
+
+@pytest.mark.usefixtures("few_parts")
+def test_light_from_files_is_radiance_in_rec709_whatever_the_file_states(tmp_path):
+    """White of 1/4 at an exposure of 1/2 is radiance of 1/2; red of ACES is more than red."""
+    pixel = bytes([64, 64, 64, 129, 1, 1, 1, 127])
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nEXPOSURE=0.5\nCOLORCORR=1 .5 1\n\n-Y 64 +X 128\n"
+    (tmp_path / "sky.hdr").write_bytes(head + 64 * pixel)
+    light = environment.load_environment(tmp_path / "sky.hdr", size=2)
+    np.testing.assert_allclose(light.radiance, np.broadcast_to([0.5, 1.0, 0.5], (6, 2, 2, 3)), rtol=1e-6)
+
+    chromaticities = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": chromaticities}
+    part = OpenEXR.Part(
+        dict(header),
+        {name: np.full((4, 8), value, np.float32) for name, value in zip("RGB", (1.0, 0.5, 0.5), strict=True)},
+        "beauty",
+    )
+    depth = OpenEXR.Part(dict(header), {"Y": np.full((4, 8), 9.0, np.float32)}, "depth")
+    with OpenEXR.File([depth, part]) as file:
+        file.write(str(tmp_path / "aces.exr"))
+    light = environment.load_environment(tmp_path / "aces.exr", size=2)
+    # ACES2065-1 to linear sRGB, from the OpenColorIO configuration of ACES.
+    expected = [2.52168619 - 0.5 * (1.13413099 + 0.38755520), -0.27647991 + 0.5 * (1.37271909 - 0.09623917)]
+    expected.append(-0.01537807 + 0.5 * (1.16835340 - 0.15297534))
+    np.testing.assert_allclose(light.radiance, np.broadcast_to(expected, (6, 2, 2, 3)), rtol=1e-4)
 
 
 def test_rotating_by_the_identity_changes_nothing():

@@ -173,14 +173,17 @@ def test_page_asks_for_nothing(made):
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", made.path.read_text())
 
 
-def radiance_hdr(rng, *, by_runs):
-    """A picture of blocks, 128 x 64, in one of the two forms of lines."""
+def radiance_hdr(rng, *, coding):
+    """A picture of blocks, 128 x 64, in one of the three codings of lines, at exposure 1/2, and with less green."""
     mantissa = rng.integers(40, 256, (16, 32, 3))
     pixel = np.concatenate([mantissa, np.full((16, 32, 1), 129)], -1).repeat(4, 0).repeat(4, 1).astype(np.uint8)
-    data = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 64 +X 128\n"
+    data = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nEXPOSURE= 0.25\nCOLORCORR=1 2 1\n\n-Y 64 +X 128\n"
     for line in pixel:
-        if not by_runs:
+        if coding == "flat":
             data += line.tobytes()
+            continue
+        if coding == "old runs":
+            data += b"".join(value.tobytes() + bytes([1, 1, 1, 3]) for value in line[::4])
             continue
         data += bytes([2, 2, 0, 128])
         for channel in line.T:  # half in runs of four, half as they are
@@ -188,10 +191,10 @@ def radiance_hdr(rng, *, by_runs):
     return data
 
 
-@pytest.mark.parametrize("by_runs", [False, True])
-def test_dropped_hdr_lights_the_page_as_it_lights_python(by_runs, page, systems, look, tmp_path):
+@pytest.mark.parametrize("coding", ["flat", "old runs", "runs"])
+def test_dropped_hdr_lights_the_page_as_it_lights_python(coding, page, systems, look, tmp_path):
     path = tmp_path / "soft.hdr"
-    path.write_bytes(radiance_hdr(np.random.default_rng(1), by_runs=by_runs))
+    path.write_bytes(radiance_hdr(np.random.default_rng(1), coding=coding))
     content, _ = page.ask({"kind": "drop", "name": path.name, "file": list(path.read_bytes())})
     assert content["lights"][-1] == "soft"
     found = page.color(look | {"light": content["light"]})

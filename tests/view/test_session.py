@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import files, image
+from jaxprt import files, image, require
 from jaxprt.relit import canvas, pictures
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
@@ -239,6 +239,16 @@ def test_files_that_are_no_environment_are_refused_by_name(session, look, name, 
     reply = session.answer({"kind": "drop", "name": name}, [data])
     assert reply.content["kind"] == "error"
     assert words in reply.content["message"]
+    assert session.answer(look).content["kind"] == "color"
+
+
+def test_environments_that_are_too_large_are_refused_by_name(session, look, tmp_path, monkeypatch):
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
+    reply = session.answer({"kind": "drop", "name": "a.hdr"}, [header + b"-Y 15000 +X 30000\n" + bytes(100)])
+    assert reply.content["message"].startswith("a.hdr must have 1 to 268435456 pixels, got 30000 x 15000")
+    monkeypatch.setattr(require, "available_memory", lambda: 10**9)
+    reply = session.answer({"kind": "drop", "name": "b.hdr"}, [header + b"-Y 8000 +X 16000\n" + bytes(100)])
+    assert reply.content["message"].startswith("b.hdr: 16000 x 8000 pixels (width x height) of 3 channels take 1.6 GB")
     assert session.answer(look).content["kind"] == "color"
 
 

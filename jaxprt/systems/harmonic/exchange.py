@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxprt import require
+from jaxprt.files import outputs
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics
 from jaxprt.sphere.conventions import Convention
@@ -78,14 +79,16 @@ def export_transfer(
     position = position @ convention.turn.T.astype(position.dtype)
     name = json.dumps(dataclasses.asdict(convention))
     if kind == ".npy":
-        np.save(path, value)
+        with outputs.beside(path) as new, new.open("wb") as file:  # NumPy would add a suffix to some names.
+            np.save(file, value)
     elif kind == ".npz":
         arrays: dict[str, Any] = {"coefficient": value, "position": position, "face": np.asarray(mesh.face)}
         arrays["what"] = "matrices" if matrix else "vectors of corners" if corners else "vectors"
         arrays["convention"] = name
         if isinstance(transport, TransferMatrix):
             arrays["frame"] = np.asarray(transport.frame) @ convention.turn.T.astype(np.float32)
-        np.savez(path, **arrays)
+        with outputs.beside(path) as new, new.open("wb") as file:
+            np.savez(file, **arrays)
     else:
         _write_ply(path, position, np.asarray(mesh.face), value, name)
 
@@ -223,7 +226,7 @@ def _write_ply(path, position: np.ndarray, face: np.ndarray, value: np.ndarray, 
     corner["count"], corner["vertex"] = 3, face
     rows = np.empty(count, [("position", "<f8" if number == "double" else "<f4", 3), ("value", "<f4", terms * colors)])
     rows["position"], rows["value"] = position, value.reshape(count, -1)
-    pathlib.Path(path).write_bytes("\n".join(head).encode() + rows.tobytes() + corner.tobytes())
+    outputs.write(path, "\n".join(head).encode() + rows.tobytes() + corner.tobytes())
 
 
 def _read_ply(path) -> dict[str, np.ndarray]:

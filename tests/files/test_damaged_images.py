@@ -1,0 +1,146 @@
+"""Damaged image files end in a picture or a clear error, within a memory limit, and without a hang."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import OpenEXR
+import OpenImageIO
+import PIL.Image
+import PIL.ImageCms
+import pytest
+
+MUTATIONS = 200
+HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nPRIMARIES=.64 .33 .29 .6 .15 .06 .333 .333\n\n-Y 12 +X 24\n"
+PIXEL, SKY = bytes([128, 64, 32, 129]), bytes([16, 32, 128, 131])
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
+
+# The memory is limited to a gigabyte above what the imports take; no picture in these files needs a hundredth of it.
+READ = """
+import collections, json, pathlib, resource, sys, time, warnings
+import jax
+import numpy as np
+from jaxprt.files import decode_image, read_image
+
+jax.devices()
+used = 4096 * int(open("/proc/self/statm").read().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (used + 10**9, resource.RLIM_INFINITY))
+warnings.simplefilter("ignore")
+
+
+def mutated(content, random):
+    data, kind = bytearray(content), random.integers(5)
+    head = min(len(data), int(random.choice([64, 400, len(data)])))  # Headers matter most.
+    place = int(random.integers(head))
+    if kind == 0:
+        for _ in range(random.integers(1, 6)):
+            data[random.integers(head)] = random.integers(256)
+    elif kind == 1:
+        del data[random.integers(len(data)) :]
+    elif kind == 2:
+        number = random.choice([0, 1, -1, 2**31 - 1, -(2**31)]).astype("<i4").tobytes()
+        data[place : place + 4] = number[:: random.choice([-1, 1])]
+    elif kind == 3:
+        del data[place : place + int(random.integers(1, 50))]
+    else:
+        data[place:place] = random.bytes(int(random.integers(1, 40)))
+    return bytes(data)
+
+
+results = {}
+for path in map(pathlib.Path, sys.argv[2:]):
+    counts, wrong = collections.Counter(), []
+    content = path.read_bytes()
+    read_image(path)
+    for seed in range(int(sys.argv[1])):
+        data = mutated(content, np.random.default_rng(seed))
+        path.write_bytes(data)
+        start = time.monotonic()
+        try:
+            if seed % 2:
+                decode_image(data, name=path.name)
+            else:
+                read_image(path)
+            counts["picture"] += 1
+        except (ValueError, MemoryError) as error:
+            counts[type(error).__name__] += 1
+            if path.name not in str(error) or type(error) not in (ValueError, MemoryError):
+                wrong.append([seed, repr(error)])
+        except Exception as error:
+            wrong.append([seed, repr(error)])
+        if time.monotonic() - start > 10:
+            wrong.append([seed, "a hang"])
+    results[path.name] = [counts, wrong]
+print(json.dumps(results))
+"""
+
+
+def write_exr(path, *parts):
+    made = [OpenEXR.Part({"type": OpenEXR.scanlineimage, **header}, channels, name) for name, header, channels in parts]
+    with OpenEXR.File(made) as file:
+        file.write(str(path))
+
+
+def write_tiles(path, image):
+    spec = OpenImageIO.ImageSpec(image.shape[1], image.shape[0], image.shape[2], "half")
+    spec.tile_width, spec.tile_height = 8, 8
+    output = OpenImageIO.ImageOutput.create("exr")
+    assert output is not None
+    assert output.open(str(path), spec)
+    assert output.write_image(image)
+    assert output.close()
+
+
+def write_sample(path):
+    """A small valid file. Its name says the kind."""
+    image = np.random.default_rng(0).random((12, 24, 3)).astype(np.float32)
+    kind = path.stem
+    planes = {name: np.ascontiguousarray(image[..., i]) for i, name in enumerate("RGB")}
+    if kind in ("zip", "piz", "dwaa", "b44", "pxr24", "rle"):
+        compression = getattr(OpenEXR, f"{kind.upper()}_COMPRESSION")
+        write_exr(path, ("image", {"compression": compression, "chromaticities": AP0}, planes))
+    elif kind == "parts":
+        depth = {"Z": planes["R"].copy()}
+        compression = {"compression": OpenEXR.ZIP_COMPRESSION}
+        write_exr(path, ("depth", dict(compression), depth), ("image", dict(compression), planes))
+    elif kind == "tiles":
+        write_tiles(path, image)
+    elif kind == "flat":
+        path.write_bytes(HEAD + PIXEL * 288)
+    elif kind == "old_runs":
+        path.write_bytes(HEAD + 12 * (PIXEL + bytes([1, 1, 1, 10]) + SKY + bytes([1, 1, 1, 12])))
+    elif kind == "turned":
+        picture = PIL.Image.fromarray((255 * image).astype(np.uint8))
+        exif = picture.getexif()
+        exif[0x112] = 6
+        picture.save(path, exif=exif, progressive=True)
+    elif kind == "profile":
+        profile = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("sRGB")).tobytes()
+        PIL.Image.fromarray((255 * image).astype(np.uint8)).save(path, icc_profile=profile)
+    else:
+        assert OpenImageIO.ImageBuf(image).write(str(path), "float" if kind == "float" else "uint8")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["image.png", "profile.png", "image.jpg", "turned.jpg", "image.bmp", "image.tif", "float.tif", "float.pfm"],
+        ["float.hdr", "flat.hdr", "old_runs.hdr"],
+        ["zip.exr", "piz.exr", "dwaa.exr", "b44.exr", "pxr24.exr", "rle.exr", "parts.exr", "tiles.exr"],
+    ],
+    ids=["others", "radiance", "exr"],
+)
+def test_mutated_files_are_read_or_refused(tmp_path, names):
+    for name in names:
+        write_sample(tmp_path / name)
+    run = [sys.executable, "-c", READ, str(MUTATIONS), *(str(tmp_path / name) for name in names)]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, (done.returncode, done.stderr[-2000:])
+    results = json.loads(done.stdout)
+    assert list(results) == names
+    assert not {name: wrong for name, (_, wrong) in results.items() if wrong}
+    for name, (counts, _) in results.items():
+        assert sum(counts.values()) == MUTATIONS
+        assert counts["ValueError"] > 0, name
+        assert counts["picture"] > 0, name
