@@ -54,11 +54,12 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
 
     Positions are read in double precision. If the mesh is far from zero, they become relative to `Mesh.origin` before
     they are rounded to float32. Vertices and faces keep the order of the file, and no vertices are merged. Polygons are
-    divided into fans of triangles. An OBJ vertex is split where its corners differ in normal or texture coordinates.
-    All meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept.
-    Texture coordinates are 0 where only some geometries of the file have them or they are not finite. All faces of an
-    OBJ material or group must have them; if they refer to texture coordinates that do not exist, the material is loaded
-    without them, with a warning.
+    divided into triangles of the same orientation: convex ones into fans, concave ones by ear clipping. A vertex is
+    split where its corners differ in what the file states for corners or faces: normals or texture coordinates. All
+    meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept. Texture
+    coordinates are 0 where only some faces of the file have them or they are not finite. OBJ faces that refer to
+    texture coordinates or normals that do not exist are loaded without them, with a warning. Triangle strips of PLY
+    files become triangles.
 
     Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
     weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
@@ -70,8 +71,9 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
             materials.
 
     Returns:
-        The mesh. The regions of an OBJ file are numbered by first appearance. Those of a glTF file are in the order of
-        its materials, with parts without material last, or with `groups` in the order of its nodes.
+        The mesh. The regions of an OBJ file are numbered by first appearance, and so are those of a PLY file, which are
+        its images. Those of a glTF file are in the order of its materials, with parts without material last, or with
+        `groups` in the order of its nodes.
 
     Raises:
         FileNotFoundError: The file does not exist.

@@ -309,7 +309,7 @@ def test_text_that_ends_within_its_last_face_is_refused_and_more_than_is_counted
     for name, text in texts.items():
         assert load_mesh(write(tmp_path, name, text)).face.shape == (3, 3)
         assert load_mesh(write(tmp_path, name, text.replace("\n", "\r\n") + "\n1 2\n")).face.shape == (3, 3)
-        with pytest.raises(ValueError, match="its last row must have 5 numbers, but has 4"):
+        with pytest.raises(ValueError, match="row 2 of the face rows must have 5 numbers, but has 4"):
             load_mesh(write(tmp_path, name, text.removesuffix(" 3\n")))
 
 

@@ -32,6 +32,20 @@ class Geometry(NamedTuple):
     region: np.ndarray | None = None
 
 
+class MeshContent(NamedTuple):
+    """What a mesh file holds.
+
+    Attributes:
+        geometry: The geometry. Colors are NaN where vertices have none.
+        images: Name of the image file of each region's base color; None where there is none.
+        ignored: What the file holds and cannot be read, for a warning.
+    """
+
+    geometry: Geometry
+    images: list[str | None]
+    ignored: set[str]
+
+
 # Defaults for attributes that only some geometries have: shape per vertex, and value.
 _MISSING = {
     "normal": ((3,), np.nan),
@@ -64,6 +78,31 @@ def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
         tangent=None if geometry.tangent is None else geometry.tangent @ linear.T,
         handedness=handedness,
     )
+
+
+def split_corners(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices for corners that differ in one of several columns, in ascending order of the columns.
+
+    Args:
+        columns: Numbers without NaN, one for each corner [c].
+
+    Returns:
+        Index of a corner of each vertex [v], and the vertex of each corner [c].
+    """
+    key = np.zeros(len(columns[0]), np.int64)
+    for column in columns:
+        value, number = np.unique(column, return_inverse=True)
+        _, key = np.unique(key * len(value) + number.reshape(-1), return_inverse=True)
+        key = key.reshape(-1)
+    _, first = np.unique(key, return_index=True)
+    return first, key
+
+
+def first_appearance(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different labels in the order of their first appearance, and for each row its index in them."""
+    value, first, number = np.unique(label, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return value[order], np.argsort(order)[number.reshape(-1)]
 
 
 def joined(geometries: Sequence[Geometry]) -> Geometry:

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt.files import images
-from jaxprt.scene.formats.mesh_file import statement
+from jaxprt.scene.formats import obj, text
+from jaxprt.scene.formats.obj import statement
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
@@ -32,43 +33,32 @@ _BLENDER = re.compile(
 )  # first line of OBJ files by Blender; the v is from its older exporter
 
 
-def matte() -> TexturedMaterial:
-    """The default material of faces without material: a matte gray."""
-    return TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0)
-
-
-def of_regions(path: pathlib.Path) -> tuple[list[str], list[TexturedMaterial]]:
+def of_regions(path: pathlib.Path, plain: TexturedMaterial) -> tuple[list[str], list[TexturedMaterial]]:
     """Names and materials of the regions of an OBJ file, in the order of their first faces.
 
     A single warning names everything that is missing (MTL files, materials, images) or not supported. Missing materials
-    are replaced by a matte gray.
+    are replaced by `plain`.
 
     Args:
         path: The OBJ file.
+        plain: Material of faces without one.
     """
-    order: dict[str | None, None] = {}
-    name, files, found = None, [], {}
+    source = obj.content(path)
+    order, files = obj.used_materials(source)
+    found: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
-    lines = path.read_bytes().decode(errors="replace").splitlines()
-    for line in lines:
-        key, _, rest = statement(line).replace("\t", " ").partition(" ")
-        if key == "usemtl":
-            name = rest.strip()
-        elif key == "mtllib":
-            files.append(rest.strip())
-        elif key == "f":
-            order[name] = None
+    first = text.name(source.partition(b"\n")[0])
     for file in files:
         for each in [file] if (path.parent / file).is_file() else file.split():
             if (path.parent / each).is_file():
-                material, more = read(path.parent / each, blender=_exponent(lines[0]))
+                material, more = read(path.parent / each, blender=_exponent(first))
                 found, ignored = material | found, ignored | more
             else:
                 ignored.add(f"mtllib ({path.parent / each}, which does not exist)")
     ignored |= {f"usemtl {each} (no such material)" for each in order if each is not None and each not in found}
     if ignored:
         warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
-    return [each or "default" for each in order], [found.get(each or "", matte()) for each in order]
+    return [each or "default" for each in order], [found.get(each or "", plain) for each in order]
 
 
 def _exponent(line: str) -> float | None:
@@ -110,7 +100,7 @@ def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str,
     ignored: set[str] = set()
     statements: dict[str, list[str]] = {}
     name = None
-    lines = path.read_bytes().decode(errors="replace").splitlines()
+    lines = [text.name(line) for line in text.read(path, "an MTL file").split(b"\n")]
     if not lines or not lines[0].startswith("# Blender"):
         blender = None
     for line in [*lines, "newmtl"]:

@@ -1,10 +1,11 @@
 """Loading of scenes from files of all supported formats."""
 
 import pathlib
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from jaxprt.scene.formats import gltf, mesh_file, mitsuba_dict, mtl
+from jaxprt.scene.formats import gltf, mesh_colors, mesh_file, mitsuba_dict, mtl
 from jaxprt.scene.formats.file_parts import split_parts
 from jaxprt.scene.scene import Scene
 
@@ -27,6 +28,10 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
     Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
 
     Files of other formats, and OBJ files without materials, become one matte gray part that is named after the file.
+    Colors of vertices or faces (PLY, OBJ, OFF) replace the gray, and multiply the base color of materials. They are
+    decoded from sRGB, integers and floats alike. Images that a PLY file names in `comment TextureFile` become the base
+    color, with the texture coordinates of its vertices or faces (MeshLab's wedges), and one part for each. Vertex
+    colors are left out where the base color is an image. A single warning names what cannot be read.
 
     A dictionary has the form of `mitsuba.load_dict`. Transforms are arrays [4 4] or objects with a `matrix`. Supported
     are the shapes obj, ply, rectangle, cube and sphere (the last three are finely subdivided); the BSDFs that
@@ -49,10 +54,16 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
     path = pathlib.Path(path)
     if path.suffix.lower() in (".glb", ".gltf") and path.is_file():
         return gltf.read(path)
-    geometry = mesh_file.read(path, groups=False)
-    names, materials = [path.stem], [mtl.matte()]
+    mesh_file.check(path)
+    content = mesh_file.content(path, groups=False)
+    plain = mesh_colors.matte(content.geometry)
     if path.suffix.lower() == ".obj":
-        names, materials = mtl.of_regions(path)
+        names, materials = mtl.of_regions(path, plain)
         if names == ["default"]:
             names = [path.stem]
-    return Scene(split_parts(geometry, names, materials, path))
+    else:
+        materials, ignored = mesh_colors.of_images(content, plain, path, outside=False)
+        names = [path.stem] * len(materials)
+        if ignored:
+            warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=2)
+    return Scene(split_parts(mesh_colors.filled(content.geometry, materials, plain), names, materials, path))

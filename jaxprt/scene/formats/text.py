@@ -1,0 +1,230 @@
+"""Text files: their encodings and line ends, and conversion of their words to numbers."""
+
+import codecs
+import io
+import itertools
+import pathlib
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxprt.files import inputs
+
+# Marks of the encoding at the start of a file. Those of UTF-32 come first, because they start like those of UTF-16.
+_MARKS = {
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+    codecs.BOM_UTF8: "utf-8-sig",
+}
+_BLANK = np.isin(np.arange(256), list(b" \t\n\v\f\r"))  # whether a byte separates words
+_BLOCK = 1 << 16  # rows whose words are in memory at once
+
+
+def read(path: pathlib.Path, what: str) -> bytes:
+    """The content of a text file without a byte order mark, and with line feeds as line ends.
+
+    UTF-16 and UTF-32 with a byte order mark become UTF-8. Other encodings stay, since only names use more than ASCII.
+
+    Args:
+        path: The file.
+        what: Kind of the file for messages, such as "an OBJ file".
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: It is not a regular file, or not text.
+        MemoryError: It does not fit into memory.
+    """
+    content = inputs.content(path, what)
+    try:
+        content = plain(content)
+        if b"\0" in content:
+            raise ValueError
+    except ValueError:  # UnicodeDecodeError is one
+        raise ValueError(f"{path} must be {what}, got one that is not text") from None
+    return content
+
+
+def plain(content: bytes) -> bytes:
+    """Text without a byte order mark, and with line feeds as line ends."""
+    encoding = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), None)
+    if encoding == "utf-8-sig":
+        content = content[len(codecs.BOM_UTF8) :]
+    elif encoding:
+        content = content.decode(encoding).encode()
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return content
+
+
+def name(word: bytes) -> str:
+    """A name in a text file: in UTF-8, or else in Windows-1252."""
+    try:
+        return word.decode()
+    except UnicodeDecodeError:
+        return word.decode("cp1252", errors="replace")
+
+
+class Words(NamedTuple):
+    """The words of rows of text.
+
+    Attributes:
+        text: The rows, with line feeds between them.
+        start: Position of the first byte of each word.
+        per_row: Number of words of each row.
+    """
+
+    text: bytes
+    start: np.ndarray
+    per_row: np.ndarray
+
+
+def words(rows: Sequence[bytes]) -> Words:
+    """Finds the words of rows of text."""
+    joined = b"\n".join([row.rstrip() for row in rows])
+    byte = np.frombuffer(joined, np.uint8)
+    blank = np.ones(len(byte) + 1, bool)
+    blank[1:] = _BLANK[byte]
+    start = np.flatnonzero(blank[:-1] & ~blank[1:])
+    end = np.append(np.flatnonzero(byte == ord("\n")), len(byte))
+    return Words(joined, start, np.diff(np.searchsorted(start, end), prepend=0))
+
+
+def numbers(words: Words, kind: type = float) -> np.ndarray:
+    """Numbers from words, in 64 bits.
+
+    Args:
+        words: The words.
+        kind: float or int. Integers beyond 64 bits become the nearest one.
+
+    Raises:
+        ValueError: A word is not a number. The first argument of the error is the index of its row.
+    """
+    if not len(words.start):
+        return np.zeros(0, kind)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
+            number = np.fromstring(words.text, kind, sep=" ")
+        if len(number) == len(words.start):  # "1-2" would be two numbers
+            return number
+    except (DeprecationWarning, ValueError):
+        pass
+    rows = words.text.split(b"\n")
+    raise ValueError(next((index for index, row in enumerate(rows) if not _are_numbers(row, kind)), 0))
+
+
+def _are_numbers(row: bytes, kind: type) -> bool:
+    try:
+        for word in row.split():
+            kind(word)
+    except ValueError:
+        return False
+    return True
+
+
+class Table:
+    """A block of rows of numbers, read from the left: the next number of all rows, or a list that states its length."""
+
+    def __init__(self, rows: Sequence[bytes], what: str, first: int):
+        """Splits rows into numbers.
+
+        Args:
+            rows: The rows.
+            what: Name of the rows for messages, such as "vertex".
+            first: Index of the first row.
+        """
+        self._what, self._first = what, first
+        row_words = words(rows)
+        try:
+            self._number = numbers(row_words)
+        except ValueError as error:
+            row = error.args[0]
+            raise ValueError(
+                f"row {first + row + 1} of the {what} rows must be numbers, got {name(rows[row].strip())[:80]!r}"
+            ) from None
+        self._end = np.cumsum(row_words.per_row)
+        self._at = self._end - row_words.per_row
+
+    def column(self, rest: int = 0) -> np.ndarray:
+        """The next number of each row, of which `rest` or more must follow."""
+        self._require(self._at + 1 + rest)
+        value = self._number[self._at]
+        self._at = self._at + 1
+        return value
+
+    def lists(self, rest: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """The next list of each row: all items, and the length of each list."""
+        start, count = self._at, whole(self.column(rest))
+        wrong = np.flatnonzero(count < 0)
+        if wrong.size:
+            raise ValueError(
+                f"row {self._first + wrong[0] + 1} of the {self._what} rows must have a list of 0 or more numbers, "
+                f"got {count[wrong[0]]}"
+            )
+        count = np.minimum(count, len(self._number) + 1)
+        self._require(start + 1 + count + rest)
+        value = self._number[ragged(self._at, count)]
+        self._at = self._at + count
+        return value, count
+
+    def remaining(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rest of each row: all numbers, and how many there are in each row."""
+        count = self._end - self._at
+        return self._number[ragged(self._at, count)], count
+
+    def _require(self, end: np.ndarray) -> None:
+        wrong = np.flatnonzero(end > self._end)
+        if wrong.size:
+            row = wrong[0]
+            length = self._end[row] - (self._end[row - 1] if row else 0)
+            raise ValueError(
+                f"row {self._first + row + 1} of the {self._what} rows must have {length + end[row] - self._end[row]} "
+                f"numbers, but has {length}"
+            )
+
+
+def tables(rows: Iterator[bytes], count: int, what: str) -> Iterator[Table]:
+    """Blocks of the next `count` rows.
+
+    Args:
+        rows: Rows that are not empty.
+        count: Number of rows to read.
+        what: Name of the rows for messages, such as "vertex".
+
+    Raises:
+        ValueError: There are fewer rows, or rows that are not numbers.
+    """
+    for first in range(0, count, _BLOCK):
+        size = min(_BLOCK, count - first)
+        block = list(itertools.islice(rows, size))
+        if len(block) < size:
+            raise ValueError(f"its header counts {count} {what} rows, but it has {first + len(block)}")
+        yield Table(block, what, first)
+
+
+def rows(content: bytes) -> Iterator[bytes]:
+    """The lines of a text that are not empty."""
+    return filter(bytes.strip, io.BytesIO(content))
+
+
+def whole(value: np.ndarray) -> np.ndarray:
+    """Integers in 64 bits. Numbers that are too large or not finite become -1."""
+    if value.dtype.kind in "iu":
+        return value.astype(np.int64)
+    limit = 1 << 62
+    return np.where(np.abs(value) < limit, value, -1).astype(np.int64)
+
+
+def ragged(start: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Indices of the items of lists, from the index of the first item and the length of each list."""
+    end = np.cumsum(count)
+    return np.arange(end[-1] if len(end) else 0) + np.repeat(start - (end - count), count)
+
+
+def unreadable(path: pathlib.Path, kind: str, detail: object) -> ValueError:
+    """The error for a damaged file of a kind such as "PLY"."""
+    return ValueError(f"{path} must be an undamaged {kind} file, got one that cannot be read: {detail}")

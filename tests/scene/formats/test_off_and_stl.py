@@ -1,0 +1,174 @@
+"""OFF and STL files as other programs write them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.formats import mesh_file
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+ROWS = ["0 0 0", "1 0 0", "1 1 0", "0 1 0"]
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+
+
+def write(folder, name, content):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def off(folder, keyword="OFF", rows=ROWS, faces=("4 0 1 2 3",), counts=None):
+    counts = counts or f"{len(rows)} {len(faces)} 0"
+    return write(folder, "mesh.off", "\n".join([keyword, counts, *rows, *faces]))
+
+
+def base_color(path):
+    (part,) = load_scene(path).parts
+    return np.asarray(part.surface().base_color), np.asarray(part.mesh.position)
+
+
+@pytest.mark.parametrize(
+    "head", ["OFF\n4 2 0", "OFF4 2 0", "OFF 4 2", "# text\nOFF # 9 9\n\n4 2 5 # counts", "4 2 0", "off\n4 2 0"]
+)
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_headers_of_off_files_have_many_forms(tmp_path, head, mark, end):
+    text = "\n".join([head, *ROWS, "3 0 1 2", "", "3 0 2 3", "trailing text"])
+    geometry = mesh_file.read(write(tmp_path, "mesh.off", mark + text.replace("\n", end).encode()), groups=False)
+    np.testing.assert_array_equal(geometry.position, SQUARE)
+    np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("most", ["255", "1.0"])
+@pytest.mark.parametrize("alpha", ["", " 255"])
+def test_vertex_colors_of_off_files_are_the_base_color(tmp_path, most, alpha):
+    alpha = alpha if most == "255" else alpha.replace("255", "1.0")
+    color = [f"{most} 0 0{alpha}", f"0 {most} 0{alpha}", f"0 0 {most}{alpha}", f"{most} {most} {most}{alpha}"]
+    path = off(tmp_path, "COFF", [f"{row} {rgb}" for row, rgb in zip(ROWS, color, strict=True)])
+    np.testing.assert_allclose(base_color(path)[0], [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], atol=1e-6)
+
+
+def test_face_colors_of_off_files_split_the_vertices(tmp_path):
+    path = off(tmp_path, faces=["3 0 1 2 255 0 0", "3 0 2 3 0 255 0"])
+    base, position = base_color(path)
+    face = np.asarray(load_mesh(path).face)
+    assert len(position) == 6
+    np.testing.assert_array_equal(position[face], SQUARE[[[0, 1, 2], [0, 2, 3]]])
+    np.testing.assert_allclose(base[face], [[[1, 0, 0]] * 3, [[0, 1, 0]] * 3], atol=1e-6)
+    base, position = base_color(off(tmp_path, faces=["3 0 1 2 1.0 0.0 0.0 1.0", "3 0 2 3"]))
+    assert sorted(base[:, 0].tolist()) == [0.5] * 3 + [1.0] * 3
+
+
+def test_what_cannot_be_read_of_an_off_file_is_named_in_a_warning(tmp_path):
+    with pytest.warns(UserWarning, match=r"mesh\.off: .* indices of colors of faces"):
+        load_scene(off(tmp_path, faces=["4 0 1 2 3 7"]))
+    with pytest.warns(UserWarning, match=r"mesh\.off: .* numbers after the coordinates of vertices"):
+        load_scene(off(tmp_path, rows=[f"{row} 1 2 3" for row in ROWS]))
+
+
+def test_normals_texture_coordinates_and_fourth_coordinates_of_off_files_are_read(tmp_path):
+    rows = [f"{row} 0 0 -2 255 0 0 255 0.25 {i}" for i, row in enumerate(ROWS)]
+    path = off(tmp_path, "STCNOFF", rows)
+    geometry = mesh_file.content(path, groups=False).geometry
+    np.testing.assert_array_equal(geometry.normal, [[0, 0, -2]] * 4)
+    np.testing.assert_array_equal(geometry.texture, [[0.25, i] for i in range(4)])
+    np.testing.assert_allclose(geometry.color, [[1, 0, 0]] * 4)
+    geometry = mesh_file.read(off(tmp_path, "4OFF", [f"{row} 2" for row in ROWS]), groups=False)
+    np.testing.assert_array_equal(geometry.position, SQUARE / 2)
+
+
+def test_points_and_segments_of_an_off_file_are_left_out(tmp_path):
+    geometry = mesh_file.read(off(tmp_path, faces=["1 0", "2 0 1", "4 0 1 2 3"]), groups=False)
+    np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"keyword": "OFF BINARY"}, "it must be text of three dimensions, got OFF BINARY"),
+        ({"keyword": "nOFF"}, "it must be text of three dimensions, got nOFF"),
+        ({"counts": "many 1 0"}, "it must start with OFF and the numbers of vertices and faces"),
+        ({"counts": "2147483648 1 0"}, "its header counts 2147483648 vertices and 1 faces, but it has"),
+        ({"counts": "4 9999999999999999 0"}, "its header counts 4 vertices and 9999999999999999 faces, but it has"),
+        ({"counts": "4 9 0"}, "its header counts 4 vertices and 9 faces, but it has"),
+        ({"counts": "4 2 0"}, "its header counts 2 face rows, but it has 1"),
+        ({"counts": "-4 1 0"}, "it must start with OFF and the numbers"),
+        ({"rows": ["0 0 0", "1 0", "1 1 0", "0 1 0"]}, "row 2 of the vertex rows must have 3 numbers, but has 2"),
+        ({"rows": ["0 0 0", "1 0 x", "1 1 0", "0 1 0"]}, "row 2 of the vertex rows must be numbers, got '1 0 x'"),
+        ({"faces": ["99999999999 0 1 2"]}, "row 1 of the face rows must have .* numbers, but has 4"),
+        ({"faces": ["-3 0 1 2"]}, "row 1 of the face rows must have a list of 0 or more numbers, got -3"),
+    ],
+)
+def test_damaged_off_files_are_refused_in_words_that_say_where(tmp_path, options, message):
+    with pytest.raises(ValueError, match=rf"mesh\.off must be an undamaged OFF file, .*{message}"):
+        load_mesh(off(tmp_path, **options))
+
+
+@pytest.mark.parametrize("face", ["3 0 1 7", "3 0 1 -1", "3 0 1 1e30", "3 0 1 nan"])
+def test_an_off_file_whose_faces_name_missing_vertices_is_refused(tmp_path, face):
+    with pytest.raises(ValueError, match=r"mesh\.off: faces must refer to vertices 0 to 3, got 1 of 2 .* at face 1"):
+        load_mesh(off(tmp_path, faces=["3 0 1 2", face]))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_text_stl_files_of_any_encoding_and_case_are_read(tmp_path, encoding, end):
+    text = f"solid a vertex 9 9 9\n{FACET}endsolid a\nsolid b\n{FACET.upper().replace('1 0 0', '1e0 0 0')}endsolid b\n"
+    path = write(tmp_path, "mesh.stl", text.replace("\n", end).encode(encoding))
+    mesh = load_mesh(path)
+    np.testing.assert_array_equal(mesh.position, [[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 2)
+    np.testing.assert_array_equal(mesh.face, [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(mesh.normal, [[0, 0, 1]] * 6)
+
+
+@pytest.mark.parametrize("start", [b"", b"solid exported by something", b"\xef\xbb\xbf"])
+def test_binary_stl_files_may_start_like_text(tmp_path, start):
+    source = trimesh.creation.box()
+    content = source.export(file_type="stl")
+    path = write(tmp_path, "mesh.stl", start.ljust(80, b" ") + content[80:])
+    position = mesh_file.read(path, groups=False).position
+    np.testing.assert_array_equal(position.reshape(-1, 3, 3), source.triangles.astype(np.float32))
+    assert len(load_scene(path).parts) == 1
+
+
+@pytest.mark.parametrize("place", ["header", "attribute"])
+def test_colors_of_a_binary_stl_file_are_named_in_a_warning(tmp_path, place):
+    content = bytearray(trimesh.creation.box().export(file_type="stl"))
+    if place == "header":
+        content[:20] = b"COLOR=\xff\x00\x00\xff,MATERIAL"[:20].ljust(20)
+    else:
+        content[84 + 48 : 84 + 50] = (0x8000 | 31).to_bytes(2, "little")
+    path = write(tmp_path, "mesh.stl", bytes(content))
+    with pytest.warns(UserWarning, match=r"mesh\.stl: not supported and ignored are colors of STL triangles"):
+        load_scene(path)
+    load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (bytes(80) + (2**31).to_bytes(4, "little") + bytes(16), "its header counts 2147483648 triangles, which take"),
+        (bytes(80) + (1).to_bytes(4, "little") + bytes(49), "take 134 bytes, but it has 133"),
+        (b"nothing", "it must start with 'solid' or have 84 bytes or more, got 7 bytes"),
+        (f"solid\n{FACET}", "its 1 facets must have three vertices and end with 'endsolid', got 3 vertices"),
+        (f"solid\n{FACET.replace('vertex 1 0 0', '')}endsolid", "three vertices .* got 2 vertices"),
+        (
+            f"solid\n{FACET.replace('vertex 1 0 0', 'vertex 1 zero 0')}endsolid",
+            "row 2 of the vertex rows must be numbers",
+        ),
+        (
+            f"solid\n{FACET.replace('vertex 1 0 0', 'vertex 1 0')}endsolid",
+            "row 2 of the vertex rows must have 3 numbers",
+        ),
+    ],
+)
+def test_damaged_stl_files_are_refused_in_words_that_say_where(tmp_path, content, message):
+    with pytest.raises(ValueError, match=rf"mesh\.stl must be an undamaged STL file, .*{message}"):
+        load_mesh(write(tmp_path, "mesh.stl", content))
+
+
+@pytest.mark.parametrize("content", [bytes(84), "solid empty\nendsolid empty\n"])
+def test_an_stl_file_without_triangles_is_refused(tmp_path, content):
+    with pytest.raises(ValueError, match=r"mesh\.stl must hold vertices and faces, got no faces"):
+        load_mesh(write(tmp_path, "mesh.stl", content))
