@@ -40,7 +40,7 @@ _traces = 0  # since the last count
 # jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103). Requirements exclude it; a flag avoids these fusions.
 _WRONG, _CURE = "0.10.2", "--xla_cpu_experimental_ynn_fusion_type="
 _CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
-if importlib.metadata.version("jaxlib") == _WRONG and _CURE not in os.environ.get("XLA_FLAGS", ""):
+if importlib.metadata.version("jaxlib") == _WRONG and _CURE not in os.getenv("XLA_FLAGS", ""):
     warnings.warn(
         f"jaxlib {_WRONG} computes wrong sums on CPUs (jax-ml/jax#39103): install another version, or set the "
         f"environment variable XLA_FLAGS={_CURE} before Python starts",

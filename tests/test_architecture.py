@@ -53,7 +53,7 @@ ONLY_IN = {
     "fast_simplification": "jaxprt.scene.occluder",
 }
 
-MOST_LINES = 400
+MOST_LINES = 800
 MOST_LINES_OF_A_FUNCTION = 60  # its docstring apart
 VAGUE = {"utils", "util", "common", "helpers", "misc", "_src", "core"}
 

@@ -19,7 +19,7 @@ from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.scene.scene import centered, default_camera
-from jaxprt.systems.protocol import Joined
+from jaxprt.systems.protocol import Joined, System
 from jaxprt.visibility import UnfinishedError
 
 
@@ -115,14 +115,7 @@ def precompute(
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
-    systems, unfinished = [], []
-    for part, shading, target in zip(near.parts, shadings, targets, strict=True):
-        try:
-            systems.append(recipes[part.name].make(shading, target))
-        except UnfinishedError as others:  # Go on with the next part of the scene.
-            unfinished.append(others)
-    if unfinished:
-        raise UnfinishedError("; ".join(map(str, unfinished)))
+    systems = _systems([recipes[part.name] for part in scene.parts], shadings, targets)
     lit = lamps.make(near, shadings, systems, targets, scene.point_lights)
     reflected = None
     if bounces:
@@ -130,6 +123,19 @@ def precompute(
         reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
     lobes = reflection.sharp(shadings, systems, folder) if bounces and rays else None
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
+
+
+def _systems(recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Sequence[Target]) -> list[System]:
+    """The systems of all parts."""
+    systems, unfinished = [], []
+    for recipe, shading, target in zip(recipes, shadings, targets, strict=True):
+        try:
+            systems.append(recipe.make(shading, target))
+        except UnfinishedError as others:  # Go on with the next part of the scene.
+            unfinished.append(others)
+    if unfinished:
+        raise UnfinishedError("; ".join(map(str, unfinished)))
+    return systems
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:

@@ -4,8 +4,9 @@ from jaxprt.visibility import blocks, diffuse, hits, members, occluder, points, 
 from jaxprt.visibility.blocks import Part, UnfinishedError
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.points import point_starts
-from jaxprt.visibility.rays import LEVELS, exhaustive, fractional, start_points
+from jaxprt.visibility.rays import LEVELS, exhaustive, fractional
 from jaxprt.visibility.refinement import refine
+from jaxprt.visibility.starts import start_points
 from jaxprt.visibility.stored import StoredVisibility, precompute
 
 __all__ = [

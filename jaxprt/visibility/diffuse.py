@@ -10,7 +10,7 @@ from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.rays import start_points
+from jaxprt.visibility.starts import start_points
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
