@@ -7,32 +7,12 @@ import json
 import socket
 import struct
 import threading
-import time
 import urllib.parse
 
 import pytest
 
-from jaxprt.view import Server, Session, messages, server
-from jaxprt.view.messages import Reply
-
-
-class Echo(Session):
-    """Answers a message by its own fields; a kind of "fault" raises."""
-
-    def __init__(self):
-        pass
-
-    def end(self):
-        pass
-
-    def answer(self, message, buffers=()):
-        if message.get("kind") == "fault":
-            raise KeyError("part")
-        if message.get("kind") == "nothing":
-            return Reply({"kind": "color", "scale": float("inf")}, [])
-        if message.get("kind") == "wrong":
-            return Reply({"kind": "error", "of": "wrong", "message": "what was required"}, [])
-        return Reply({"kind": "color", "came": list(message), "bytes": [len(data) for data in buffers]}, [])
+from jaxprt.view import Server, messages, server
+from tests.view.peers import Echo, exchange
 
 
 @pytest.fixture(scope="module")
@@ -47,24 +27,6 @@ def quick(monkeypatch):
     """Short patience with slow clients."""
     monkeypatch.setattr(server, "_BODY", 0.4)
     monkeypatch.setattr(server, "_SLOWEST", 1e9)
-
-
-def exchange(made, data, *, parts=(), wait=0.0, end=True):
-    """Status and text of the answer to raw bytes."""
-    place = urllib.parse.urlsplit(made.url)
-    with socket.create_connection((place.hostname or "", place.port or 0), timeout=20) as connection:
-        connection.sendall(data)
-        for part in parts:
-            time.sleep(wait)
-            connection.sendall(part)
-        if end:
-            connection.shutdown(socket.SHUT_WR)
-        answer = b""
-        while part := connection.recv(1 << 16):
-            answer += part
-    head, _, body = answer.partition(b"\r\n\r\n")
-    assert head.startswith(b"HTTP/1.1 "), answer[:200]
-    return int(head.split()[1]), body.decode("utf-8", "replace")
 
 
 def request(made, *, method="POST", path="ask", host=None, body=b"", length=True, extra=()):
