@@ -45,19 +45,23 @@ def load(path: Path) -> Any:
             f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read: it is damaged, {error}"
         ) from error
     if header.get("format") != FORMAT:
-        found = header.get("format", "another kind of folder")
-        raise ValueError(f"{path} must be a folder that jaxprt.files.save wrote, got {str(found)[:80]}: it is damaged")
+        came = str(header.get("format", "another kind of folder"))[:80]
+        raise ValueError(f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged")
     version, text = header.get("version"), header.get("content")
     if version != VERSION or type(version) is not int:
         newer = isinstance(version, int) and version > VERSION
-        cure = "update jaxprt" if newer else "load it with the version of jaxprt that saved it, or it is damaged"
-        raise ValueError(f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}")
+        cure = "update jaxprt" if newer else "load it with the version of jaxprt that saved it"
+        raise ValueError(
+            f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}, or it is damaged"
+        )
     if not isinstance(text, str) or zlib.crc32(text.encode("utf-8", "replace")) != header.get("checksum"):
         raise ValueError(f"{path} is damaged: its description is not what was saved")
     try:
         return _Reader(path, json.loads(text)).value
     except _KnownError as error:
         raise ValueError(str(error)) from error
+    except MemoryError:
+        raise
     except RecursionError:
         raise ValueError(f"{path} is damaged: its description is nested too deeply") from None
     except Exception as error:
@@ -215,13 +219,13 @@ def _class(path: Path, name: str) -> type:
         _check_module(module)
     except ValueError as error:
         raise _KnownError(f"{path} {error}") from None
-    found = getattr(sys.modules[module], kind, None)
-    if not isinstance(found, type) or found.__module__ != module or not is_ours(found):
+    result = getattr(sys.modules[module], kind, None)
+    if not isinstance(result, type) or result.__module__ != module or not is_ours(result):
         raise _KnownError(
             f"{path} names the class {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by "
             "another version"
         )
-    return found
+    return result
 
 
 def _check_module(name: str) -> None:

@@ -33,11 +33,11 @@ def proxied(request):
     proxy.server_close()
 
 
-def ask(url, *, method="POST", data=GOOD, **headers):
+def ask(url, *, method="POST", data: bytes | None = GOOD, headers=None, **more):
     """Status and bytes of an answer."""
     place = urllib.parse.urlsplit(url)
     connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=60)
-    connection.request(method, place.path, data, headers)
+    connection.request(method, place.path, data, {**(headers or {}), **more})
     answer = connection.getresponse()
     found = answer.status, answer.read()
     connection.close()
@@ -84,7 +84,7 @@ def test_a_proxy_that_keeps_its_path_is_served_too():
     for path, status in (("/user/me/proxy/absolute/8765", 200), ("", 200), ("/user/me", 403)):
         for host in ("hub.example.org", "hub.example.org:443", "HUB.example.org"):
             headers = {"Host": host, "Origin": "https://hub.example.org"}
-            assert ask(f"{local}{path}/{token}/ask", **headers)[0] == status
+            assert ask(f"{local}{path}/{token}/ask", headers=headers)[0] == status
     assert ask(f"{local}/{token}/ask", Host="hub.example.org:80", Origin="https://hub.example.org")[0] == 403
     assert ask(f"{local}/{token}/ask")[0] == 200  # this machine is served as before
     made.close()
