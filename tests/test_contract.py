@@ -118,7 +118,7 @@ HOST = {
     "brdf.measured.require": "checks values",
     "brdf.measured.load_merl": "reads a file",
     "brdf.measured.load_npf": "reads a file",
-    "brdf.measured.load_lafortune": "reads a file",
+    "brdf.measured.check_unique": "checks names",
     "brdf.measured.one_of": "checks a name",
     "brdf.models.color": "converts a parameter where it enters",
     "brdf.models.scalar": "the same",

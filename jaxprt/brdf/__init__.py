@@ -2,8 +2,8 @@
 
 from jaxprt.brdf import cylinders, fitted, measured, microfacet, models, navigation, scattered
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
-from jaxprt.brdf.fitted import load_ngan
-from jaxprt.brdf.measured import load_lafortune, load_merl, load_npf
+from jaxprt.brdf.fitted import load_lafortune, load_ngan
+from jaxprt.brdf.measured import load_merl, load_npf
 from jaxprt.brdf.microfacet import GGX, GGXInterface, MetallicRoughness, SchlickDiffuse
 from jaxprt.brdf.models import (
     AshikhminShirley,

@@ -1,4 +1,4 @@
-"""Measured BRDFs: MERL files, and published fits to measurements.
+"""Measured BRDFs: MERL files, and a published table of fits to them.
 
 Loaders run on the host and check the data. They return a BRDF like any other, differentiable in its directions and its
 table. ``HalfDifferenceTable`` and ``MicrofacetTable`` are tabulated over the half-difference angles of Rusinkiewicz
@@ -6,8 +6,8 @@ table. ``HalfDifferenceTable`` and ``MicrofacetTable`` are tabulated over the ha
 of the directions about the half vector. Values and gradients are finite where these angles are undefined.
 """
 
+import collections
 import difflib
-import json
 import pathlib
 
 import equinox as eqx
@@ -16,13 +16,16 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Float64
 
-from jaxprt.brdf import models
+from jaxprt.files import inputs
 
 _MERL_SHAPE = (90, 90, 180)
 _MERL_SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 _BINS = 90  # bins of each factor of the microfacet table
 _ROWS, _COLUMNS = 256, 512
 _TINY = 1e-12
+# Largest value in 1/sr that a file may hold. A lobe of this height that reflects all light is a millionth of a radian
+# wide. Much larger values would overflow float32 in sums over the light.
+LARGEST = 1e12
 
 
 def _norm(vector: Array) -> Array:
@@ -227,21 +230,25 @@ def load_merl(path: str | pathlib.Path) -> HalfDifferenceTable:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file has other dimensions or another length, holds NaN or infinity, or no valid cell.
+        ValueError: The file has other dimensions or another length, holds NaN, infinity or values above ``LARGEST``,
+            or no valid cell.
 
     Reference: Matusik, Pfister, Brand, McMillan 2003.
     """
-    content = pathlib.Path(path).read_bytes()
-    if len(content) < 12:
-        raise ValueError(f"{path}: must begin with three int32 {_MERL_SHAPE}, got {len(content)} bytes")
-    shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
+    path = pathlib.Path(path)
+    inputs.check(path, "a BRDF in MERL's format")
+    with path.open("rb") as file:
+        start = file.read(12)
+    if len(start) < 12:
+        raise ValueError(f"{path}: must begin with three int32 {_MERL_SHAPE}, got {len(start)} bytes")
+    shape = tuple(np.frombuffer(start, "<i4").tolist())
     if shape != _MERL_SHAPE:
         raise ValueError(f"{path}: the dimensions must be {_MERL_SHAPE}, got {shape}")
-    size = 12 + 3 * 8 * int(np.prod(_MERL_SHAPE))
-    if len(content) != size:
-        raise ValueError(f"{path}: must have {size} bytes, got {len(content)}")
-    plane = np.frombuffer(content, "<f8", offset=12).reshape(3, *_MERL_SHAPE)
-    require(path, plane, np.isfinite(plane), "finite", "value at color, theta_h, theta_d, phi_d")
+    _check_size(path, 12 + 3 * 8 * int(np.prod(_MERL_SHAPE)))
+    plane = np.fromfile(path, "<f8", offset=12).reshape(3, *_MERL_SHAPE)
+    place = "value at color, theta_h, theta_d, phi_d"
+    require(path, plane, np.isfinite(plane), "finite", place)
+    require(path, plane, plane <= 1500 * LARGEST, f"at most {1500 * LARGEST:g}", place)
     valid = np.all(plane >= 0, 0)
     if not valid.any():
         raise ValueError(f"{path}: must hold at least one cell without a negative value, got none of {valid.size}")
@@ -265,70 +272,49 @@ def load_npf(path: str | pathlib.Path, material: str, *, names: str | pathlib.Pa
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The material is unknown, the table has another size, or the row holds values that are negative
-            or not finite.
+        ValueError: The material is unknown, two materials have one name, the table has another size, or the row holds
+            values that are negative, not finite, or make a BRDF above ``LARGEST``.
 
     Reference: Bagher, Snyder, Nowrouzezahrai 2016.
     """
     path = pathlib.Path(path)
     names = pathlib.Path(names or path.with_name("merl_npf_materials.txt"))
-    known = names.read_text(encoding="utf-8").split()
+    known = inputs.content(names, "the names of materials").decode("utf-8", "replace").split()
     if len(known) > _ROWS:
         raise ValueError(f"{names}: must hold at most {_ROWS} names, got {len(known)}")
+    check_unique(names, known)
     index = known.index(one_of(material, known, names))
-    size, required = path.stat().st_size, _ROWS * _COLUMNS * 3 * 4
-    if size != required:
-        raise ValueError(f"{path}: must have {required} bytes, got {size}")
+    inputs.check(path, "a table of microfacet factors")
+    _check_size(path, _ROWS * _COLUMNS * 3 * 4)
     row = np.fromfile(path, "<f4").reshape(_ROWS, _COLUMNS, 3)[index].astype(float)
     good = np.isfinite(row) & (row >= 0)
     require(path, row, good, "finite and non-negative", f"value of {material} at column, color")
     distribution, masking, fresnel = row[2 : 2 + 3 * _BINS].reshape(3, _BINS, 3)
     for factor in (masking, fresnel):
         factor[0] = np.where(factor[0] > 0, factor[0], factor[1])
+    lowest = np.cos(np.pi / 2 * (1 - 0.5 / _BINS))
+    peak = row[0] + row[1] * distribution.max(0) * fresnel.max(0) * (masking.max(0) / lowest) ** 2
+    require(
+        path, peak, peak <= LARGEST, f"at most {LARGEST:g} per sr", f"product of the factors of {material} at color"
+    )
     factors = (row[0], row[1], distribution, fresnel, masking)
     return MicrofacetTable(*(jnp.asarray(factor, jnp.result_type(float)) for factor in factors))
 
 
-def load_lafortune(path: str | pathlib.Path, material: str) -> models.Lafortune:
-    """Loads one material from a JSON file with coefficients of Lafortune's model.
+def _check_size(path: pathlib.Path, required: int) -> None:
+    size = path.stat().st_size
+    if size != required:
+        raise ValueError(f"{path}: must have {required} bytes, got {size}")
 
-    The file holds ``materials`` by name, each with ``diffuse`` and a list ``lobes`` of ``Cxy``, ``Cz`` and ``n``. All
-    values have three colors. ``jaxprt.brdf.Lafortune`` explains the model.
 
-    Args:
-        path: The file.
-        material: Name of the material, such as "clay".
-
-    Returns:
-        The BRDF in linear RGB.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file has another structure, the material is unknown, a number is not finite, a diffuse
-            reflectance is negative, or an exponent is not positive.
-
-    Reference: Lafortune, Foo, Torrance, Greenberg 1997.
-    """
-    form = f"{path}: must be JSON with materials, each with diffuse and lobes, whose Cxy, Cz and n have three colors"
-    try:
-        known = {str(name): entry for name, entry in json.loads(pathlib.Path(path).read_text())["materials"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{form}, got other content: {error!r}") from error
-    entry = known[one_of(material, list(known), path)]
-    try:
-        diffuse = np.array(entry["diffuse"], float).reshape(3)
-        cxy, cz, exponent = (
-            np.array([lobe[key] for lobe in entry["lobes"]], float).reshape(-1, 3) for key in ("Cxy", "Cz", "n")
+def check_unique(path: str | pathlib.Path, names: list[str]) -> None:
+    """Raises ValueError if a file has two materials of one name."""
+    counts = collections.Counter(names)
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        raise ValueError(
+            f"{path}: materials must have different names, got {len(twice)} names twice, first {twice[0]!r}"
         )
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{form}, got {material} in another form: {error!r}") from error
-    if not len(cxy) == len(cz) == len(exponent):
-        raise ValueError(f"{form}, got {len(cxy)} Cxy, {len(cz)} Cz and {len(exponent)} n for {material}")
-    require(path, diffuse, np.isfinite(diffuse) & (diffuse >= 0), "finite and non-negative", "diffuse at color")
-    for value, name in ((cxy, "Cxy"), (cz, "Cz"), (exponent, "n")):
-        good = np.isfinite(value) & ((value > 0) | (name != "n"))
-        require(path, value, good, "positive" if name == "n" else "finite", f"{name} at lobe, color")
-    return models.Lafortune(diffuse=diffuse, cx=cxy, cy=cxy, cz=cz, exponent=exponent)
 
 
 def one_of(material: str, known: list[str], path: str | pathlib.Path) -> str:

@@ -21,12 +21,14 @@ from jaxtyping import Array, Float
 
 from jaxprt.brdf import models
 from jaxprt.brdf.places import Columns, Line, Plane, columns, identity, in_columns, triangulate
+from jaxprt.files import inputs
 
 _identity = identity  # Files of earlier releases use this name.
 _LEAST = 1e-30  # smallest exponent whose logarithm is taken
 _SMOOTHEST = 1e-3  # smallest roughness that the models distinguish
 _SCALE = np.array([1.0, 1.15, 1.66])  # MERL's color scale, which the fits of Ngan et al. lack
 _COLUMNS = ("kd_r", "kd_g", "kd_b", "ks_r", "ks_g", "ks_b", "m", "F0")
+_LARGEST = 1e9  # largest number of a fit; larger ones would overflow float32 in BRDFs
 _NO_MATERIAL = np.array([0.0, 1.0])[:, None, None]  # diffuse and specular weights
 
 
@@ -143,8 +145,9 @@ def _grid() -> np.ndarray:
 
 def _read(path: pathlib.Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names, kd and ks [2, m, 3], and F0 and m [m, 2] of the materials in a CSV file."""
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"there is no table of materials {path}")
+    inputs.check(path, "a table of materials")
     table: dict[str, list[float]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -177,8 +180,9 @@ def _number(row: dict, column: str, line: int) -> float:
     except ValueError:
         came = repr(row[column]) if row[column] else "nothing"
         raise ValueError(f"line {line}: {column} must be a number, got {came}") from None
-    least, most = {"m": (math.ulp(0), math.inf), "F0": (0, 1)}.get(column, (0, math.inf))
-    if not (least <= value <= most and math.isfinite(value)):
+    least, most = {"m": (math.ulp(0), _LARGEST), "F0": (0, 1)}.get(column, (0, _LARGEST))
+    if not least <= value <= most:
         required = {"m": "positive", "F0": "between 0 and 1"}.get(column, "not negative")
+        required += f", at most {most:g}" if _LARGEST < value < math.inf else ""
         raise ValueError(f"line {line}: {column} must be finite and {required}, got {value}")
     return value

@@ -10,8 +10,10 @@ import numpy as np
 import scipy
 from jaxtyping import Float64
 
+from jaxprt import require
 from jaxprt.brdf import measured
 from jaxprt.brdf.measured import HalfDifferenceTable
+from jaxprt.files import inputs
 
 _GLOSS = 0.01  # sine of theta_h beyond which the first coordinate of the radial basis functions is logarithmic
 _HIGHLIGHT = 2.0  # first coordinate up to which samples belong to the highlight: theta_h of 1.5 degrees
@@ -74,8 +76,8 @@ def read_scattered(
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file does not have this form, or holds no samples, values that are negative or not finite, or
-            directions below the horizon.
+        ValueError: The file does not have this form, or holds no samples, values that are negative, not finite or above
+            ``jaxprt.brdf.measured.LARGEST``, or directions below the horizon.
     """
     number = _numbers(path)
     count = int(number[0]) if number.size and number[0] == np.floor(number[0]) and 0 < number[0] < 1e6 else 0
@@ -92,7 +94,10 @@ def read_scattered(
         )
     sample = sample.reshape(-1, 4 + count)
     measured.require(path, sample, np.isfinite(sample), "finite", "number at sample, column")
-    measured.require(path, sample[:, 4:], sample[:, 4:] >= 0, "non-negative", "value at sample, wavelength")
+    value = sample[:, 4:]
+    measured.require(path, value, value >= 0, "non-negative", "value at sample, wavelength")
+    most = measured.LARGEST
+    measured.require(path, value, value <= most, f"at most {most:g} per sr", "value at sample, wavelength")
     polar = sample[:, [0, 2]]
     measured.require(
         path, polar, (polar >= 0) & (polar < np.pi / 2), "theta in [0, pi/2)", "angle at sample, direction"
@@ -107,13 +112,13 @@ def read_scattered(
 
 def _numbers(path: str | pathlib.Path) -> Float64[np.ndarray, " n"]:
     result: list[float] = []
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for index, line in enumerate(file, 1):
-            for word in line.partition("#")[0].split():
-                try:
-                    result.append(float(word))
-                except ValueError:
-                    raise ValueError(f"{path}: line {index} must hold numbers, got {word[:40]!r}") from None
+    text = inputs.content(pathlib.Path(path), "a file of scattered measurements").decode("utf-8", "replace")
+    for index, line in enumerate(text.splitlines(), 1):
+        for word in line.partition("#")[0].split():
+            try:
+                result.append(float(word))
+            except ValueError:
+                raise ValueError(f"{path}: line {index} must hold numbers, got {word[:40]!r}") from None
     return np.array(result)
 
 
@@ -151,6 +156,7 @@ def interpolate_scattered(
 
     Raises:
         ValueError: There are fewer than ten different samples, all lie on one plane, or an option is out of range.
+        MemoryError: There are too many samples.
 
     Reference: Kautz, Sloan, Snyder 2002, "Calculating BRDF Coefficients", for radial basis functions. The choice of
     coordinates is new.
@@ -168,6 +174,11 @@ def interpolate_scattered(
     mean = np.zeros((len(place), value.shape[1]))
     np.add.at(mean, inverse, np.maximum(value, 0))
     mean /= count[:, None]
+    require.memory(
+        f"splines of {len(place):,} samples",
+        3 * 8 * len(place) ** 2,
+        "give fewer samples: the spline has a square matrix",
+    )
     scale = np.median(mean[mean > 0]) / 10 if np.any(mean > 0) else 1.0
     height = np.log1p(mean / scale)
     stiffness: Any = np.where(place[:, 0] < _HIGHLIGHT, smoothing / 1000, smoothing)  # One per sample; typed float.

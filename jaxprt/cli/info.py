@@ -17,6 +17,7 @@ import numpy as np
 from jaxprt import brdf, compile
 from jaxprt.cli import inputs, materials, options
 from jaxprt.cli.options import option
+from jaxprt.files import inputs as regular
 from jaxprt.files import read_image
 from jaxprt.scene import TexturedMaterial, load_environment, load_scene
 from jaxprt.scene.environment import layout_of
@@ -168,6 +169,7 @@ def _light(path: Path, size: int) -> dict[str, Any]:
 
 def _brdf(path: Path) -> dict[str, Any]:
     """Describes a file of BRDFs, whose format is recognized from its content."""
+    regular.check(path, "a mesh, an environment or a BRDF")
     with path.open("rb") as file:
         start = file.read(4096)
     if start.startswith(_MERL):
@@ -179,10 +181,10 @@ def _brdf(path: Path) -> dict[str, Any]:
         return _named("npf", path, names)
     text = start.decode("utf-8", errors="replace")
     if path.suffix.lower() == ".json":
-        try:
-            names = list(json.loads(path.read_text())["materials"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} must be JSON with materials, got {error!r}") from error
+        known = regular.json_object(path, "a file of Lafortune BRDFs").get("materials")
+        if not isinstance(known, dict) or not known:
+            raise ValueError(f"{path} must be JSON with materials, got none")
+        names = list(known)
         brdf.load_lafortune(path, names[0])
         return _named("lafortune", path, names)
     if "Aggregate(Lambertian(" in text:
@@ -207,36 +209,34 @@ def _named(form: str, path: Path, names: list[str]) -> dict[str, Any]:
 def _folder(path: Path) -> dict[str, Any]:
     """Describes a saved object, a store of blocks, or a folder that contains such objects or stores."""
     nbytes = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
-    if (path / "object.json").exists():
-        header = _json(path / "object.json")
-        tree = json.loads(header["content"])["tree"]
-        what = tree.get("class", next(iter(tree), "value")).rpartition(":")[2]
-        return {"kind": "object", "holds": what, "bytes": nbytes}
-    if (path / "store.json").exists():
-        header = _json(path / "store.json")
-        done = np.load(path / "checksum.npy", mmap_mode="r")[: header["blocks"]]
-        finished = int(np.count_nonzero(done))
-        shapes = {name: each[:-1] for name, each in header["shapes"].items()}
-        system = header.get("system", "blocks")
-        return {
-            "kind": "store",
-            "holds": system,
-            "bytes": nbytes,
-            "blocks": header["blocks"],
-            "finished": finished,
-            "blocks_of": shapes,
-        }
+    if (path / "object.json").exists() or (path / "store.json").exists():
+        try:
+            return _written(path, nbytes)
+        except Exception as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
     inside = sorted({each.parent for name in ("object.json", "store.json") for each in path.rglob(name)})
     if not inside:
         raise ValueError(f"{path} must be a folder that jaxprt wrote, got one without saved objects and stores")
     return {"kind": "folder", "bytes": nbytes, "inside": [{"path": str(each), **_folder(each)} for each in inside]}
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: it must be JSON, got {error}") from error
+def _written(path: Path, nbytes: int) -> dict[str, Any]:
+    """Describes a saved object or a store of blocks."""
+    if (path / "object.json").exists():
+        tree = json.loads(regular.json_object(path / "object.json", "the description of an object")["content"])["tree"]
+        what = tree.get("class", next(iter(tree), "value")).rpartition(":")[2]
+        return {"kind": "object", "holds": what, "bytes": nbytes}
+    header = regular.json_object(path / "store.json", "the header of a store")
+    regular.check(path / "checksum.npy", "the checksums of a store")
+    done = np.load(path / "checksum.npy", mmap_mode="r")[: header["blocks"]]
+    return {
+        "kind": "store",
+        "holds": header.get("system", "blocks"),
+        "bytes": nbytes,
+        "blocks": int(header["blocks"]),
+        "finished": int(np.count_nonzero(done)),
+        "blocks_of": {name: shape[:-1] for name, shape in header["shapes"].items()},
+    }
 
 
 def _text(found: dict[str, Any], indent: str = "") -> str:

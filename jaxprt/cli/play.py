@@ -20,6 +20,7 @@ from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, Scene
 from jaxprt.view import serve
+from jaxprt.view.address import parse
 
 ROUGHNESS = (0.25, 0.8)  # range of materials' roughness; smoother materials take more time per look
 LOBES = 6
@@ -47,6 +48,12 @@ _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads s
     help="Port of this machine.  [default: a free one]",
 )
 @option(
+    "--address",
+    group="Viewer",
+    metavar="URL",
+    help="Address by which the browser comes, through a tunnel or a proxy.  [default: that of this machine]",
+)
+@option(
     "--no-browser",
     "browser",
     group="Viewer",
@@ -67,15 +74,17 @@ def command(**given: Any) -> None:
       jaxprt view scene.glb grace.hdr --output kept
       jaxprt view bunny.ply --ground --system lobe,harmonic --lobes 3,6,12 --bounces 1
       jaxprt view bunny.ply --brdf metallic-roughness:base_color=.9/.6/.2,roughness=.3 --port 8080 --no-browser
+      jaxprt view scene.glb --port 8765 --address http://localhost:9000
     """  # noqa: D301
     check_port(given["port"])
+    check_address(given["address"])
     if given["output"] is not None:
         relight.make_folder(given["output"])
     made, lights = ready(SimpleNamespace(**given))
-    server = _serve(made, lights, given["port"])
+    server = _serve(made, lights, given["port"], given["address"])
     click.echo(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it")
     sys.stdout.flush()
-    if given["browser"]:
+    if given["browser"] and given["address"] is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
     try:
         server.wait()
@@ -103,15 +112,28 @@ def check_port(port: int) -> None:
                 raise _no_port(port, error) from error
 
 
+def check_address(address: str | None) -> None:
+    """Refuses an address that no browser can come by, before anything is computed.
+
+    Raises:
+        ValueError: It is not the address of a page.
+    """
+    if address is not None:
+        try:
+            parse(address)
+        except ValueError as error:
+            raise ValueError(f"--address: {error}") from error
+
+
 def _no_port(port: int, error: OSError) -> ValueError:
     why = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "only the administrator may use it"}
     reason = why.get(error.errno or 0, error.strerror)
     return ValueError(f"--port must be free, got {port}: {reason}; without --port a free one is taken")
 
 
-def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: int) -> Any:
+def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: int, address: str | None) -> Any:
     try:
-        return serve(made, environments=lights, port=port)
+        return serve(made, environments=lights, port=port, address=address)
     except OSError as error:
         raise _no_port(port, error) from error
 

@@ -11,6 +11,7 @@ import errno
 import functools
 import json
 import os
+import re
 import shutil
 import uuid
 import zlib
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple
 import filelock
 import numpy as np
 
-from jaxprt.files import mapped
+from jaxprt.files import inputs, mapped
 
 VERSION = 4
 _FORMAT = "jaxprt blocks"
@@ -32,6 +33,7 @@ _PATIENCE = 2.0  # seconds to wait for another writer's check
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SUMS = 32
 _PART = 1 << 20  # values per partial sum
+_MOST = 1e300  # largest number in a sketch
 _STRIDE = 7919  # shift of the random signs from one part to the next
 
 
@@ -257,7 +259,9 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
     try:
         found = _found(path)
     except Exception as error:
-        raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
+        raise ValueError(
+            f"{path} exists but is not a readable store of arrays, or is damaged ({error}); name another path"
+        ) from error
     if found.get("format") != _FORMAT:
         raise ValueError(f"{path} exists but is not a store that jaxprt wrote; name another path")
     if found.get("version") != VERSION:
@@ -270,31 +274,50 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
         )
     differ = [key for key in header if found.get(key) != header[key]]
     if differ:
-        told = "; ".join(f"{key}: stored {found.get(key)}, now {header[key]}" for key in differ)
+        told = "; ".join(f"{key}: stored {str(found.get(key))[:200]}, now {header[key]}" for key in differ)
         raise ValueError(
             f"{path} holds arrays that were computed from other inputs ({told}); name another path or delete it"
         )
     _check_near(path, found.get("near", {}), near)
-    return str(found.get("key"))
+    key = found.get("key")
+    if not (isinstance(key, str) and re.fullmatch("[0-9a-f]{32}", key)):
+        raise ValueError(f"{path} is damaged: its key must be 32 hexadecimal digits, got {str(key)[:80]}; delete it")
+    return key
 
 
 def _found(path: Path) -> dict[str, Any]:
     """The header of a store of the current version, or of a version up to 3, which zarr wrote."""
     old = path / "zarr.json"
+    what = "the header of a store"
     if old.exists() and not (path / _HEADER).exists():
-        return dict(json.loads(old.read_text()).get("attributes", {}))
-    return dict(json.loads((path / _HEADER).read_text()))
+        return dict(inputs.json_object(old, what).get("attributes", {}))
+    _check_files(path, _HEADER)
+    return inputs.json_object(path / _HEADER, what)
+
+
+def _check_files(path: Path, name: str) -> None:
+    """Refuses links, which may lead out of the folder, and pipes, which would block.
+
+    Files are also written, so a link in a folder from a stranger could replace other files of the user.
+    """
+    for file in (path / name, *path.glob(".lock.*")):
+        if file.is_symlink():
+            raise ValueError(f"{file.name} must be a file in the folder, got a link")
+        inputs.check(file, "a part of a store of arrays")
 
 
 def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
     """Byte offset of the values of an array in its file."""
     file = path / f"{name}.npy"
     try:
+        _check_files(path, file.name)
         return mapped.read_header(file, shape, dtype)
     except FileNotFoundError:
         raise ValueError(f"{path} lacks the array {name}: it is damaged; delete it to start anew") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} exists but is not a readable store of arrays ({error}); name another path") from error
+    except Exception as error:  # NumPy raises other errors for some damaged headers
+        raise ValueError(
+            f"{path} exists but is not a readable store of arrays, or is damaged ({error}); name another path"
+        ) from error
 
 
 def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
@@ -304,7 +327,8 @@ def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None
         raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {told}; delete it")
     for name, now in near.items():
         kept = found[name]
-        if not (isinstance(kept, list) and len(kept) == len(now) and all(isinstance(x, int | float) for x in kept)):
+        numbers = isinstance(kept, list) and all(type(x) in (int, float) and abs(x) < _MOST for x in kept)
+        if not (numbers and len(kept) == len(now)):
             raise ValueError(f"{path} is damaged: the sketch of {name} must have {len(now)} numbers; delete it")
     for name, now in near.items():
         norm = max(now[1], found[name][1])

@@ -1,7 +1,10 @@
 """Input files: only regular ones that fit into memory, and, for what a scene refers to, only those in its folder."""
 
+import collections
+import json
 import pathlib
 import stat
+from typing import Any
 
 from jaxprt import require
 
@@ -74,3 +77,37 @@ def inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outside: boo
             "move the file into the folder, or call load_scene(path, outside=True) if you trust the scene"
         )
     return path
+
+
+def json_object(path: pathlib.Path, what: str) -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Args:
+        path: The file.
+        what: Kind of the file for messages, such as "a file of BRDFs".
+
+    Raises:
+        FileNotFoundError: Nothing has this name.
+        ValueError: It is no regular file, no JSON in UTF-8, nested too deeply, has a name twice in one object, or holds
+            something other than an object.
+        MemoryError: The file does not fit into memory.
+    """
+    data = content(path, what)
+    try:
+        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_without_duplicates)
+    except RecursionError:
+        raise ValueError(f"{path} must be {what} in JSON, got lists or objects that are nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"{path} must be {what} in JSON, got other content: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} must be {what} in JSON, an object in braces, got a {type(value).__name__}")
+    return value
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        counts = collections.Counter(name for name, _ in pairs)
+        twice = counts.most_common(1)[0][0]
+        raise ValueError(f"the name {twice[:80]!r} twice in one object")
+    return result

@@ -67,7 +67,7 @@ def precompute(
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.
         executor: Executor that computes the blocks of work. If None, all cores of this machine. A
             `jaxprt.visibility.Part` computes only its share of the blocks, for machines that have nothing in common but
-            `path`.
+            `path`. A `ProcessPoolExecutor` must have the context "spawn", since forked processes hang where JAX runs.
         progress: Whether to show progress bars.
 
     Returns:
@@ -161,6 +161,8 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     kept = folder and folder / "plan"
     if kept is not None and kept.exists():
         found, environments = objects.load(kept), options["environments"]
+        if not isinstance(found, Plan):
+            raise ValueError(f"{kept} is damaged: it must hold a plan, got a {type(found).__name__}")
         if found.key != key_of(scene, lights_of(scene) if environments is None else environments):
             raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
         asked = ERROR if options["error"] is None else options["error"]

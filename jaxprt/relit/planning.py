@@ -267,4 +267,7 @@ def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Ca
     path = folder / re.sub(r"\W+", "_", str(recipe))
     if not path.exists():
         objects.save(path, sample.measure(recipe))
-    return objects.load(path)
+    found = objects.load(path)
+    if not isinstance(found, Candidate):
+        raise ValueError(f"{path} is damaged: it must hold a candidate, got a {type(found).__name__}; delete it")
+    return found

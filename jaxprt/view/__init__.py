@@ -48,8 +48,13 @@ def serve(
     *,
     environments: Mapping[str, Environment] | None = None,
     port: int = 0,
+    address: str | None = None,
 ) -> Server:
-    """Starts a viewer for a browser on this machine. Open its `url`, and call `close` when done.
+    """Starts a viewer for a browser. Open its `url`, and call `close` when done.
+
+    Only this machine can reach the server. For a browser on another machine, tunnel or proxy the port, and give the
+    address by which the browser then comes. Requests from pages of other addresses, and without the token in `url`, are
+    refused.
 
     Args:
         scene: The result of `jaxprt.precompute`, or a dictionary from names to results of several systems for the same
@@ -57,13 +62,16 @@ def serve(
         environments: Dictionary from names to lights. Their size must be that of the scene's transport. If None, the
             scene's own lights or the two embedded ones.
         port: Port of this machine; 0 chooses a free one.
+        address: Address by which the browser comes, if it is not that of this machine: "http://localhost:9000" for an
+            ssh tunnel from port 9000, or "https://hub.example.org/user/me/proxy/8765" behind jupyter-server-proxy.
 
     Returns:
         The running server.
 
     Raises:
         TypeError: `scene` holds something other than relit scenes, or `environments` something other than lights.
-        ValueError: There is no scene or no light, the scenes differ, or the lights have different sizes.
+        ValueError: There is no scene or no light, the scenes differ, the lights have different sizes, or `address` is
+            not an address of http or https.
         OSError: The port is in use or not permitted.
     """
-    return Server(Session(scene, environments=environments), port=port)
+    return Server(Session(scene, environments=environments), port=port, address=address)

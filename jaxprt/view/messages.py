@@ -10,7 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxprt import require
+
 MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
+_MOST_JSON = 1 << 24  # bytes of the JSON of a message; it takes many times its size in memory
+_MOST_LAMPS = 1000
+_LARGEST_INTEGER = 1 << 1000  # integers below it are floats too
 _LARGEST_HALF = 65504.0
 
 
@@ -73,10 +78,10 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
     """
     system = message.get("system")
     if not isinstance(system, str) or system not in systems:
-        raise ValueError(f"the system must be one of {', '.join(systems)}, got {system!r}")
+        raise ValueError(f"the system must be one of {', '.join(systems)}, got {_shown(system)}")
     light = message.get("light")
     if type(light) is not int or not 0 <= light < lights:
-        raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {light!r}")
+        raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {_shown(light)}")
     eye, target = (numbers(message, name, 3) for name in ("eye", "target"))
     if eye == target:
         raise ValueError(f"eye and target must be different points, got {list(eye)} for both")
@@ -84,11 +89,11 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
         system,
         light,
         number(message, "turn", -math.inf, math.inf),
-        tuple(_lamp(each) for each in _items(message, "lamps")),
+        _lamps(message),
         eye,
         target,
         number(message, "field_of_view", 1e-3, math.pi - 1e-3),
-        bool(message.get("bounces", False)),
+        truth(message, "bounces"),
         _materials(message.get("materials", {})),
     )
 
@@ -100,11 +105,45 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
         ValueError: The field is not a finite number, or is out of range.
     """
     value = message.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}")
+    large = isinstance(value, int) and abs(value) >= _LARGEST_INTEGER  # float() would raise OverflowError
+    if isinstance(value, bool) or not isinstance(value, int | float) or large or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {_shown(value)}")
     if not low <= value <= high:
         raise ValueError(f"{name} must be from {low:g} to {high:g}, got {value:g}")
     return float(value)
+
+
+def truth(message: Mapping[str, Any], name: str) -> bool:
+    """Reads a field that is true or false; false if it is missing.
+
+    Raises:
+        ValueError: The field is something else.
+    """
+    value = message.get(name, False)
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be true or false, got {_shown(value)}")
+    return value
+
+
+def text(message: Mapping[str, Any], name: str) -> str:
+    """Reads a field that is text; empty if it is missing.
+
+    Raises:
+        ValueError: The field is something else.
+    """
+    value = message.get(name, "")
+    if not isinstance(value, str):
+        raise ValueError(f"{name} must be text, got {_shown(value)}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    """A value in an error message, cut off where it is long."""
+    if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
+        return f"an integer of {value.bit_length()} bits"
+    if isinstance(value, str | int | float | None):
+        return ascii(value[:80]) if isinstance(value, str) else repr(value)
+    return f"a {type(value).__name__}"
 
 
 def numbers(
@@ -128,26 +167,53 @@ def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
     return b"".join([struct.pack("<I", len(head)), head, *(each + bytes(-len(each) % 8) for each in buffers)])
 
 
-def unpack(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
+def unpack(data: bytes | bytearray) -> tuple[dict[str, Any], list[bytes]]:
     """Unpacks bytes from `pack` into the message and its arrays.
 
     Raises:
-        ValueError: The bytes are not a packed message.
+        ValueError: The bytes are not a packed message, or its JSON has numbers that are not finite floats.
     """
     try:
         (length,) = struct.unpack_from("<I", data)
-        head = json.loads(data[4 : 4 + length])
-        content, lengths, buffers, place = dict(head["content"]), head["lengths"], [], 4 + length
-        for each in lengths:
-            if type(each) is not int or not 0 <= each <= len(data) - place:
-                raise ValueError(each)
-            buffers.append(data[place : place + each])
-            place += each + -each % 8
-    except (struct.error, ValueError, KeyError, TypeError, RecursionError):
+        if length > _MOST_JSON:
+            raise ValueError(f"its JSON has {length} bytes")
+        head = json.loads(bytes(data[4 : 4 + length]), parse_constant=_finite, parse_float=_finite, parse_int=_whole)
+        content, lengths, buffers, place = head["content"], head["lengths"], [], 4 + length
+        if not isinstance(content, dict) or not isinstance(lengths, list):
+            raise TypeError("its JSON must have an object, `content`, and a list, `lengths`")
+        for size in lengths:
+            if type(size) is not int or not 0 <= size <= len(data) - place:
+                raise ValueError(f"an array has {size} bytes")
+            buffers.append(bytes(data[place : place + size]))
+            place += size + -size % 8
+    except (struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(
-            f"a message must have the binary form that the viewer sends, got {len(data)} bytes in another form"
+            f"a message must have the binary form that the viewer sends, got {len(data)} bytes in another form: {error}"
         ) from None
     return content, buffers
+
+
+def most_bytes() -> int:
+    """Size of the largest message that is accepted: a quarter of the free memory, but not above `MOST_BYTES`.
+
+    A dropped file is held as bytes, as an array and as a decoded picture.
+    """
+    free = require.available_memory()
+    return MOST_BYTES if free is None else max(min(MOST_BYTES, free // 4), _MOST_JSON)
+
+
+def _finite(text: str) -> float:
+    """A number of JSON. `NaN` and `Infinity`, which Python also reads, and numbers beyond float64 are refused."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"numbers must be finite, got {text[:40]}")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > 400 or abs(int(text)) >= _LARGEST_INTEGER:
+        raise ValueError(f"numbers must be in the range of float64, got {text[:40]}.. of {len(text)} digits")
+    return int(text)
 
 
 def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
@@ -162,7 +228,8 @@ def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
         The bytes, and the factor by which half floats must be multiplied. It is 1 unless the brightest color exceeds
         the range of half floats.
     """
-    value = np.asarray(color, np.float32)
+    # Pictures of absurd looks may not be finite, which neither half floats nor JSON can tell.
+    value = np.nan_to_num(np.asarray(color, np.float32))
     if stops is None:
         scale = max(1.0, float(np.max(np.abs(value), initial=0.0)) / _LARGEST_HALF)
         return np.clip(value / np.float32(scale), -_LARGEST_HALF, _LARGEST_HALF).astype("<f2").tobytes(), scale
@@ -177,13 +244,20 @@ def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
 def _items(message: Mapping[str, Any], name: str) -> Sequence[Any]:
     value = message.get(name, [])
     if not isinstance(value, list | tuple):
-        raise ValueError(f"{name} must be a list, got {value!r}")
+        raise ValueError(f"{name} must be a list, got {_shown(value)}")
     return value
+
+
+def _lamps(message: Mapping[str, Any]) -> tuple[Lamp, ...]:
+    lamps = _items(message, "lamps")
+    if len(lamps) > _MOST_LAMPS:
+        raise ValueError(f"lamps must be at most {_MOST_LAMPS}, got {len(lamps)}")
+    return tuple(_lamp(lamp) for lamp in lamps)
 
 
 def _lamp(message: Any) -> Lamp:
     if not isinstance(message, Mapping):
-        raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {message!r}")
+        raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {_shown(message)}")
     direction = numbers(message, "direction", 3)
     if not 1e-6 < math.hypot(*direction) < 1e6:
         raise ValueError(f"the direction of a lamp must have a length between 1e-6 and 1e6, got {list(direction)}")
@@ -192,14 +266,15 @@ def _lamp(message: Any) -> Lamp:
 
 def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
     if not isinstance(message, Mapping):
-        raise ValueError(f"materials must be a dictionary from names of parts, got {message!r}")
+        raise ValueError(f"materials must be a dictionary from names of parts, got {_shown(message)}")
     return tuple(sorted((str(name), _material(name, value)) for name, value in message.items()))
 
 
 def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     if not isinstance(message, Mapping) or not set(message) <= set(MATERIAL):
         raise ValueError(
-            f"the material of part {part!r} must be a dictionary with keys among {', '.join(MATERIAL)}, got {message!r}"
+            f"the material of part {_shown(part)} must be a dictionary with keys among {', '.join(MATERIAL)}, got "
+            f"{', '.join(map(_shown, message)) if isinstance(message, Mapping) else _shown(message)}"
         )
     result = []
     for name in sorted(message):

@@ -1,18 +1,26 @@
 """The viewer in a browser: a server that only this machine can reach, and the page that it serves."""
 
 import contextlib
+import http
 import http.server
 import pathlib
+import re
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 from jaxprt.view import messages
+from jaxprt.view.address import Address, parse
 from jaxprt.view.session import Session
 
 MODULE = pathlib.Path(__file__).with_name("viewer.js")
+_IDLE = 600.0  # seconds that a connection may rest
+_BODY = 30.0  # seconds that a message may take, beside those of its length
+_SLOWEST = 1e5  # bytes a second
+_LINGER = 5.0  # most seconds in which bytes that were refused are still received
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>jaxprt</title><link rel="icon" href="data:,">
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
@@ -26,7 +34,8 @@ async function ask(content, buffers = []) {
   const length = new Uint8Array(new Uint32Array([padded.length]).buffer);
   const pieces = buffers.flatMap((each) => [each, new Uint8Array((8 - (each.byteLength % 8)) % 8)]);
   const response = await fetch("./ask", { method: "POST", body: new Blob([length, padded, ...pieces]) });
-  if (!response.ok) throw new Error(`the server says ${response.status}`);
+  const type = response.headers.get("Content-Type") ?? "";
+  if (!type.startsWith("application/octet-stream")) throw new Error((await response.text()) || response.status);
   return unpack(await response.arrayBuffer());
 }
 const close = mount(document.getElementById("viewer"), ask);
@@ -47,22 +56,26 @@ class Server:
     """Serves a viewer on this machine until it is closed. Its address contains a random token.
 
     Attributes:
-        url: The address.
+        url: The address to open.
     """
 
-    def __init__(self, session: Session, *, port: int = 0):
+    def __init__(self, session: Session, *, port: int = 0, address: str | None = None):
         """Starts the server in a new thread.
 
         Args:
             session: The session to show.
             port: Port of this machine; 0 chooses a free one.
+            address: Address by which the browser comes, such as that of a tunnel or a proxy; None for this machine's.
 
         Raises:
+            TypeError: `address` is not text.
+            ValueError: `address` is not that of a page.
             OSError: The port is in use or not permitted.
         """
-        token = secrets.token_urlsafe(16)
-        self._server = _Listener(port, session, token)
-        self.url = f"http://127.0.0.1:{self._server.server_port}/{token}/"
+        token, coming = secrets.token_urlsafe(16), None if address is None else parse(address)
+        self._server = _Listener(port, session, token, coming)
+        start = f"http://127.0.0.1:{self._server.server_port}" if coming is None else coming.url
+        self.url = f"{start}/{token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
         self._thread.start()
 
@@ -88,12 +101,16 @@ class _Listener(http.server.ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, port: int, session: Session, token: str):
-        self.session, self.token = session, token
+    def __init__(self, port: int, session: Session, token: str, address: Address | None):
+        self.session, self.token, self.address = session, token, address
         self.idle, self._answers, self._count = threading.Event(), 0, threading.Lock()
         self.idle.set()
         self._open: set[socket.socket] = set()
         super().__init__(("127.0.0.1", port), _Handler)
+        local = [parse(f"http://{name}:{self.server_port}") for name in ("127.0.0.1", "localhost")]
+        known = local if address is None else [*local, address]
+        self.hosts = [host for place in known for host in place.hosts]
+        self.origins = [place.origin for place in known]
 
     @contextlib.contextmanager
     def answering(self) -> Iterator[None]:
@@ -132,64 +149,153 @@ class _Listener(http.server.ThreadingHTTPServer):
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = 600
+    default_request_version = "HTTP/1.0"  # so that answers to requests without a version have a status too
+    timeout = _IDLE
     server: _Listener  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def log_message(self, format: str, *args: Any) -> None:
         """Logs nothing, because addresses contain the token."""
 
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuses requests that the base class cannot parse."""
+        status = {501: 405, 505: 400}.get(code, int(code))
+        self._refuse(status, message or http.HTTPStatus(status).phrase)
+
     def do_GET(self) -> None:
         """Serves the page and its module."""
-        if not self._allowed():
+        place = self._allowed()
+        if place is None:
+            return
+        if self.headers.get("Content-Length", "0") != "0" or "Transfer-Encoding" in self.headers:
+            self._refuse(400, "a request for a page must have no body")
             return
         pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
         pages["viewer.js"] = MODULE.read_bytes(), "text/javascript; charset=utf-8"
-        found = pages.get(self.path.split("?")[0].removeprefix(f"/{self.server.token}/"))
-        if found is None:
-            self._send(404, b"there is no such page", "text/plain")
+        page = pages.get(place.split("?")[0])
+        if page is None:
+            self._refuse(404, "there is no such page")
         else:
-            self._send(200, *found)
+            self._send(200, *page)
 
     def do_POST(self) -> None:
         """Answers a message of the page."""
-        if not self._allowed():
+        place = self._allowed()
+        if place is None:
             return
-        length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > messages.MOST_BYTES:
-            self.close_connection = True
-            self._send(413, b"a message must say its length, and be less than 512 MiB", "text/plain")
+        if place != "ask":
+            self._refuse(404, "there is no such page")
             return
-        data = self.rfile.read(int(length))
-        if self.path != f"/{self.server.token}/ask":
-            self._send(404, b"there is no such page", "text/plain")
+        data = self._body()
+        if data is None:
             return
         try:
             content, buffers = messages.unpack(data)
         except ValueError as error:
-            self._send(400, str(error).encode(), "text/plain")
+            self._refuse(400, str(error))
             return
         with self.server.answering():
-            answer = messages.pack(*self.server.session.answer(content, buffers))
-        self._send(200, answer, "application/octet-stream")
+            try:
+                reply = self.server.session.answer(content, buffers)
+                answer = messages.pack(*reply)
+            except Exception as error:  # a fault of the viewer; the page shows its words, and the server goes on
+                self._refuse(500, f"the viewer failed: {type(error).__name__}: {error}")
+                return
+        self._send(400 if reply.content["kind"] == "error" else 200, answer, "application/octet-stream")
 
-    def _allowed(self) -> bool:
-        """Refuses wrong tokens, other names for this machine, and pages of other origins."""
-        port = self.server.server_port
-        hosts = [f"127.0.0.1:{port}", f"localhost:{port}"]
-        origin = self.headers.get("Origin")
-        right = secrets.compare_digest(
-            self.path.encode()[: len(self.server.token) + 2], f"/{self.server.token}/".encode()
+    def _body(self) -> bytearray | None:
+        """The body of a message. None if it was refused."""
+        lengths, coding = self.headers.get_all("Content-Length", []), self.headers.get("Transfer-Encoding")
+        if coding is not None or not lengths:
+            came = "none" if coding is None else f"Transfer-Encoding {coding[:40]!r}"
+            self._refuse(
+                400 if lengths else 411, f"a message must state its length by Content-Length alone, got {came}"
+            )
+            return None
+        if len(lengths) > 1 or not re.fullmatch(r"[0-9]+", lengths[0]):
+            came = ", ".join(repr(length[:40]) for length in lengths[:4])
+            self._refuse(400, f"a message must have one Content-Length, a whole number, got {came}")
+            return None
+        length, most = int(lengths[0][:20]), messages.most_bytes()
+        if len(lengths[0]) > 20 or length > most:
+            self._refuse(
+                413, f"a message must have at most {most} bytes, as many as fit into memory, got {lengths[0][:40]}"
+            )
+            return None
+        data, deadline = bytearray(), time.monotonic() + _BODY + length / _SLOWEST
+        self.connection.settimeout(_BODY)
+        try:
+            while len(data) < length:
+                part = self.rfile.read1(min(length - len(data), 1 << 20))
+                if not part:
+                    self._refuse(400, f"a message must have the {length} bytes that it states, got {len(data)}")
+                    return None
+                data += part
+                if time.monotonic() > deadline:
+                    raise TimeoutError
+        except TimeoutError:
+            self._refuse(408, f"a message must arrive within {_BODY:g} seconds, got {len(data)} of {length} bytes")
+            return None
+        self.connection.settimeout(self.timeout)
+        return data
+
+    def _allowed(self) -> str | None:
+        """The path after the token. None if the request was refused: by its token, its host, or the page's origin.
+
+        A page of another origin could not read the answers, but a name that an attacker points to this machine would
+        make its page one of this origin. The header Host then has that name.
+        """
+        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or len(origins) > 1 or self.headers.defects or self.headers.get_payload():
+            self._refuse(
+                400, "a request must have headers of the right form, one Host among them, and at most one Origin"
+            )
+            return None
+        place = self._place()
+        if place is None:
+            self._refuse(
+                403, "this address lacks the viewer's token: open the whole address that the viewer has printed"
+            )
+        elif hosts[0].lower() not in self.server.hosts:
+            self._refuse(403, self._stranger("Host", hosts[0], self.server.hosts))
+        elif origins and origins[0] not in self.server.origins:
+            self._refuse(403, self._stranger("Origin", origins[0], self.server.origins))
+        else:
+            return place
+        return None
+
+    def _place(self) -> str | None:
+        """The path after the token; None for another token. Some proxies remove their own path, others do not."""
+        for path in ("", *(() if self.server.address is None else (self.server.address.path,))):
+            start = f"{path}/{self.server.token}/"
+            if secrets.compare_digest(self.path[: len(start)].encode(), start.encode()):
+                return self.path[len(start) :]
+        return None
+
+    def _stranger(self, header: str, value: str, known: list[str]) -> str:
+        """The refusal of a host or an origin, with the cause and the remedy."""
+        return (
+            f"the browser came with the {header} {value[:100]!a}, and this viewer answers to {', '.join(known)}. If "
+            "you came through a tunnel or a proxy, start the viewer with the address in the browser's bar, without the "
+            "token: prt.view.serve(.., address=URL), or jaxprt view --address URL, such as http://localhost:9000"
         )
-        known = self.headers.get("Host") in hosts and (origin is None or origin in [f"http://{x}" for x in hosts])
-        if right and known:
-            return True
+
+    def _refuse(self, status: int, words: str) -> None:
+        """Answers by words and closes the connection, since bytes of the request may be unread."""
         self.close_connection = True
-        self._send(403, b"this address is not the viewer's", "text/plain")
-        return False
+        self._send(status, words.encode("utf-8", "backslashreplace"), "text/plain; charset=utf-8")
+        # A connection that is closed with unread bytes is reset, and the other side may lose the words.
+        deadline = time.monotonic() + _LINGER
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+            self.connection.settimeout(1.0)
+            while time.monotonic() < deadline and self.connection.recv(1 << 16):
+                pass
 
     def _send(self, status: int, data: bytes, kind: str) -> None:
         self.send_response(status)
-        for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
+        close = {"Connection": "close"} if self.close_connection else {}
+        for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **close, **_HEADERS}.items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(data)
+        self.wfile.flush()

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import re
 import tempfile
 import threading
 import time
@@ -92,15 +93,18 @@ class Session:
             "sky": self._sky,
             "drop": self._drop,
         }
+        kind = message.get("kind")
+        kind = kind if isinstance(kind, str) else type(kind).__name__
         try:
-            kind = message.get("kind")
             if kind not in kinds:
-                raise ValueError(f"the kind of a message must be one of {', '.join(kinds)}, got {kind!r}")
+                raise ValueError(f"the kind of a message must be one of {', '.join(kinds)}, got {kind[:80]!r}")
             return kinds[kind](message, buffers)
         except _LateError:
             return Reply({"kind": "late", "seq": message.get("seq")}, [])
         except (ValueError, TypeError, OSError, MemoryError) as error:
-            return Reply({"kind": "error", "of": message.get("kind"), "message": str(error)}, [])
+            return Reply({"kind": "error", "of": kind, "message": str(error)}, [])
+        except Exception as error:  # a fault of the viewer: its page tells the user, and goes on
+            return Reply({"kind": "error", "of": kind, "message": f"{type(error).__name__}: {error}"}, [])
 
     def picture(self) -> Float[np.ndarray, "h w 3"]:
         """The first picture of the viewer, from vertex radiance, encoded for display."""
@@ -163,7 +167,7 @@ class Session:
         """Mask of the vertices that a message requests: those that face the eye, or the others; None for all."""
         asked = message.get("vertices", "all")
         if asked not in ("all", "seen", "unseen"):
-            raise ValueError(f"vertices must be all, seen or unseen, got {asked!r}")
+            raise ValueError(f"vertices must be all, seen or unseen, got {str(asked)[:80]!r}")
         if asked == "all":
             return None
         seen = self.stages.facing(look)
@@ -208,10 +212,14 @@ class Session:
 
     def _drop(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """Adds a light from a file that was dropped on the viewer."""
-        file = pathlib.PurePath(str(message.get("name") or "light.hdr"))
+        # Only a name, because browsers of Windows may send paths too.
+        file = pathlib.PurePath(
+            messages.text(message, "name").replace("\\", "/").replace("\0", "")[-100:] or "light.hdr"
+        )
+        suffix = file.suffix if re.fullmatch(r"\.\w{1,8}", file.suffix, re.ASCII) else ""
         if len(buffers) != 1 or not len(buffers[0]):
             raise ValueError(f"{file.name} must hold an environment, got no bytes")
-        handle, path = tempfile.mkstemp(suffix=file.suffix)
+        handle, path = tempfile.mkstemp(suffix=suffix)
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(buffers[0])
@@ -240,13 +248,13 @@ class Session:
 
 def _viewer(message: Mapping[str, Any]) -> str:
     """The name that a viewer has chosen. Each viewer numbers its own looks."""
-    return str(message.get("viewer", ""))[:64]
+    return messages.text(message, "viewer")[:64]
 
 
 def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
     """Width and height of the picture that a message requests, and whether it is a coarse one, which is smaller."""
     width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
-    coarse = bool(message.get("coarse", False))
+    coarse = messages.truth(message, "coarse")
     step = _COARSE[message["kind"]] if coarse else 1
     return max(width // step, 1), max(height // step, 1), coarse
 

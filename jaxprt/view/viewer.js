@@ -414,6 +414,7 @@ export function mount(root, ask) {
     if (long) moved(); else redraw();
   };
   const drop = async (file) => {
+    if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
       const { content } = await ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
       if (content.kind === "error") { stats.errors++; return tell(content.message); }

@@ -9,7 +9,7 @@ import pickle
 import queue
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -115,7 +115,7 @@ def compute(
         job: The computation.
         path: Folder of the store. Finished blocks are kept there; blocks found there are not computed again.
         executor: Executor that computes the blocks; threads on this machine's cores if None. A `Part` computes only
-            its own blocks.
+            its own blocks. A `ProcessPoolExecutor` must have the context "spawn" or "forkserver".
         progress: Whether to show a progress bar.
         label: Text of the progress bar.
 
@@ -124,12 +124,14 @@ def compute(
         whose first axis is that of the blocks are memory-mapped: pages are read when they are first used.
 
     Raises:
-        ValueError: The store at `path` was made from other inputs, or `executor` is a `Part` and there is no path.
+        ValueError: The store at `path` was made from other inputs, `executor` is a `Part` and there is no path, or it
+            forks this process.
         BlockingIOError: Another process is writing to the store.
         OSError: The disk is full; finished blocks are kept in the store.
         UnfinishedError: This part is finished, but others are not.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
+    _check_context(executor)
     blocks = -(-job.vertices // job.step)
     part = executor if isinstance(executor, Part) else None
     if part is not None and path is None:
@@ -158,6 +160,21 @@ def compute(
                 "run the other parts, then run again without a part"
             )
     return {name: store.whole(name, count) for name, count in counts.items()}
+
+
+def _check_context(executor: Executor | None) -> None:
+    """Refuses process pools that fork.
+
+    A forked process has the locks of JAX's threads but not the threads, and waits forever for a lock that one of them
+    held.
+    """
+    context = getattr(executor, "_mp_context", None) if isinstance(executor, ProcessPoolExecutor) else None
+    if context is not None and context.get_start_method() == "fork":
+        raise ValueError(
+            'executor must not fork this process, got a ProcessPoolExecutor with the context "fork": JAX runs threads, '
+            "and forked workers would hang; make it by ProcessPoolExecutor(n, "
+            'mp_context=multiprocessing.get_context("spawn"))'
+        )
 
 
 class _Kept:

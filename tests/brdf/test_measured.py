@@ -1,5 +1,5 @@
 import csv
-import json
+import os
 
 import equinox as eqx
 import jax
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import CookTorrance, load_lafortune, load_merl, load_npf, measured
+from jaxprt.brdf import CookTorrance, load_merl, load_npf, measured
 
 MERL = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
@@ -208,6 +208,33 @@ def test_merl_files_without_a_number_are_refused(tmp_path):
         load_merl(write(tmp_path / "broken.binary", plane))
 
 
+def test_merl_values_that_no_surface_has_are_refused_by_their_number_and_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(measured, "_MERL_SHAPE", (2, 2, 4))
+    plane = np.full((3, 2, 2, 4), 30.0)
+    for value in (1e300, 1e16, np.finfo(float).max):
+        plane[1, 1, 0, 2:] = value
+        with pytest.raises(ValueError, match=r"hot.binary: .* at most 1.5e\+15, got 2 .*\(1, 1, 0, 2\): ") as error:
+            load_merl(write(tmp_path / "hot.binary", plane, (2, 2, 4)))
+        assert str(error.value).endswith(str(value))
+    plane[1, 1, 0, 2:] = 1e15
+    brdf = load_merl(write(tmp_path / "hot.binary", plane, (2, 2, 4)))
+    np.testing.assert_allclose(np.asarray(brdf.root, float)[1, 1, 2:, 1] ** 3, 1.5e12 / 1.5 * 1.15 / 1.5, rtol=1)
+    assert np.all(np.isfinite(np.asarray(brdf.root) ** 3))
+    # A negative value marks a cell that was not measured, however large it is.
+    plane[1, 1, 0, 2:] = -1e300
+    assert np.all(np.isfinite(np.asarray(load_merl(write(tmp_path / "cold.binary", plane, (2, 2, 4))).root)))
+
+
+@pytest.mark.parametrize("load", [load_merl, lambda path: load_npf(path, "iron", names=path)])
+def test_pipes_and_folders_in_place_of_measurements_are_refused(tmp_path, load):
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "special file"), (tmp_path, "directory")):
+        with pytest.raises(ValueError, match=f"got a {kind}"):
+            load(path)
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        load(tmp_path / "none")
+
+
 @pytest.fixture
 def npf(data):
     return data / "brdf/merl_npf_512x256_rgb32f.bin"
@@ -315,45 +342,13 @@ def test_bad_tables_of_factors_are_refused(npf, tmp_path):
     with pytest.raises(ValueError, match=r"got 1 that are not, the first value of iron at column, color \(2, 1\): nan"):
         load_npf(path, "iron", names=names)
     assert not np.any(evaluate(load_npf(path, "zinc", names=names), *pairs(5)))
+    table[1] = 1e20  # finite in float32, but not the product of the factors
+    path.write_bytes(table.tobytes())
+    with pytest.raises(ValueError, match=r"table.bin: every product must be at most 1e\+12 per sr, got 3 .*\(0,\): "):
+        load_npf(path, "iron", names=names)
+    names.write_text("iron zinc iron")
+    with pytest.raises(ValueError, match=r"names.txt: materials must have different names, .* first 'iron'"):
+        load_npf(path, "iron", names=names)
     names.write_text("iron " * 300)
     with pytest.raises(ValueError, match=r"names.txt: must hold at most 256 names, got 300"):
         load_npf(path, "iron", names=names)
-
-
-def test_lafortune_coefficients_make_their_model(data):
-    path = data / "brdf/lafortune_measured.json"
-    wi, wo = np.asarray(pairs(50), float)
-    entry = json.loads(path.read_text())["materials"]["clay"]
-    expected = np.broadcast_to(np.array(entry["diffuse"]) / np.pi, wi.shape)
-    for lobe in entry["lobes"]:
-        cxy, cz, exponent = (np.array(lobe[key]) for key in ("Cxy", "Cz", "n"))
-        base = cxy * np.sum((wi * wo)[:, :2], 1, keepdims=True) + cz * (wi * wo)[:, 2:]
-        expected = expected + np.maximum(base, 0) ** exponent
-    found = np.asarray(evaluate(load_lafortune(path, "clay"), jnp.float32(wi), jnp.float32(wo)))
-    # Exponents of 200 magnify the rounding of float32.
-    assert norm(found - expected, expected) < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda entry: entry.pop("diffuse"), "must be JSON with materials"),
-        (lambda entry: entry.update(diffuse=[0.1, -0.1, 0]), r"first diffuse at color \(1,\): -0.1"),
-        (lambda entry: entry["lobes"][0].update(n=[1, 2, 0]), r"every n must be positive.*\(0, 2\): 0.0"),
-        (lambda entry: entry["lobes"][1].update(Cz=[1, float("nan"), 0]), r"every Cz must be finite.*\(1, 1\): nan"),
-        (lambda entry: entry["lobes"][1].update(Cz=[1]), "must be JSON"),
-    ],
-)
-def test_bad_lafortune_files_are_refused(tmp_path, change, message):
-    lobe = {"Cxy": [-1, -1, -1], "Cz": [1, 1, 1], "n": [5, 5, 5]}
-    entry = {"diffuse": [0.1, 0.2, 0.3], "lobes": [lobe, dict(lobe)]}
-    change(entry)
-    path = tmp_path / "coefficients.json"
-    path.write_text(json.dumps({"materials": {"clay": entry}}))
-    with pytest.raises(ValueError, match=f"coefficients.json: .*({message})"):
-        load_lafortune(path, "clay")
-    with pytest.raises(ValueError, match=r"material must be one of 1 names such as clay, got 'clya'"):
-        load_lafortune(path, "clya")
-    path.write_text("{")
-    with pytest.raises(ValueError, match="must be JSON"):
-        load_lafortune(path, "clay")

@@ -109,7 +109,7 @@ def half_cosine():
     ("text", "words"),
     [
         (NGAN.format(model="NganHe", more="roughness = 1"), "must be one of NganBlinnPhong, .* got NganHe"),
-        (NGAN.format(model="NganWardDuer", more="sharpness = 1"), "must fit its model NganWardDuer: 'roughness'"),
+        (NGAN.format(model="NganWardDuer", more="sharpness = 1"), "model NganWardDuer: it must have albedo, roughness"),
         ("nothing", "must have lines such as"),
     ],
 )

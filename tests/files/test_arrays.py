@@ -352,3 +352,53 @@ def test_damaged_sketches_are_told(tmp_path, damaged):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"near": damaged}))
     with pytest.raises(ValueError, match=r"a\.prt is damaged: .* must have"):
         open_store(path, header={}, near=near)
+
+
+WRONG_HEADERS = {
+    "cut off": lambda text: text[: len(text) // 2],
+    "empty": lambda text: "",
+    "nested": lambda text: "[" * 100_000,
+    "a list": lambda text: "[1]",
+    "a number": lambda text: "1" * 5000,
+    "no key": lambda text: json.dumps({k: v for k, v in json.loads(text).items() if k != "key"}),
+    "another key": lambda text: json.dumps(json.loads(text) | {"key": ["../.."]}),
+    "no shapes": lambda text: json.dumps({k: v for k, v in json.loads(text).items() if k != "shapes"}),
+    "other shapes": lambda text: json.dumps(json.loads(text) | {"shapes": {"index": [10**30, None]}}),
+    "no version": lambda text: json.dumps({k: v for k, v in json.loads(text).items() if k != "version"}),
+    "a number in place of sketches": lambda text: json.dumps(json.loads(text) | {"near": 10**400}),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_HEADERS)
+def test_damaged_headers_are_refused_and_nothing_is_lost(path, case):
+    header = path / "store.json"
+    text = header.read_text()
+    header.write_text(WRONG_HEADERS[case](text))
+    with pytest.raises(ValueError, match=r"a\.prt (exists but is not|is damaged|holds arrays|has format version)"):
+        open_store(path)
+    header.write_text(text)
+    assert found(path) == list(range(BLOCKS))
+
+
+@pytest.mark.parametrize("name", ["store.json", "index.npy", "checksum.npy", ".lock.1-of-1"])
+def test_pipes_and_links_in_place_of_the_files_of_a_store_are_refused(path, tmp_path, name):
+    outside = tmp_path / "outside"
+    outside.write_bytes((path / name).read_bytes() if (path / name).exists() else b"mine")
+    content = outside.read_bytes()
+    for kind, make in (("link", lambda file: file.symlink_to(outside)), ("special file", os.mkfifo)):
+        (path / name).unlink(missing_ok=True)
+        make(path / name)
+        with pytest.raises(ValueError, match=rf"a\.prt exists but is not a readable store.*got a {kind}"):
+            open_store(path)
+    assert outside.read_bytes() == content
+
+
+def test_a_sketch_beyond_float64_is_damage(tmp_path):
+    path, near = tmp_path / "a.prt", {"brdf": arrays.sketch(np.ones(9))}
+    open_store(path, near=near)
+    file = path / "store.json"
+    header = json.loads(file.read_text())
+    for wrong in (10**400, True, "1", None):
+        file.write_text(json.dumps(header | {"near": {"brdf": [wrong, *near["brdf"][1:]]}}))
+        with pytest.raises(ValueError, match="is damaged: the sketch of brdf must have"):
+            open_store(path, near=near)

@@ -16,6 +16,7 @@ from jaxprt import files, image
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.view import Server, Session
+from tests.view.peers import Proxy
 
 CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
 TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
@@ -445,3 +446,18 @@ def test_the_plane_of_blinn_phong_changes_exponent_and_reflectance(browser, ligh
     assert hand.stats()["errors"] == 0
     hand.page.close()
     server.close()
+
+
+def test_the_page_works_behind_a_proxy_with_a_path(browser, session):
+    proxy = Proxy(path="/user/me/proxy/8765")
+    made = Server(session, address=proxy.address)
+    proxy.target = made._server.server_port
+    hand = Hand(browser, made.url)
+    assert hand.page.url.startswith(f"{proxy.address}/")
+    hand.drag((100, 150), (150, 170))
+    assert hand.stats()["errors"] == 0
+    hand.page.close()
+    assert not hand.errors
+    made.close()
+    proxy.shutdown()
+    proxy.server_close()

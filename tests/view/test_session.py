@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import tempfile
 import threading
 import zlib
 
@@ -274,6 +275,40 @@ WRONG = {
     "lamp": ({"lamps": [{"direction": [0, 0, 0], "angle": 1, "radiance": [1, 1, 1]}]}, "must have a length"),
     "lamps": ({"lamps": 3}, "lamps must be a list, got 3"),
     "stops": ({"stops": 1e9}, "stops must be from -60 to 60"),
+    "kind of a list": ({"kind": ["look"]}, "the kind of a message must be one of scene, look"),
+    "no kind": ({"kind": None}, "the kind of a message must be one of scene, look"),
+    "a kind that is no number": ({"kind": float("nan")}, "the kind of a message must be one of"),
+    "system of a list": ({"system": ["lobes"]}, "the system must be one of lobes, harmonics, got a list"),
+    "light beyond float64": ({"light": 10**400}, "the light must be a number from 0 to 1, got an integer of 1329 bits"),
+    "light of a fraction": ({"light": 0.5}, "the light must be a number from 0 to 1, got 0.5"),
+    "turn beyond float64": ({"turn": 10**400}, "turn must be a finite number, got an integer of 1329 bits"),
+    "turn of a list": ({"turn": [1]}, "turn must be a finite number, got a list"),
+    "seq beyond float64": ({"seq": 10**400}, "seq must be a finite number"),
+    "seq below 0": ({"seq": -1}, "seq must be from 0 to"),
+    "eye beyond float64": ({"eye": [10**400, 0, 0]}, "eye must be a finite number"),
+    "eye of text": ({"eye": "abc"}, "eye must be a list, got 'abc'"),
+    "eye of an object": ({"eye": {"x": 1}}, "eye must be a list, got a dict"),
+    "angle beyond float64": ({"field_of_view": -(10**400)}, "field_of_view must be a finite number"),
+    "width beyond float64": ({"kind": "still", "width": 10**400, "height": 4}, "width must be a finite number"),
+    "width of text": ({"kind": "exact", "width": "8", "height": 4}, "width must be a finite number, got '8'"),
+    "coarse of text": (
+        {"kind": "still", "width": 8, "height": 4, "coarse": "no"},
+        "coarse must be true or false, got 'no'",
+    ),
+    "bounces of a number": ({"bounces": 1}, "bounces must be true or false, got 1"),
+    "viewer of a list": ({"viewer": [1]}, "viewer must be text, got a list"),
+    "stops beyond float64": ({"stops": 10**400}, "stops must be a finite number"),
+    "vertices of a list": ({"vertices": []}, "vertices must be all, seen or unseen, got '[]'"),
+    "materials of a list": ({"materials": [1]}, "materials must be a dictionary from names of parts, got a list"),
+    "material of a number": ({"materials": {"ball": 3}}, "must be a dictionary with keys among"),
+    "parameter beyond float64": ({"materials": {"ball": {"f0": 10**400}}}, "f0 must be a finite number"),
+    "parameter of none": ({"materials": {"ball": {"diffuse": None}}}, "diffuse must be a list, got None"),
+    "lamp of a number": ({"lamps": [3]}, "a lamp must have a direction, an angle and a radiance, got 3"),
+    "lamp beyond float64": ({"lamps": [{"direction": [0, 1, 0], "angle": 10**400}]}, "angle must be a finite number"),
+    "many lamps": ({"lamps": [{}] * 1001}, "lamps must be at most 1000, got 1001"),
+    "sky of another light": ({"kind": "sky", "light": "0"}, "the light must be a number from 0 to 1, got '0'"),
+    "drop of nothing": ({"kind": "drop", "name": "a.hdr"}, "a.hdr must hold an environment, got no bytes"),
+    "drop of a number": ({"kind": "drop", "name": 3}, "name must be text, got 3"),
 }
 
 
@@ -287,6 +322,36 @@ def test_a_wrong_message_is_answered_by_what_was_required(session, look, name):
     assert reply.content["kind"] == "error"
     assert words in reply.content["message"]
     assert session.answer(look).content["kind"] == "color"
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("../../secret/a.hdr", "a.hdr"),
+        ("/etc/a.hdr", "a.hdr"),
+        ("C:\\lights\\a.hdr", "a.hdr"),
+        ("a\0.hdr", "a.hdr"),
+        ("a" * 5000 + ".hdr", "a" * 96 + ".hdr"),
+        ("a.h d r/../..", ".."),
+        ("a." + "x" * 5000, "x" * 100),
+        ("", "light.hdr"),
+        ("\ud800.hdr", ".hdr"),
+    ],
+)
+def test_names_of_dropped_files_lead_nowhere(session, name, shown, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    reply = session.answer({"kind": "drop", "name": name}, [b"no light"])
+    assert reply.content["kind"] == "error"
+    assert shown in reply.content["message"]
+    assert not list(tmp_path.iterdir())
+    assert messages.unpack(messages.pack(*reply))[0] == reply.content
+
+
+def test_looks_from_absurd_places_are_answered_by_finite_numbers():
+    for stops in (None, 0.0):
+        data, scale = messages.encode(np.array([[np.nan, np.inf, -np.inf], [1, 2, 3]]), stops=stops)
+        assert np.isfinite(scale)
+        assert stops is not None or np.isfinite(np.frombuffer(data, "<f2").astype(float)).all()
 
 
 def test_threads_get_the_answers_to_their_own_questions(session, look):

@@ -551,3 +551,10 @@ def test_fingerprints_tell_values_shapes_and_types_apart():
     assert visibility.blocks.fingerprint(array, array) != visibility.blocks.fingerprint(array)
     assert visibility.blocks.fingerprint(array[::2]) == visibility.blocks.fingerprint(array[::2].copy())
     assert zlib.crc32(b"") == 0  # The checksum that stands for nothing written is also that of no bytes.
+
+
+def test_process_pools_that_fork_are_refused_by_the_remedy():
+    with ProcessPoolExecutor(1, mp_context=get_context("fork")) as pool:
+        with pytest.raises(ValueError, match=r'must not fork .* mp_context=multiprocessing.get_context\("spawn"\)'):
+            visibility.blocks.compute(Squares(), executor=pool, progress=False)
+        assert not pool._processes  # nothing was forked

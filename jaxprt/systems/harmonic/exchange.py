@@ -13,6 +13,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import zipfile
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxprt import require
-from jaxprt.files import outputs
+from jaxprt.files import inputs, outputs
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics
 from jaxprt.sphere.conventions import Convention
@@ -114,13 +115,14 @@ def import_transfer(
         Transfer vectors for `DiffuseSystem`, or matrices for `HarmonicSystem` in the frames of the mesh.
 
     Raises:
-        ValueError: The convention is not known, arrays have other axes or another number of vertices, values are not
-            finite, positions or frames differ from those of the mesh, or vectors of corners at one vertex differ.
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, the convention is not known, arrays have other axes or another number of
+            vertices, values are not finite, positions or frames differ from those of the mesh, or vectors of corners at
+            one vertex differ.
+        MemoryError: The arrays do not fit into memory.
     """
     kind, source = _suffix(path), str(path)
-    held = (
-        dict(np.load(path)) if kind == ".npz" else _read_ply(path) if kind == ".ply" else {"coefficient": np.load(path)}
-    )
+    held = _read(pathlib.Path(path), kind)
     if "coefficient" not in held:
         raise ValueError(f"{source} must hold an array `coefficient`, got {', '.join(sorted(held)) or 'none'}")
     stated = _said(source, str(held["convention"])) if "convention" in held else convention
@@ -132,16 +134,16 @@ def import_transfer(
         raise ValueError(f"the convention must be that of {source} or None, got {convention}: the file says {stated}")
     convention = stated
     what = str(held.get("what", "vectors")) if what is None else what
-    value = np.asarray(held["coefficient"], np.float32)
-    require.finite(f"the coefficients of {source}", value)
+    value = _numbers(source, "coefficient", held["coefficient"])
     turn = convention.turn.astype(np.float32)
     if "position" in held:
-        place = np.asarray(held["position"], np.float64) @ convention.turn - mesh.origin
-        _same(f"positions of {source}", place, np.asarray(mesh.position))
+        position = _numbers(source, "position", held["position"], np.float64, axes=3)
+        _same(f"positions of {source}", position @ convention.turn - mesh.origin, np.asarray(mesh.position))
     if what == "matrices":
         frame = directions.frame(mesh.normal, mesh.tangent)
         if "frame" in held:
-            _same(f"frames of {source}", held["frame"] @ turn, np.asarray(frame))
+            axes = _numbers(source, "frame", held["frame"], axes=3)
+            _same(f"frames of {source}", axes @ turn, np.asarray(frame))
         return TransferMatrix(jnp.asarray(_matrices(source, value, mesh, convention)), mesh.position, frame)
     if what not in ("vectors", "vectors of corners"):
         raise ValueError(f'what must be "vectors", "vectors of corners" or "matrices", got {what!r}')
@@ -156,12 +158,55 @@ def import_transfer(
     return TransferVector(jnp.asarray(value.transpose(1, 2, 0)), mesh.position)
 
 
+def _read(path: pathlib.Path, kind: str) -> dict[str, np.ndarray]:
+    """The arrays of a file, by name. Nothing in it is unpickled."""
+    inputs.check(path, "a file of transfer vectors or matrices")
+    try:
+        if kind == ".ply":
+            return _read_ply(path)
+        if kind == ".npy":
+            return {"coefficient": np.array(np.load(path, mmap_mode="r"))}
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        require.memory(f"the arrays of {path}", size, "free some memory")
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        if not all(isinstance(value, np.ndarray) for value in arrays.values()):  # NumPy returns other members as bytes
+            raise ValueError("it holds something that is no array")
+        return arrays
+    except MemoryError as error:
+        raise MemoryError(f"{path} does not fit into memory: {error}") from error
+    except Exception as error:  # the readers raise many kinds of errors for damaged files
+        raise ValueError(
+            f"{path} must be an undamaged {kind} file with arrays of numbers, got another: {error}"
+        ) from error
+
+
+def _numbers(
+    source: str, name: str, value: np.ndarray, dtype: type = np.float32, *, axes: int | None = None
+) -> np.ndarray:
+    """An array of a file as finite numbers of a type, with `axes` entries along its last axis."""
+    if value.dtype.kind not in "iuf":
+        raise ValueError(f"{source}: `{name}` must be of real numbers, got {value.dtype}")
+    if axes is not None and (value.ndim < 2 or value.shape[-1] != axes):
+        raise ValueError(f"{source}: `{name}` must be [.., {axes}], got {list(value.shape)}")
+    with np.errstate(over="ignore"):  # refused as infinite
+        value = np.asarray(value, dtype)
+    require.finite(f"the {name}s of {source}", value)
+    return value
+
+
 def _said(source: str, text: str) -> Convention:
     """The convention that a file states."""
     try:
-        return Convention(**json.loads(text))
-    except (TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"the convention in {source} must be one that export_transfer writes, got {text}") from error
+        convention = Convention(**json.loads(text))
+        if not (type(convention.condon_shortley) is bool and type(convention.over_pi) is bool):
+            raise TypeError("condon_shortley and over_pi must be true or false")
+        return convention
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"the convention in {source} must be one that export_transfer writes, got {text[:200]}"
+        ) from error
 
 
 def _matrices(source: str, value: np.ndarray, mesh: Mesh, convention: Convention) -> Float[np.ndarray, "v c o i"]:

@@ -46,7 +46,7 @@ def precompute(
         path: Folder in which finished blocks are stored; it is created with its parents. A call that was interrupted
             continues from there.
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine. Process
-            pools must not fork a process in which JAX runs: use the "spawn" context.
+            pools must have the context "spawn": forked processes hang where JAX runs.
         progress: Whether to show a progress bar.
 
     Returns:

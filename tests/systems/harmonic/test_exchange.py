@@ -1,6 +1,10 @@
 """Transfer in files: the round trip, and files that are written and read by NumPy alone."""
 
 import dataclasses
+import io
+import json
+import os
+import zipfile
 
 import jax.numpy as jnp
 import numpy as np
@@ -130,3 +134,76 @@ def test_what_does_not_fit_is_refused(tmp_path):
     np.savez(tmp_path / "v.npz", other=np.ones(3))
     with pytest.raises(ValueError, match="must hold an array `coefficient`, got other"):
         harmonic.import_transfer(tmp_path / "v.npz", MESH)
+
+
+RIGHT = json.dumps(dataclasses.asdict(Convention()))
+
+
+def packed(**arrays):
+    """The bytes of an npz file, with the arrays of a right one unless others are named."""
+    file = io.BytesIO()
+    right = {"coefficient": np.ones((COUNT, 9)), "position": np.asarray(MESH.position), "convention": RIGHT}
+    np.savez(file, **(right | arrays), allow_pickle=True)
+    return file.getvalue()
+
+
+def zipped(content):
+    """An npz file with some bytes in place of the coefficients."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("coefficient.npy", content)
+    return file.getvalue()
+
+
+def header(shape):
+    """The header of an npy file without its values."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("t.npz", b"", "must be an undamaged .npz file"),
+        ("t.npz", b"PK", "must be an undamaged .npz file"),
+        ("t.npz", packed()[:400], "must be an undamaged .npz file"),
+        ("t.npz", zipped(b"text"), "must be an undamaged .npz file"),
+        ("t.npz", zipped(header((3, 9))), "must be an undamaged .npz file"),
+        ("t.npz", packed(coefficient=np.array([{}], object)), "must be an undamaged .npz file"),
+        ("t.npz", packed(coefficient=np.ones((COUNT, 9), complex)), "must be of real numbers, got complex128"),
+        ("t.npz", packed(coefficient=np.full((COUNT, 9), "1.0")), "must be of real numbers, got <U3"),
+        ("t.npz", packed(coefficient=np.full((COUNT, 9), 1e60)), "must be finite, got"),
+        ("t.npz", packed(coefficient=np.float64(1)), "must be \\["),
+        ("t.npz", packed(position=np.ones((COUNT, 2))), r"`position` must be \[.., 3\]"),
+        ("t.npz", packed(position=np.array("here")), "`position` must be of real numbers"),
+        ("t.npz", packed(convention="[" * 100_000), "must be one that export_transfer writes"),
+        ("t.npz", packed(convention="3"), "must be one that export_transfer writes"),
+        ("t.npz", packed(convention='{"order": 3}'), "must be one that export_transfer writes"),
+        ("t.npz", packed(convention='{"axes": "+x+x+x"}'), "must be one that export_transfer writes"),
+        ("t.npz", packed(convention='{"over_pi": "no"}'), "must be one that export_transfer writes"),
+        ("t.npy", b"", "must be an undamaged .npy file"),
+        ("t.npy", header((3, 9)), "must be an undamaged .npy file"),
+        ("t.npy", header((2**40, 2**40)), "must be an undamaged .npy file"),
+        ("t.ply", b"", "must be an undamaged .ply file"),
+        (
+            "t.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n",
+            "must be an undamaged .ply file|coefficient",
+        ),
+    ],
+)
+def test_damaged_files_are_refused_by_their_name(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"(?s){name}.*{message}"):
+        harmonic.import_transfer(path, MESH, convention=None if name == "t.npz" else Convention())
+
+
+def test_pipes_in_place_of_transfer_are_refused(tmp_path):
+    for name in ("t.npz", "t.npy", "t.ply"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(ValueError, match=f"{name} must be a file of transfer .*, got a special file"):
+            harmonic.import_transfer(tmp_path / name, MESH)
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        harmonic.import_transfer(tmp_path / "u.npz", MESH)
