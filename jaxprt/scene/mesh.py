@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
 from jaxprt.scene.formats import mesh_file
-from jaxprt.scene.formats.geometry import Geometry
+from jaxprt.scene.formats.geometry import Geometry, rows_of
 from jaxprt.sphere import directions
 
 _CREASE = np.cos(np.radians(40))  # smallest cosine between a shared normal and that of each split vertex
@@ -47,14 +47,15 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
 
     Vertices and faces keep the order of the file, and no vertices are merged. Polygons are divided into fans of
     triangles. An OBJ vertex is split where its corners differ in normal or texture coordinates. All meshes of a glTF
-    file's default scene are transformed by their nodes and joined, and its tangents are kept. Texture coordinates are 0
-    where only some geometries of the file have them or they are not finite. All faces of an OBJ material or group must
-    have them; if they refer to texture coordinates that do not exist, the material is loaded without them, with a
-    warning.
+    file's default scene are transformed by their nodes and joined, and its tangents are kept. Its buffers must be in
+    its folder; `load_scene` can read others. Texture coordinates are 0 where only some geometries of the file have them
+    or they are not finite. All faces of an OBJ material or group must have them; if they refer to texture coordinates
+    that do not exist, the material is loaded without them, with a warning.
 
     Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
     weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
-    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces.
+    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces. So do primitives
+    of glTF files without normals, whose triangles get vertices of their own, as the specification says.
 
     Args:
         path: The file.
@@ -165,18 +166,17 @@ def split(mesh: Mesh) -> list[Mesh]:
             f"the corners of a face must be in one region, got {mixed.size} of {len(face)} faces with corners in "
             f"several, the first is face {mixed[0]} in the regions {corner[mixed[0]].tolist()}"
         )
+    frame = [np.asarray(field) for field in (mesh.position, mesh.normal, mesh.tangent)]
+    place = None if mesh.texture is None else np.asarray(mesh.texture)
+    index = np.zeros(len(region), np.int32)
     parts = []
-    for number in np.unique(region):
-        own = np.flatnonzero(region == number)
-        index = np.zeros(len(region), np.int32)
-        index[own] = np.arange(len(own))
-        own_face = index[face[corner[:, 0] == number]]
-        position, normal, tangent = (
-            jax.device_put(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
-        )
-        texture = None if mesh.texture is None else jax.device_put(np.asarray(mesh.texture)[own])
-        own_face, zero = (jax.device_put(each) for each in (own_face, np.zeros(len(own), np.int32)))
-        parts.append(Mesh(position, own_face, normal, tangent, zero, texture))
+    used = np.unique(region)
+    for vertices, faces in zip(rows_of(region, used), rows_of(corner[:, 0], used), strict=True):
+        index[vertices] = np.arange(len(vertices))
+        position, normal, tangent = (jax.device_put(field[vertices]) for field in frame)
+        texture = None if place is None else jax.device_put(place[vertices])
+        zero = jax.device_put(np.zeros(len(vertices), np.int32))
+        parts.append(Mesh(position, jax.device_put(index[face[faces]]), normal, tangent, zero, texture))
     return parts
 
 
