@@ -11,8 +11,8 @@ import warnings
 import numpy as np
 import pytest
 
-from jaxprt.cli import inputs as command_inputs
 from jaxprt.cli import info, play
+from jaxprt.cli import inputs as command_inputs
 from jaxprt.files import inputs, write_png
 from jaxprt.scene import load_mesh, load_scene
 from tests.scene.formats.gltf_writer import PLACE, SQUARE, Writer, one
