@@ -52,7 +52,8 @@ class Elements(NamedTuple):
 
     def numbers(self, index: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Elements in float64. Normalized integers are mapped to [0, 1] or [-1, 1]."""
-        value = self.rows(index).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
+            value = self.rows(index).astype(np.float64)
         return np.maximum(value / self.most, -1) if self.most else value
 
 

@@ -279,6 +279,14 @@ def test_images_that_cannot_be_read_are_left_out_and_named(tmp_path):
         load_scene(writer.write(path))
 
 
+def test_signaling_nans_are_refused_like_others(tmp_path):
+    position = SQUARE.copy()
+    position.view(np.uint32)[1, 2] = 0x7FA00000
+    writer = one((writer := Writer()).square(POSITION=position), writer=writer)
+    with pytest.raises(ValueError, match=r"a\.glb: positions must be finite, got 1 of 4"):
+        load_scene(writer.write(tmp_path / "a.glb"))
+
+
 def test_names_of_materials_can_be_written_to_files(tmp_path):
     writer = one((writer := Writer()).square(material=0), writer=writer)
     for name, expected in (("\ud800x", "?x"), (7, "7"), ("", "material 0"), (None, "material 0"), ("häuser", "häuser")):
