@@ -45,6 +45,7 @@ _NAMES = 6  # most names of a file's materials that the text lists
     metavar="N",
     help="Texels along the edge of the cubemap faces whose brightest texels are counted.",
 )
+@options.outside
 @options.as_json
 def command(**given: Any) -> None:
     """Describe the content of files: meshes and scenes, environments, BRDFs, and folders written by jaxprt.
@@ -68,7 +69,7 @@ def command(**given: Any) -> None:
     found, refused = [], []
     for path in chosen.files:
         try:
-            found.append(about(path, chosen.light_size))
+            found.append(about(path, chosen.light_size, outside=chosen.outside))
         except (ValueError, OSError) as error:
             refused.append(options.said(error))
     options.tell(found, "\n".join(map(_text, found)), as_json=chosen.as_json)
@@ -96,7 +97,7 @@ def _installed(here: dict[str, Any]) -> str:
     return f"{versions}, Python {here['python']}\ndevice {here['platform']}, {here['device']}\ncompiler {sums}"
 
 
-def about(path: Path, light_size: int) -> dict[str, Any]:
+def about(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
     """Describes the content of a file or folder, as JSON.
 
     Raises:
@@ -104,25 +105,25 @@ def about(path: Path, light_size: int) -> dict[str, Any]:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = {"path": str(path), **_about(path, light_size)}
+        found = {"path": str(path), **_about(path, light_size, outside)}
     if caught:
         found["left_out"] = [str(each.message) for each in caught]
     return found
 
 
-def _about(path: Path, light_size: int) -> dict[str, Any]:
+def _about(path: Path, light_size: int, outside: bool) -> dict[str, Any]:
     if path.is_dir():
         return _folder(path)
     kind = inputs.kind(path)
     if kind == "mesh":
-        return _scene(path)
+        return _scene(path, outside)
     if kind == "light":
         return _light(path, light_size)
     return _brdf(path)
 
 
-def _scene(path: Path) -> dict[str, Any]:
-    scene = load_scene(path)
+def _scene(path: Path, outside: bool) -> dict[str, Any]:
+    scene = load_scene(path, outside=outside)
     low, high = (np.asarray(each, float).tolist() for each in bounds(scene.mesh))
     parts = [
         {

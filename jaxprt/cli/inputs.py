@@ -63,7 +63,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
 
     Args:
-        options: Object with `files`, `up`, `ground`, `brdf` and `material`.
+        options: Object with `files`, `outside`, `up`, `ground`, `brdf` and `material`.
         playable: Whether to make materials changeable for the viewer. Parts without a material become plastic.
 
     Raises:
@@ -153,7 +153,8 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
 
 def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
     """The scenes of all files as one upright scene, with a ground if requested."""
-    turn, every = np.array(UPRIGHT[options.up]), [load_scene(path) for path in paths]
+    turn = np.array(UPRIGHT[options.up])
+    every = [load_scene(path, outside=options.outside) for path in paths]
     parts = [part for each in every for part in each.parts]
     names = numbered([part.name for part in parts])
     if options.up != "y":

@@ -219,6 +219,7 @@ def together(*decorators: Callable) -> Callable:
     return decorate
 
 
+outside = option("--outside", group="Scene", is_flag=True, help="Let scenes read files outside of their folders.")
 scene = together(
     click.argument("files", metavar="[FILE]...", type=click.Path(exists=True, path_type=Path), nargs=-1),
     option(
@@ -230,6 +231,7 @@ scene = together(
         help="Axis of the meshes that points up.",
     ),
     option("--ground", group="Scene", is_flag=True, help="Stand the meshes on a diffuse ground plane."),
+    outside,
     option(
         "--brdf",
         group="Scene",

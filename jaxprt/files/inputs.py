@@ -1,6 +1,7 @@
 """Input files: only regular ones that fit into memory, and, for what a scene refers to, only those in its folder."""
 
 import collections
+import errno
 import json
 import pathlib
 import stat
@@ -18,7 +19,8 @@ def check(path: pathlib.Path, what: str) -> None:
 
     Raises:
         FileNotFoundError: Nothing has this name.
-        ValueError: It is a directory, a pipe, a device or a socket.
+        ValueError: It is a directory, a pipe, a device or a socket; or the name is too long, has a null character, or
+            is a link that leads to itself.
     """
     try:
         mode = path.stat().st_mode
@@ -26,6 +28,10 @@ def check(path: pathlib.Path, what: str) -> None:
         raise FileNotFoundError(f"{path} must be {what}, and there is no such file") from error
     except ValueError as error:  # a null character
         raise ValueError(f"{str(path)!r} must be the path of {what}, got one that no file can have") from error
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise
+        raise ValueError(f"{str(path)[:200]!r} must be the path of {what}, got one with {error.strerror}") from error
     if not stat.S_ISREG(mode):
         raise ValueError(f"{path} must be {what}, got a {'directory' if stat.S_ISDIR(mode) else 'special file'}")
 
@@ -74,7 +80,8 @@ def inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outside: boo
     if not target.is_relative_to(home):
         raise ValueError(
             f"{owner} must refer to files in the folder of the scene, {home}, got {target}, which is outside of it: "
-            "move the file into the folder, or call load_scene(path, outside=True) if you trust the scene"
+            "move the file into the folder or, if you trust the scene, call load_scene(path, outside=True) or give "
+            "--outside to the command"
         )
     return path
 
@@ -111,3 +118,22 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = counts.most_common(1)[0][0]
         raise ValueError(f"the name {twice[:80]!r} twice in one object")
     return result
+
+
+def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str, outside: bool) -> pathlib.Path:
+    r"""The path of a file that a scene names, with the checks of `inside`.
+
+    A \ may separate folders, as on Windows, or belong to a name, as elsewhere. The file must be inside either way.
+
+    Args:
+        name: Name of the file in the scene.
+        base: Folder to which names are relative.
+        folder: Folder of the scene.
+        owner: What refers to the file, for the message: "scene.gltf, image 2".
+        outside: Whether files outside of the folder of the scene are allowed.
+
+    Raises:
+        ValueError: The file is outside of the folder. The message names the file.
+    """
+    inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
+    return inside(base / name, folder, owner=owner, outside=outside)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from jaxprt.scene import origin as origins
 from jaxprt.scene.formats import mesh_file
-from jaxprt.scene.formats.geometry import Geometry
+from jaxprt.scene.formats.geometry import Geometry, rows_of
 from jaxprt.scene.normals import vertex_normals
 from jaxprt.sphere import directions
 
@@ -56,14 +56,15 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     they are rounded to float32. Vertices and faces keep the order of the file, and no vertices are merged. Polygons are
     divided into triangles of the same orientation: convex ones into fans, concave ones by ear clipping. A vertex is
     split where its corners differ in what the file states for corners or faces: normals or texture coordinates. All
-    meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept. Texture
-    coordinates are 0 where only some faces of the file have them or they are not finite. OBJ faces that refer to
-    texture coordinates or normals that do not exist are loaded without them, with a warning. Triangle strips of PLY
-    files become triangles.
+    meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept. Its
+    buffers must be in its folder; `load_scene` can read others. Texture coordinates are 0 where only some faces of the
+    file have them or they are not finite. OBJ faces that refer to texture coordinates or normals that do not exist are
+    loaded without them, with a warning. Triangle strips of PLY files become triangles.
 
     Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
     weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
-    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces.
+    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces. So do primitives
+    of glTF files without normals, whose triangles get vertices of their own, as the specification says.
 
     Args:
         path: The file.
@@ -199,18 +200,17 @@ def split(mesh: Mesh) -> list[Mesh]:
             f"the corners of a face must be in one region, got {mixed.size} of {len(face)} faces with corners in "
             f"several, the first is face {mixed[0]} in the regions {corner[mixed[0]].tolist()}"
         )
+    frame = [np.asarray(field) for field in (mesh.position, mesh.normal, mesh.tangent)]
+    place = None if mesh.texture is None else np.asarray(mesh.texture)
+    index = np.zeros(len(region), np.int32)
     parts = []
-    for number in np.unique(region):
-        own = np.flatnonzero(region == number)
-        index = np.zeros(len(region), np.int32)
-        index[own] = np.arange(len(own))
-        own_face = index[face[corner[:, 0] == number]]
-        position, normal, tangent = (
-            jax.device_put(np.asarray(field)[own]) for field in (mesh.position, mesh.normal, mesh.tangent)
-        )
-        texture = None if mesh.texture is None else jax.device_put(np.asarray(mesh.texture)[own])
-        own_face, zero = (jax.device_put(each) for each in (own_face, np.zeros(len(own), np.int32)))
-        parts.append(Mesh(position, own_face, normal, tangent, zero, texture, mesh.origin))
+    used = np.unique(region)
+    for vertices, faces in zip(rows_of(region, used), rows_of(corner[:, 0], used), strict=True):
+        index[vertices] = np.arange(len(vertices))
+        position, normal, tangent = (jax.device_put(field[vertices]) for field in frame)
+        texture = None if place is None else jax.device_put(place[vertices])
+        zero = jax.device_put(np.zeros(len(vertices), np.int32))
+        parts.append(Mesh(position, jax.device_put(index[face[faces]]), normal, tangent, zero, texture, mesh.origin))
     return parts
 
 

@@ -1,5 +1,6 @@
 """Scenes: meshes with materials, cameras, and lights."""
 
+import collections
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -186,8 +187,8 @@ class Scene(eqx.Module):
                 require.kind(f"each of the scene's {name}", each, kind, source=source)
         if not self.parts:
             raise ValueError("a scene must have at least one part, got none")
-        names = [each.name for each in (*self.parts, *self.point_lights)]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        count = collections.Counter(each.name for each in (*self.parts, *self.point_lights))
+        twice = sorted(name for name, times in count.items() if times > 1)
         if twice:
             raise ValueError(f"the parts of a scene must have different names, got several named {twice}")
 
@@ -239,12 +240,14 @@ def default_camera(scene: Scene, mesh: Mesh) -> Camera:
 def numbered(names: Sequence[str]) -> list[str]:
     """Makes names unique by appending numbers to repeated ones: "wood", "wood 2", "wood 3"."""
     taken: set[str] = set()
+    latest: dict[str, int] = {}  # the number that each name got last, because counting anew takes quadratic time
     result = []
     for name in names:
-        number, unique = 1, name
+        number, unique = latest.get(name, 1), name
         while unique in taken:
             number += 1
             unique = f"{name} {number}"
+        latest[name] = number
         taken.add(unique)
         result.append(unique)
     return result

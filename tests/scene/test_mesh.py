@@ -40,10 +40,15 @@ def ball(**options):
     return trimesh.creation.icosphere(subdivisions=2, **options)
 
 
+def export(mesh, path):
+    """Writes a mesh; a glTF file with normals, since its triangles would be separate without."""
+    mesh.export(path, **({"include_normals": True} if path.suffix == ".glb" else {}))
+
+
 @pytest.mark.parametrize("suffix", ["ply", "obj", "off", "glb"])
 def test_a_ball_comes_back_from_every_format_with_its_vertices_in_order(tmp_path, suffix, close):
     source = ball()
-    source.export(tmp_path / f"ball.{suffix}")
+    export(source, tmp_path / f"ball.{suffix}")
     mesh = load_mesh(tmp_path / f"ball.{suffix}")
     close(mesh.position, source.vertices, tolerance=1e-6)
     np.testing.assert_array_equal(mesh.face, source.faces)
@@ -56,7 +61,7 @@ def test_texture_coordinates_come_back_and_follow_joining_splitting_and_turning(
     source = ball()
     place = np.random.default_rng(0).uniform(-1, 2, (len(source.vertices), 2))
     source.visual = trimesh.visual.TextureVisuals(uv=place)
-    source.export(tmp_path / f"ball.{suffix}")
+    export(source, tmp_path / f"ball.{suffix}")
     mesh = load_mesh(tmp_path / f"ball.{suffix}")
     close(mesh.texture, place, tolerance=1e-5)
     plain = builtin.plane(cells=2)
@@ -85,20 +90,26 @@ def test_texture_coordinates_of_a_gltf_in_whole_numbers_are_fractions(tmp_path, 
     stride = max(4, 2 * raw.itemsize)
     packed = b"".join(row.tobytes().ljust(stride, b"\0") for row in raw)
     position, face = SQUARE.astype(np.float32).tobytes(), SQUARE_FACE.astype(np.uint16).tobytes()
-    data = position + packed + face
+    data = position + packed + face + np.tile(np.float32([0, 0, 1]), (4, 1)).tobytes()
     views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(position)}]
     views += [{"buffer": 0, "byteOffset": len(position), "byteLength": len(packed), "byteStride": stride}]
     views += [{"buffer": 0, "byteOffset": len(position) + len(packed), "byteLength": len(face)}]
+    views += [{"buffer": 0, "byteOffset": len(position) + len(packed) + len(face), "byteLength": 48}]
     accessors = [{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}]
     accessors += [{"bufferView": 1, "componentType": kind, "normalized": True, "count": 4, "type": "VEC2"}]
     accessors += [{"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"}]
+    accessors += [{"bufferView": 3, "componentType": 5126, "count": 4, "type": "VEC3"}]
     uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
     header = {
         **{"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]},
         **{"materials": [{"name": "a"}], "bufferViews": views, "accessors": accessors},
         "buffers": [{"byteLength": len(data)} | ({"uri": uri} if suffix == "gltf" else {})],
         "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]},
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0, "NORMAL": 3, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+                ]
+            },
         ],
     }
     text = json.dumps(header).encode()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxprt.scene import texture
-from jaxprt.scene.formats.geometry import Geometry
+from jaxprt.scene.formats.geometry import Geometry, rows_of
 from jaxprt.scene.material import TexturedMaterial
 from jaxprt.scene.mesh import Mesh, brush, from_file, split
 from jaxprt.scene.scene import Part, numbered
@@ -33,14 +33,16 @@ def split_parts(
     meshes = split(from_file(geometry, path))
     if len(meshes) != len(names):
         raise ValueError(f"{path} must have {len(names)} materials, got {len(meshes)}")
+    region = np.zeros(len(geometry.position), int) if geometry.region is None else geometry.region
+    vertices = rows_of(region, np.arange(len(names)))
     return [
-        _part(name, mesh, material, geometry, number)
-        for number, (name, mesh, material) in enumerate(zip(numbered(names), meshes, materials, strict=True))
+        _part(name, mesh, material, geometry, own)
+        for name, mesh, material, own in zip(numbered(names), meshes, materials, vertices, strict=True)
     ]
 
 
-def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, region: int) -> Part:
-    own = geometry.region == region
+def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, own: np.ndarray) -> Part:
+    """A part of some vertices of a file's geometry."""
 
     def rows(value: np.ndarray | None, plain: int) -> np.ndarray | None:
         """The part's rows of a vertex attribute; None if all have the default value."""

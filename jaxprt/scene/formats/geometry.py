@@ -65,19 +65,42 @@ def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
     """
     if np.array_equal(matrix, np.eye(4)):
         return geometry
-    linear = np.asarray(matrix, np.float64)[:3, :3]
-    cofactor = np.stack([np.cross(linear[i - 2], linear[i - 1]) for i in range(3)])
-    sign = -1 if np.linalg.det(linear) < 0 else 1
-    handedness = geometry.handedness
-    if sign < 0 and geometry.tangent is not None:
-        handedness = -(np.ones(len(geometry.position)) if handedness is None else handedness)
-    return geometry._replace(
-        position=geometry.position @ linear.T + matrix[:3, 3],
-        face=geometry.face[:, ::sign],
-        normal=None if geometry.normal is None else sign * geometry.normal @ cofactor.T,
-        tangent=None if geometry.tangent is None else geometry.tangent @ linear.T,
-        handedness=handedness,
-    )
+    return instances(geometry, np.asarray(matrix, np.float64)[None])[0]
+
+
+def instances(geometry: Geometry, matrices: np.ndarray) -> list[Geometry]:
+    """Applies each of several affine transforms [n 4 4] to a geometry, as `placed` does."""
+    linear, shift = matrices[:, :3, :3], matrices[:, None, :3, 3]
+    columns = linear.transpose(0, 2, 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
+        mirrored = np.linalg.det(linear) < 0
+        position = geometry.position @ columns + shift
+        normal = tangent = [None] * len(matrices)
+        if geometry.normal is not None:
+            cofactor = cofactors(linear) * np.where(mirrored, -1, 1)[:, None, None]
+            normal = geometry.normal @ cofactor.transpose(0, 2, 1)
+        if geometry.tangent is not None:
+            tangent = geometry.tangent @ columns
+    face = (geometry.face, geometry.face[:, ::-1])
+    handedness = (geometry.handedness, geometry.handedness)
+    if geometry.tangent is not None:
+        plain = np.ones(len(geometry.position)) if geometry.handedness is None else geometry.handedness
+        handedness = (geometry.handedness, -plain)
+    return [
+        geometry._replace(
+            position=position[row],
+            face=face[flip],
+            normal=normal[row],
+            tangent=tangent[row],
+            handedness=handedness[flip],
+        )
+        for row, flip in enumerate(mirrored.astype(int).tolist())
+    ]
+
+
+def cofactors(linear: np.ndarray) -> np.ndarray:
+    """Cofactor matrices of linear maps [n 3 3], which transform normals, also where a map is singular."""
+    return np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
 
 
 def split_corners(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -113,6 +136,17 @@ def joined(geometries: Sequence[Geometry]) -> Geometry:
     face = np.concatenate([each.face + first for each, first in zip(geometries, start[:-1], strict=True)])
     field = {name: _column(geometries, name, *missing) for name, missing in _MISSING.items()}
     return Geometry(np.concatenate([each.position for each in geometries]), face, **field)
+
+
+def rows_of(region: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
+    """Indices of the rows of each region, in ascending order. They are sorted once, whatever the number of regions.
+
+    Args:
+        region: Number of the region of each row.
+        numbers: The regions, in ascending order.
+    """
+    order = np.argsort(region, kind="stable")
+    return np.split(order, np.searchsorted(region[order], numbers[1:]))
 
 
 def _column(geometries: Sequence[Geometry], name: str, shape: tuple[int, ...], value: float) -> np.ndarray | None:

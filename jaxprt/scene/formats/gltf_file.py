@@ -1,144 +1,148 @@
-"""The container format of glTF 2.0: JSON header, buffers, accessors and images, in GLB files or separate files.
+"""The container format of glTF 2.0: buffers, accessors and images, in GLB files or separate files.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
 
 import base64
 import contextlib
-import json
-import math
+import functools
 import pathlib
+import re
 import struct
 import urllib.parse
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxprt.files import inputs
+from jaxprt.scene.formats.gltf_header import Header, excerpt
+
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
-_MOST = 2**28  # most elements of an accessor
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")  # of a URI that is not relative
 
 
-class Document:
-    """A glTF file. Its objects are looked up by index; errors name the file and the object.
+class Elements(NamedTuple):
+    """The elements of an accessor, as they lie in the buffer. They are copied only where they are used.
 
     Attributes:
-        path: The file.
-        header: The JSON object.
+        value: The elements in their own type [count width].
+        place: Numbers of the elements that a sparse accessor replaces, in ascending order; may be empty.
+        replacement: What replaces them.
+        most: Largest value of normalized integers, which stands for 1; 0 for other numbers.
     """
 
-    def __init__(self, path: pathlib.Path):
-        """Reads the header and the binary chunk of a GLB. Other files are read when they are needed."""
+    value: np.ndarray
+    place: np.ndarray
+    replacement: np.ndarray
+    most: int
+
+    def rows(self, index: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Elements in their own type."""
+        value = self.value[index]
+        if len(self.place):
+            number = np.arange(len(self.value))[index] if isinstance(index, slice) else index
+            rank = np.searchsorted(self.place, number, side="right") - 1
+            replaced = (rank >= 0) & (self.place[np.maximum(rank, 0)] == number)
+            value = np.where(replaced[:, None], self.replacement[np.maximum(rank, 0)], value)
+        return value
+
+    def numbers(self, index: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Elements in float64. Normalized integers are mapped to [0, 1] or [-1, 1]."""
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
+            value = self.rows(index).astype(np.float64)
+        return np.maximum(value / self.most, -1) if self.most else value
+
+
+class Document(Header):
+    """A glTF file. Its objects are looked up by index; errors name the file and the object."""
+
+    def __init__(self, path: pathlib.Path, *, outside: bool = False):
+        """Reads the header and the binary chunk of a GLB. Other files are read when they are needed.
+
+        Args:
+            path: The file.
+            outside: Whether buffers and images may be files outside of the folder of the file.
+        """
         self.path = path
+        self._outside = outside
         self._buffer: dict[int, bytes] = {}
-        content = path.read_bytes()
-        text: bytes = content
+        self._view: dict[int, tuple[memoryview, int]] = {}
+        text = content = inputs.content(path, "a glTF file")
+        self._length = len(content)
         self._chunk: bytes | None = None
         if path.suffix.lower() == ".glb" or content.startswith(b"glTF"):
             text, self._chunk = self._chunks(content)
-        try:
-            self.header = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise self.error("must be an undamaged glTF file", f"a header that is not JSON: {error}") from error
-        version = str(self.header.get("asset", {}).get("version", "none")) if isinstance(self.header, dict) else "none"
-        if not version.startswith("2."):
-            raise self.error("must be an undamaged glTF file of version 2", f"version {version}")
+        super().__init__(path, text)
 
-    def error(self, required: str, got: str) -> ValueError:
-        """An error that names the file."""
-        return ValueError(f"{self.path} {required}, got {got}")
-
-    def items(self, kind: str) -> list:
-        """All objects of a kind, such as "meshes"; may be empty."""
-        found = self.header.get(kind, [])
-        if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
-            raise self.error(f"must be an undamaged glTF file with a list of {kind}", str(type(found).__name__))
-        return found
-
-    def item(self, kind: str, index: Any, owner: str) -> dict[str, Any]:
-        """One object of a kind.
-
-        Args:
-            kind: The kind, such as "meshes".
-            index: Its index, as found in the file.
-            owner: The object that refers to it, for error messages.
-
-        Raises:
-            ValueError: There is no object with this index.
-        """
-        found = self.items(kind)
-        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
-            raise self.error(f"must refer to one of its {len(found)} {kind} in {owner}", repr(index))
-        return found[index]
-
-    def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-        """Checks numbers of the header and converts them to float64.
-
-        Raises:
-            ValueError: The numbers have another shape or are not finite.
-        """
-        try:
-            array = np.asarray(value)
-            right = array.dtype.kind in "iuf" and array.shape == shape and bool(np.isfinite(array).all())
-        except ValueError:
-            right = False
-        if not right:
-            must = f"{math.prod(shape)} finite numbers" if shape else "a finite number"
-            raise self.error(f"must have {must} for {what}", repr(value))
-        return np.asarray(value, np.float64)
-
-    def view(self, index: Any, owner: str) -> tuple[memoryview, int]:
+    def view(self, value: Any, owner: str) -> tuple[memoryview, int]:
         """The bytes of a buffer view, and its stride; 0 if elements are contiguous."""
-        item = self.item("bufferViews", index, owner)
-        content = self._content(item.get("buffer"), f"buffer view {index}")
-        start, length = item.get("byteOffset", 0), item["byteLength"]
-        if start < 0 or length < 0 or start + length > len(content):
-            need = f"must have buffers of at least {start + length} bytes for buffer view {index}"
-            raise self.error(need, f"{len(content)} bytes in buffer {item.get('buffer')}")
-        return memoryview(content)[start : start + length], item.get("byteStride", 0)
+        index = self.index("bufferViews", value, owner)
+        if index not in self._view:
+            item, name = self.items("bufferViews")[index], f"buffer view {index}"
+            content = self._content(item, name)
+            start = self.integer(item, "byteOffset", name, 0)
+            end = start + self.integer(item, "byteLength", name)
+            if end > len(content):
+                got = f"{len(content)} bytes in buffer {item['buffer']}"
+                raise self.error(f"must have buffers of at least {end} bytes for {name}", got)
+            self._view[index] = memoryview(content)[start:end], self.integer(item, "byteStride", name, 0)
+        return self._view[index]
 
-    def accessor(self, index: Any, owner: str, *widths: int, whole: bool = False) -> np.ndarray:
+    def accessor(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Elements:
         """The elements of an accessor (section 3.6.2).
 
         Args:
-            index: Its index.
+            value: Its index, as it stands in the file.
             owner: The object that refers to it, for error messages.
             widths: Allowed numbers of components of an element.
             whole: Whether the elements must be integers, such as indices.
 
-        Returns:
-            An array [count, width], in float64 unless `whole`. Normalized integers are mapped to [0, 1] or [-1, 1].
-
         Raises:
-            ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type.
+            ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type; or it
+                has no buffer view and more elements than the file and its buffers have bytes.
         """
-        item, name = self.item("accessors", index, owner), f"accessor {index} ({owner})"
-        width, count, kind = _WIDTH.get(item["type"], 0), item["count"], item["componentType"]
+        index = self.index("accessors", value, owner)
+        item, name = self.items("accessors")[index], f"accessor {index} ({owner})"
+        kind, form = self.integer(item, "componentType", name), self.string(item, "type", name)
+        count, width = self.integer(item, "count", name), _WIDTH.get(form, 0)
         if width not in widths or kind not in _COMPONENT or (whole and kind == 5126):
             must = f"must have {' or '.join(map(str, widths))} {'whole ' if whole else ''}numbers per element"
-            raise self.error(f"{must} in {name}", f"type {item['type']!r} of component type {kind!r}")
-        if not isinstance(count, int) or not 0 < count <= _MOST:
-            raise self.error(f"must have 1 to {_MOST} elements in {name}", repr(count))
+            raise self.error(f"{must} in {name}", f"type {excerpt(form)} of component type {kind}")
+        if count < 1:
+            raise self.error(f"must have 1 or more elements in {name}", str(count))
         dtype = np.dtype(_COMPONENT[kind])
-        value = np.zeros((count, width), dtype)
         if "bufferView" in item:
-            value = self._strided(item, name, dtype, (count, width))
+            array = self._strided(item, name, dtype, (count, width))
+        else:
+            # Zeros need no memory here, but a geometry of them does. Another attribute of the same vertices takes at
+            # least one byte of the file for each vertex.
+            if count > self._size:
+                must = f"must have a buffer view for {name}, or at most {self._size} elements, one for each byte of"
+                raise self.error(f"{must} the file and its buffers", f"{count} elements without one")
+            array = np.broadcast_to(np.zeros((1, width), dtype), (count, width))
+        place, replacement = np.zeros(0, np.int64), array[:0]
         if "sparse" in item:
-            value = self._sparse(item["sparse"], name, value)
-        if whole:
-            return value
-        if item.get("normalized", False) and dtype.kind in "iu":
-            return np.maximum(value.astype(np.float64) / np.iinfo(dtype).max, -1)
-        return value.astype(np.float64)
+            place, replacement = self._sparse(self.object(item, "sparse", name), name, array)
+        normalized = self.boolean(item, "normalized", name) and dtype.kind in "iu"
+        return Elements(array, place, replacement, int(np.iinfo(dtype).max) if normalized else 0)
 
-    def image(self, index: Any, owner: str) -> bytes:
+    def image(self, value: Any, owner: str) -> bytes:
         """The bytes of an image, embedded or in a separate file."""
-        item = self.item("images", index, owner)
+        index = self.index("images", value, owner)
+        item = self.items("images")[index]
         if "bufferView" in item:
             return bytes(self.view(item["bufferView"], f"image {index}")[0])
         return self._resource(item.get("uri"), f"image {index}")
+
+    @functools.cached_property
+    def _size(self) -> int:
+        """Bytes of the file and of the files of its buffers."""
+        separate = [number for number, item in enumerate(self.items("buffers")) if "uri" in item]
+        return self._length + sum(len(self._bytes(number)) for number in separate)
 
     def _chunks(self, content: bytes) -> tuple[bytes, bytes | None]:
         """The header and the binary chunk of a GLB (section 4)."""
@@ -159,74 +163,91 @@ class Document:
             place += 8 + extent
         return content[20 : 20 + size], binary
 
-    def _content(self, index: Any, owner: str) -> bytes:
+    def _content(self, view: dict[str, Any], name: str) -> bytes:
+        """The bytes of the buffer of a buffer view. Compressed views have a fallback, which may be empty."""
+        index = self.index("buffers", view.get("buffer"), name)
+        item = self.items("buffers")[index]
+        compressed = [key for key in MESHOPT if key in self.object(view, "extensions", name)]
+        compressed += [key for key in MESHOPT if key in self.object(item, "extensions", f"buffer {index}")]
+        if compressed and "uri" not in item and (index or self._chunk is None):
+            got = f"{compressed[0]} in {name}, whose fallback, buffer {index}, has no data"
+            raise self.error("must have uncompressed geometry", got)
+        return self._bytes(index)
+
+    def _bytes(self, index: int) -> bytes:
         """The bytes of a buffer."""
-        item = self.item("buffers", index, owner)
         if index not in self._buffer:
+            item, name = self.items("buffers")[index], f"buffer {index}"
             if "uri" in item:
-                content = self._resource(item["uri"], f"buffer {index}")
+                content = self._resource(item["uri"], name)
             elif index == 0 and self._chunk is not None:
                 content = self._chunk
             else:
-                raise self.error(f"must have the bytes of buffer {index}", "neither a file nor a binary chunk")
-            if len(content) < item["byteLength"]:
-                raise self.error(f"must have {item['byteLength']} bytes in buffer {index}", f"{len(content)} bytes")
+                raise self.error(f"must have the bytes of {name}", "neither a file nor a binary chunk")
+            length = self.integer(item, "byteLength", name)
+            if len(content) < length:
+                raise self.error(f"must have {length} bytes in {name}", f"{len(content)} bytes")
             self._buffer[index] = content
         return self._buffer[index]
 
     def _resource(self, uri: Any, owner: str) -> bytes:
         """The data of a URI: embedded in it, or in a file relative to the glTF file."""
         if not isinstance(uri, str) or not uri:
-            raise self.error(f"must name a file or hold data in {owner}", repr(uri))
-        if uri.startswith("data:"):
+            raise self.error(f"must name a file or hold data in {owner}", excerpt(uri))
+        if uri[:5].lower() == "data:":
             kind, _, data = uri.partition(",")
             plain = urllib.parse.unquote_to_bytes(data)
             try:
                 return base64.b64decode(plain, validate=True) if kind.endswith(";base64") else plain
             except ValueError as error:
                 raise self.error(f"must have undamaged base64 data in {owner}", str(error)) from error
-        if "://" in uri:
-            raise self.error(f"must name a file beside it in {owner}", repr(uri))
-        path = self.path.parent / urllib.parse.unquote(uri)
-        if not path.is_file():
-            raise FileNotFoundError(f"{self.path} needs the file {path} for {owner}, which does not exist")
-        return path.read_bytes()
+        if _SCHEME.match(uri):
+            raise self.error(f"must name a file beside it in {owner}", excerpt(uri))
+        name, folder = urllib.parse.unquote(uri), self.path.parent
+        owner_name = f"{self.path}, {owner}"
+        path = inputs.reference(name, folder, folder=folder, owner=owner_name, outside=self._outside)
+        return inputs.content(path, f"the file that {self.path} needs for {owner}")
 
     def _strided(self, item: dict[str, Any], name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
-        """A copy of the elements of a buffer view."""
-        content, stride = self.view(item["bufferView"], name)
-        offset, size = item.get("byteOffset", 0), dtype.itemsize * shape[1]
+        """The elements of a buffer view, without a copy."""
+        content, stride = self.view(item.get("bufferView"), name)
+        offset, size = self.integer(item, "byteOffset", name, 0), dtype.itemsize * shape[1]
         stride = stride or size
         end = offset + stride * (shape[0] - 1) + size
-        if offset < 0 or stride < size or end > len(content):
+        if stride < size or end > len(content):
             raise self.error(
                 f"must keep {name} inside buffer view {item['bufferView']} of {len(content)} bytes",
                 f"{shape[0]} elements of {size} bytes each {stride} bytes from byte {offset} on, which end at {end}",
             )
-        return np.ndarray(shape, dtype, content, offset, (stride, dtype.itemsize)).copy()
+        return np.ndarray(shape, dtype, content, offset, (stride, dtype.itemsize))
 
-    def _sparse(self, item: dict[str, Any], name: str, value: np.ndarray) -> np.ndarray:
-        """Elements with the replacements of a sparse accessor (section 3.6.2.3)."""
-        count, kind = item["count"], item["indices"]["componentType"]
-        if not isinstance(count, int) or not 0 < count <= len(value) or kind not in (5121, 5123, 5125):
-            got = f"{count!r} of component type {kind!r}"
+    def _sparse(self, item: dict[str, Any], name: str, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the elements that a sparse accessor replaces, and what replaces them (section 3.6.2.3)."""
+        indices, values = self.object(item, "indices", name), self.object(item, "values", name)
+        count, kind = self.integer(item, "count", name), self.integer(indices, "componentType", name)
+        if not 0 < count <= len(value) or kind not in (5121, 5123, 5125):
+            got = f"{count} of component type {kind}"
             raise self.error(f"must replace 1 to {len(value)} elements, numbered by unsigned integers, in {name}", got)
-        index = self._strided(item["indices"], name, np.dtype(_COMPONENT[kind]), (count, 1))[:, 0]
-        if index.max() >= len(value):
-            raise self.error(f"must replace elements 0 to {len(value) - 1} in {name}", f"element {index.max()}")
-        value[index] = self._strided(item["values"], name, value.dtype, (count, value.shape[1]))
-        return value
+        place = self._strided(indices, name, np.dtype(_COMPONENT[kind]), (count, 1))[:, 0].astype(np.int64)
+        if place.max() >= len(value):
+            raise self.error(f"must replace elements 0 to {len(value) - 1} in {name}", f"element {place.max()}")
+        order = np.argsort(place, kind="stable")
+        return place[order], self._strided(values, name, value.dtype, (count, value.shape[1]))[order]
 
 
 @contextlib.contextmanager
 def damage_named(path: pathlib.Path) -> Iterator[None]:
-    """Converts errors caused by damaged headers into an error that names the file."""
+    """Makes all errors that a damaged file causes name the file."""
+    must = f"{path} must be an undamaged glTF file"
     try:
         yield
     except KeyError as error:
-        raise ValueError(
-            f"{path} must be an undamaged glTF file, got one that lacks {error} where it is needed"
-        ) from error
-    except (IndexError, TypeError, AttributeError, OverflowError) as error:
-        detail = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path} must be an undamaged glTF file, got one that cannot be read: {detail}") from error
+        raise ValueError(f"{must}, got one that lacks {error} where it is needed") from error
+    except (IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{must}, got one that cannot be read: {type(error).__name__}: {error}") from error
+    except (ValueError, MemoryError) as error:
+        if str(path) in str(error):
+            raise
+        if isinstance(error, MemoryError):
+            raise MemoryError(f"{path}: {error}") from error
+        raise ValueError(f"{must}, got one that cannot be read: {error}") from error

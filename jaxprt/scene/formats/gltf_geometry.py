@@ -1,31 +1,64 @@
-"""Geometry of glTF files: nodes with their transforms, and the triangles of their meshes.
+"""Geometry of glTF files: the triangles of the meshes of all nodes, in world coordinates.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxprt.scene.formats.geometry import Geometry, joined, placed
-from jaxprt.scene.formats.gltf_file import Document
+from jaxprt import require
+from jaxprt.scene.formats import gltf_skin
+from jaxprt.scene.formats.geometry import Geometry, instances, joined
+from jaxprt.scene.formats.gltf_extensions import DRACO, check_required
+from jaxprt.scene.formats.gltf_file import Document, Elements
+from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joints, nodes
+from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
+# Attributes that are read, and their numbers of components.
+_ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "COLOR_0": (3, 4)}
+_ATTRIBUTES |= {"TEXCOORD_0": (2,), "TEXCOORD_1": (2,)}
+# Bytes for each vertex, its joints, each triangle, and each primitive of a node, while a scene is loaded, as measured.
+_VERTEX, _JOINTS, _FACE, _PART = 300, 350, 70, 3000
 
 
-class Placed(NamedTuple):
-    """A node with its transform to world coordinates.
+class Primitive(NamedTuple):
+    """Triangles of a mesh with one material, not yet read.
 
     Attributes:
-        node: Index of the node.
-        item: The JSON object of the node.
-        matrix: Transform from the node to world coordinates [4 4].
+        name: Name for messages.
+        material: Index of the material; None for the default one.
+        mode: How corners form triangles.
+        corner: Vertices of the corners; None if they are the vertices in order.
+        attribute: Attributes of the vertices by their names in the file.
+        joints: Number of sets of joints; 0 where no skin is used.
     """
 
-    node: int
-    item: dict[str, Any]
-    matrix: np.ndarray
+    name: str
+    material: int | None
+    mode: int
+    corner: Elements | None
+    attribute: dict[str, Elements]
+    joints: int
+
+    @property
+    def flat(self) -> bool:
+        """Whether each triangle has vertices and a normal of its own, because the file has no normals."""
+        return "NORMAL" not in self.attribute
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles."""
+        corners = len((self.corner or self.attribute["POSITION"]).value)
+        return corners // 3 if self.mode == _TRIANGLES else corners - 2
+
+    @property
+    def most_vertices(self) -> int:
+        """Upper bound of the number of used vertices."""
+        corners = 3 * self.face_count
+        return corners if self.flat else min(corners, len(self.attribute["POSITION"].value))
 
 
 class Contents(NamedTuple):
@@ -44,162 +77,212 @@ class Contents(NamedTuple):
     ignored: frozenset[str]
 
 
-def read(document: Document, *, groups: bool = False) -> Contents:
+def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | None = None) -> Contents:
     """Reads all triangles of the default scene in world coordinates. Instances of a mesh are repeated.
 
-    Vertices that no triangle of their primitive uses are removed. The others keep the order of the file.
+    Vertices that no triangle of their primitive uses are removed. The others keep the order of the file. Without
+    normals, each triangle has vertices and a flat normal of its own (section 3.7.2.1). Meshes with a skin are in the
+    pose of the file's joints.
 
     Args:
         document: The file.
         groups: Whether regions are nodes, in order of occurrence. Otherwise they are the used materials in ascending
             order, with primitives without material last.
+        scene: The nodes of the default scene; None reads them.
 
     Raises:
-        ValueError: The file is damaged, its geometry is compressed, or it has no triangles.
+        ValueError: The file is damaged, has no triangles, requires an unknown extension, or has compressed geometry.
+        MemoryError: The triangles do not fit into memory.
     """
-    _check_readable(document)
+    check_required(document, geometry=True)
+    scene = nodes(document) if scene is None else scene
+    drawn = [node for node in scene if "mesh" in node.item]
     ignored: set[str] = set()
-    mesh: dict[int, list[tuple[int | None, Geometry]]] = {}
-    part, label = [], []
-    for node, item, matrix in nodes(document):
-        if "mesh" not in item:
-            continue
-        index, owner = item["mesh"], f"node {node}"
-        if index not in mesh:
-            found = document.item("meshes", index, owner)
-            mesh[index] = _primitives(document, found, f"mesh {index}", ignored)
-        if "skin" in item:
-            ignored.add("skins")
-        for material, geometry in mesh[index]:
-            part.append(placed(geometry, matrix))
-            label.append(node if groups else material)
-    if not part:
+    mesh_of = [document.index("meshes", node.item["mesh"], f"node {node.number}") for node in drawn]
+    skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
+    primitives = {mesh: _primitives(document, mesh, mesh in skinned, ignored) for mesh in dict.fromkeys(mesh_of)}
+    _check_memory(document, drawn, mesh_of, primitives)
+    parts, labels = [], []
+    for node, primitive, geometry in _placements(document, scene, mesh_of, primitives, ignored):
+        parts.append(geometry)
+        labels.append(node.number if groups else primitive.material)
+    if not parts:
         extra = f" ({', '.join(sorted(ignored))} are not read)" if ignored else ""
         raise document.error("must hold vertices and faces", f"no faces{extra}")
-    order = list(dict.fromkeys(label))
+    order = list(dict.fromkeys(labels))
     if not groups:
-        order.sort(key=lambda each: len(document.items("materials")) if each is None else each)
-    rank = {each: number for number, each in enumerate(order)}
-    part = [
-        each._replace(region=np.full(len(each.position), rank[name])) for each, name in zip(part, label, strict=True)
-    ]
+        order.sort(key=lambda material: len(document.items("materials")) if material is None else material)
+    rank = {label: number for number, label in enumerate(order)}
+    region = np.repeat([rank[label] for label in labels], [len(part.position) for part in parts])
     lacking = {
-        (material, number)
-        for primitives in mesh.values()
-        for material, each in primitives
-        for number, place in enumerate((each.texture, each.second))
-        if place is None
+        (primitive.material, number)
+        for each in primitives.values()
+        for primitive in each
+        for number in (0, 1)
+        if f"TEXCOORD_{number}" not in primitive.attribute
     }
-    return Contents(joined(part), () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
+    geometry = joined(parts)._replace(region=region)
+    return Contents(geometry, () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
 
 
-def nodes(document: Document) -> list[Placed]:
-    """All nodes of the default scene, parents before their children.
-
-    Raises:
-        ValueError: A node is missing, is reached twice, or has a transform that is not finite.
-    """
-    found = []
-    waiting = [(index, np.eye(4), owner) for index, owner in reversed(_roots(document))]
-    seen = set()
-    while waiting:
-        index, above, owner = waiting.pop()
-        item = document.item("nodes", index, owner)
-        if index in seen:
-            raise document.error("must have nodes that form trees", f"node {index} twice, the second time in {owner}")
-        seen.add(index)
-        matrix = above @ _transform(document, item, f"node {index}")
-        found.append(Placed(index, item, matrix))
-        waiting += [(child, matrix, f"node {index}") for child in reversed(item.get("children", []))]
-    return found
-
-
-def _roots(document: Document) -> list[tuple[Any, str]]:
-    """Root nodes of the default scene, or else of the first scene; without scenes, of all nodes."""
-    if document.items("scenes"):
-        index = document.header.get("scene", 0)
-        scene = document.item("scenes", index, "the default scene")
-        return [(node, f"scene {index}") for node in scene.get("nodes", [])]
-    child = {child for node in document.items("nodes") for child in node.get("children", [])}
-    return [(node, "the file") for node in range(len(document.items("nodes"))) if node not in child]
-
-
-def _transform(document: Document, item: dict[str, Any], name: str) -> np.ndarray:
-    """A node's transform, from its matrix or its translation, rotation and scale (section 3.5.2)."""
-    if "matrix" in item:
-        return document.numbers(item["matrix"], (16,), f"the matrix of {name}").reshape(4, 4).T
-    rotation, scale, translation = (
-        document.numbers(item.get(key, default), (len(default),), f"the {key} of {name}")
-        for key, default in (("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)), ("translation", (0, 0, 0)))
-    )
-    length = np.linalg.norm(rotation)
-    if not length > 0:
-        raise document.error(f"must have a nonzero quaternion for the rotation of {name}", "zero")
-    x, y, z, w = rotation / length
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= scale
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def _check_readable(document: Document) -> None:
-    compressed = _COMPRESSED & set(document.header.get("extensionsRequired", []))
-    if compressed:
-        raise document.error("must have uncompressed geometry", ", ".join(sorted(compressed)))
-
-
-def _primitives(
-    document: Document, mesh: dict[str, Any], owner: str, ignored: set[str]
-) -> list[tuple[int | None, Geometry]]:
-    """Material and geometry of each primitive of a mesh, as far as it consists of triangles."""
-    found = []
-    for number, item in enumerate(mesh["primitives"]):
+def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str]) -> list[Primitive]:
+    """The primitives of a mesh that consist of triangles. Adds the names of what is not read to `ignored`."""
+    owner = f"mesh {mesh}"
+    primitives = []
+    for number, item in enumerate(document.array(document.items("meshes")[mesh], "primitives", owner)):
         name = f"primitive {number} of {owner}"
-        if item.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+        if not isinstance(item, dict):
+            raise document.error(f"must have an object for {name}", repr(item)[:80])
+        mode = document.integer(item, "mode", name, _TRIANGLES)
+        if mode > _FAN:
+            raise document.error(f"must have a mode from 0 to {_FAN} in {name}", str(mode))
+        if mode < _TRIANGLES:
             ignored.add("points and lines")
             continue
         if "targets" in item:
             ignored.add("morph targets")
         material = item.get("material")
         if material is not None:
-            document.item("materials", material, name)
-        found.append((material, _geometry(document, item, name, ignored)))
-    return found
+            material = document.index("materials", material, name)
+        attribute = document.object(item, "attributes", name)
+        ignored |= {
+            key for key in attribute if key.startswith(("TEXCOORD_", "COLOR_")) and key[-2:] not in ("_0", "_1")
+        }
+        ignored |= {"COLOR_1"} & set(attribute)
+        _check_uncompressed(document, item, name)
+        elements = _elements(document, attribute, skinned, name)
+        index = None
+        if "indices" in item:
+            index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)
+        corners = len((index or elements["POSITION"]).value)
+        if corners < 3 or (mode == _TRIANGLES and corners % 3):
+            must = "a multiple of three" if mode == _TRIANGLES else "three or more"
+            raise document.error(f"must have {must} corners of triangles in {name}", str(corners))
+        sets = sum(key.startswith("JOINTS_") for key in elements)
+        primitives.append(Primitive(name, material, mode, index, elements, sets))
+    return primitives
 
 
-def _geometry(document: Document, item: dict[str, Any], name: str, ignored: set[str]) -> Geometry:
-    """The triangles of a primitive (section 3.7.2)."""
-    attribute = item["attributes"]
-    ignored |= {key for key in attribute if key.startswith(("TEXCOORD_", "COLOR_")) and key[-2:] not in ("_0", "_1")}
-    ignored |= {"COLOR_1"} & set(attribute)
+def _elements(document: Document, attribute: dict[str, Any], skinned: bool, name: str) -> dict[str, Elements]:
+    """The attributes of a primitive that are read."""
+    if "POSITION" not in attribute:
+        raise document.error("must be an undamaged glTF file", f"one that lacks 'POSITION' in {name}")
+    widths = dict(_ATTRIBUTES)
+    sets = 0
+    while skinned and f"JOINTS_{sets}" in attribute and f"WEIGHTS_{sets}" in attribute:
+        widths |= {f"JOINTS_{sets}": (4,), f"WEIGHTS_{sets}": (4,)}
+        sets += 1
+    elements = {}
+    for key, width in widths.items():
+        if key in attribute:
+            whole = key.startswith("JOINTS_")
+            elements[key] = document.accessor(attribute[key], f"{key} of {name}", *width, whole=whole)
+            got, count = len(elements[key].value), len(elements["POSITION"].value)
+            if got != count:
+                raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(got))
+    return elements
 
-    def read_attribute(key: str, *widths: int) -> np.ndarray | None:
-        if key not in attribute:
-            return None
-        value = document.accessor(attribute[key], f"{key} of {name}", *widths)
-        if len(value) != count:
-            raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(len(value)))
-        return value
 
-    position = document.accessor(attribute["POSITION"], f"POSITION of {name}", 3)
-    count = len(position)
-    normal, tangent = read_attribute("NORMAL", 3), read_attribute("TANGENT", 4)
-    color = read_attribute("COLOR_0", 3, 4)
-    place = [read_attribute(f"TEXCOORD_{number}", 2) for number in (0, 1)]
+def _check_uncompressed(document: Document, item: dict[str, Any], name: str) -> None:
+    """Refuses a primitive whose geometry is only in a compressed form. Its accessors are then without data."""
+    if DRACO not in document.object(item, "extensions", name):
+        return
+    for value in [*item["attributes"].values(), *([item["indices"]] if "indices" in item else [])]:
+        if "bufferView" not in document.item("accessors", value, name):
+            got = f"{DRACO} in {name}, and accessor {value} has no uncompressed data"
+            raise document.error("must have uncompressed geometry", got)
+
+
+def _check_memory(
+    document: Document, drawn: Sequence[Node], mesh_of: Sequence[int], primitives: dict[int, list[Primitive]]
+) -> None:
+    """Refuses geometry that does not fit into memory, before it is read."""
+    size: dict[int, np.ndarray] = {}
+    for mesh, listed in primitives.items():
+        vertices, faces = (sum(getattr(each, name) for each in listed) for name in ("most_vertices", "face_count"))
+        joints = sum(each.most_vertices for each in listed if each.joints)
+        need = vertices * _VERTEX + joints * _JOINTS + faces * _FACE + len(listed) * _PART
+        size[mesh] = np.array([vertices, faces, need], object)  # Python's integers, which do not overflow
+    times = [instance_count(document, node) for node in drawn]
+    total = sum((count * size[mesh] for count, mesh in zip(times, mesh_of, strict=True)), np.zeros(3, object))
+    vertices, faces, need = total.tolist()
+    require.memory(
+        f"up to {vertices:,} vertices and {faces:,} triangles in {sum(times):,} meshes of {document.path}",
+        need,
+        "load a smaller part of the scene, or simplify its meshes",
+    )
+
+
+def _placements(
+    document: Document,
+    scene: Sequence[Node],
+    mesh_of: Sequence[int],
+    primitives: dict[int, list[Primitive]],
+    ignored: set[str],
+) -> Iterator[tuple[Node, Primitive, Geometry]]:
+    """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once."""
+    drawn = [node for node in scene if "mesh" in node.item]
+    matrices = [instance_matrices(document, node) for node in drawn]
+    together: dict[int, list[np.ndarray]] = {}
+    for mesh, matrix in zip(mesh_of, matrices, strict=True):
+        together.setdefault(mesh, []).append(matrix)
+    bound, placed = {}, {}
+    for mesh, listed in primitives.items():
+        pairs = [_geometry(document, primitive) for primitive in listed]
+        bound[mesh] = pairs
+        placed[mesh] = [iter(instances(geometry, np.concatenate(together[mesh]))) for geometry, _ in pairs]
+    skins = _joint_matrices(document, scene, mesh_of, primitives)
+    for node, mesh, matrix in zip(drawn, mesh_of, matrices, strict=True):
+        skin = skins.get(node.number)
+        for _ in matrix:
+            for primitive, (geometry, binding), rest in zip(primitives[mesh], bound[mesh], placed[mesh], strict=True):
+                here = next(rest)
+                if skin is not None and binding is not None:
+                    here = gltf_skin.pose(document, geometry, binding, skin, primitive.name)
+                    here = here._replace(normal=_face_normals(here.position)) if primitive.flat else here
+                yield node, primitive, here
+
+
+def _joint_matrices(
+    document: Document, scene: Sequence[Node], mesh_of: Sequence[int], primitives: dict[int, list[Primitive]]
+) -> dict[int, np.ndarray]:
+    """Transforms of the joints of all nodes that draw a mesh with a skin, by the index of the node."""
+    drawn = (node for node in scene if "mesh" in node.item)
+    skin = {
+        node.number: document.index("skins", node.item["skin"], f"node {node.number}")
+        for node, mesh in zip(drawn, mesh_of, strict=True)
+        if "skin" in node.item and any(primitive.joints for primitive in primitives[mesh])
+    }
+    if not skin:
+        return {}
+    world = joints(document, scene)
+    matrices = {number: gltf_skin.joint_matrices(document, number, world) for number in set(skin.values())}
+    return {node: matrices[number] for node, number in skin.items()}
+
+
+def _geometry(document: Document, primitive: Primitive) -> tuple[Geometry, gltf_skin.Binding | None]:
+    """The triangles of a primitive (section 3.7.2), and the joints of its vertices."""
+    face = _faces(document, primitive)
+    if primitive.flat:
+        used, face = face.ravel(), np.arange(face.size).reshape(-1, 3)
+    else:
+        used, face = _used(face, len(primitive.attribute["POSITION"].value))
+
+    def values(key: str) -> np.ndarray | None:
+        return primitive.attribute[key].numbers(used) if key in primitive.attribute else None
+
+    position = primitive.attribute["POSITION"].numbers(used)
+    normal = _face_normals(position) if primitive.flat else values("NORMAL")
+    tangent = None if primitive.flat else values("TANGENT")  # section 3.7.2.1: ignored without normals
+    color = values("COLOR_0")
     # In glTF v points down. Coordinates that are not finite count as missing.
     texture, second = (
-        None if each is None else np.where(np.isfinite(each), [[0, 1]] + each * [[1, -1]], 0) for each in place
+        None if place is None else np.where(np.isfinite(place), [[0, 1]] + place * [[1, -1]], 0)
+        for place in (values("TEXCOORD_0"), values("TEXCOORD_1"))
     )
-    if normal is None:
-        tangent = None  # section 3.7.2.1: ignored without normals
-    whole = Geometry(
+    geometry = Geometry(
         position,
-        _faces(document, item, count, name),
+        face,
         normal,
         None if tangent is None else tangent[:, :3],
         None if tangent is None else np.where(tangent[:, 3] < 0, -1.0, 1.0),
@@ -207,37 +290,47 @@ def _geometry(document: Document, item: dict[str, Any], name: str, ignored: set[
         second,
         None if color is None else np.clip(np.nan_to_num(color[:, :3]), 0, 1),
     )
-    return _used(whole)
+    bound = gltf_skin.binding(document, primitive.attribute, primitive.joints, used, primitive.name)
+    return geometry, bound
 
 
-def _faces(document: Document, item: dict[str, Any], count: int, name: str) -> np.ndarray:
+def _face_normals(position: np.ndarray) -> np.ndarray:
+    """Unit normals [3f 3] of separate triangles with positions [3f 3]. A triangle without area gets +y."""
+    corner = position.reshape(-1, 3, 3)
+    with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
+        cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        length = np.linalg.norm(cross, axis=1, keepdims=True)
+    flat = np.where(length > 0, cross / np.where(length > 0, length, 1), [0.0, 1.0, 0.0])
+    return np.repeat(flat, 3, 0)
+
+
+def _faces(document: Document, primitive: Primitive) -> np.ndarray:
     """Vertex indices of the triangles of a primitive."""
+    count = len(primitive.attribute["POSITION"].value)
     index = np.arange(count)
-    if "indices" in item:
-        index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)[:, 0].astype(np.int64)
+    if primitive.corner is not None:
+        index = primitive.corner.rows()[:, 0].astype(np.int64)
         if index.min() < 0 or index.max() >= count:
             wrong = np.flatnonzero((index < 0) | (index >= count))
             got = f"{len(wrong)} of {len(index)} that refer to others, the first is {index[wrong[0]]} at {wrong[0]}"
-            raise document.error(f"must refer to vertices 0 to {count - 1} in indices of {name}", got)
-    mode = item.get("mode", _TRIANGLES)
-    if len(index) < 3 or (mode == _TRIANGLES and len(index) % 3):
-        must = "a multiple of three" if mode == _TRIANGLES else "three or more"
-        raise document.error(f"must have {must} corners of triangles in {name}", str(len(index)))
-    if mode == _TRIANGLES:
+            raise document.error(f"must refer to vertices 0 to {count - 1} in indices of {primitive.name}", got)
+    if primitive.mode == _TRIANGLES:
         return index.reshape(-1, 3)
     step = np.arange(len(index) - 2)
-    if mode == _FAN:
+    if primitive.mode == _FAN:
         return np.stack([index[step + 1], index[step + 2], np.full(len(step), index[0])], 1)
     odd = step % 2
     return np.stack([index[step], index[step + 1 + odd], index[step + 2 - odd]], 1)
 
 
-def _used(geometry: Geometry) -> Geometry:
-    """A geometry without unused vertices, because primitives may share one array of vertices."""
-    used = np.zeros(len(geometry.position), bool)
-    used[geometry.face] = True
-    if used.all():
-        return geometry
-    rest: dict[str, Any] = geometry._asdict()
-    rest = {name: value[used] for name, value in rest.items() if value is not None and name != "face"}
-    return geometry._replace(face=(np.cumsum(used) - 1)[geometry.face], **rest)
+def _used(face: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that triangles use, in ascending order, and the triangles as indices to these.
+
+    Thousands of primitives may share one array of vertices, so the work is in proportion to the triangles.
+    """
+    if count > 4 * face.size:
+        used, dense = np.unique(face, return_inverse=True)
+        return used, dense.reshape(-1, 3)
+    mask = np.zeros(count, bool)
+    mask[face] = True
+    return np.flatnonzero(mask), (np.cumsum(mask) - 1)[face]

@@ -10,64 +10,73 @@ import numpy as np
 
 from jaxprt.files import images
 from jaxprt.scene.formats.gltf_file import Document
+from jaxprt.scene.formats.gltf_header import excerpt
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
+_SHOWN = 80  # characters of a URI in warnings
 
 
 class MaterialReader:
     """Reads the materials of a file. Shared textures are decoded and stored only once.
 
     Attributes:
-        ignored: Names of unsupported features of the materials that have been read.
+        ignored: Names of unsupported features of the materials that have been read, and of images that cannot be read.
     """
 
     def __init__(self, document: Document):
         self.ignored: set[str] = set()
         self._document = document
-        self._image: dict[tuple[Any, bool], np.ndarray] = {}
-        self._channels: dict[tuple[Any, bool, tuple[int, ...]], jax.Array] = {}
+        self._image: dict[tuple[int, bool], np.ndarray | None] = {}
+        self._channels: dict[tuple[int, bool, tuple[int, ...]], jax.Array] = {}
 
     def material(self, index: int | None) -> TexturedMaterial:
         """The material with an index; for None the default material of the specification.
 
         Raises:
-            ValueError: A number is not finite or out of range, or a texture is not an image.
+            ValueError: A number is not finite or out of range, or an image is outside of the folder of the file.
             FileNotFoundError: The file of an image does not exist.
+            MemoryError: An image does not fit into memory.
         """
         if index is None:
             return TexturedMaterial()
         owner = f"material {index}"
         item = self._document.item("materials", index, owner)
-        extension = item.get("extensions", {})
-        pbr = item.get("pbrMetallicRoughness", {})
-        specular, brushed = (extension.get(f"KHR_materials_{name}", {}) for name in ("specular", "anisotropy"))
-        strength = self._number(extension.get("KHR_materials_emissive_strength", {}), "emissiveStrength", 1.0, owner)
-        normal = item.get("normalTexture", {})
-        self._note(item)
+        extensions = self._document.object(item, "extensions", owner)
+        ior, specular, brushed, emissive = (
+            self._document.object(extensions, f"KHR_materials_{name}", owner)
+            for name in ("ior", "specular", "anisotropy", "emissive_strength")
+        )
+        pbr = self._document.object(item, "pbrMetallicRoughness", owner)
+        glow = self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner)
+        glow = glow * self._number(emissive, "emissiveStrength", 1.0, owner)
+        normal = self._document.object(item, "normalTexture", owner)
+        self._note(item, owner)
         field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
             "roughness": self._number(pbr, "roughnessFactor", 1.0, owner),
-            "emissive": self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner) * strength,
-            "ior": self._number(extension.get("KHR_materials_ior", {}), "ior", 1.5, owner),
+            "emissive": self._document.numbers(
+                glow.tolist(), (3,), f"emissiveFactor times emissiveStrength of {owner}"
+            ),
+            "ior": self._number(ior, "ior", 1.5, owner),
             "specular": self._number(specular, "specularFactor", 1.0, owner),
             "specular_color": self._number(specular, "specularColorFactor", (1.0, 1.0, 1.0), owner),
             "anisotropy": self._number(brushed, "anisotropyStrength", 0.0, owner),
             "rotation": self._number(brushed, "anisotropyRotation", 0.0, owner),
             "normal_scale": self._number(normal, "scale", 1.0, owner),
         }
-        colors, both = (0, 1, 2), pbr.get("metallicRoughnessTexture")
+        colors = (0, 1, 2)
         field |= {
-            "base_color_texture": self._texture(pbr.get("baseColorTexture"), colors, owner, decoded=True),
-            "metallic_texture": self._texture(both, (2,), owner),
-            "roughness_texture": self._texture(both, (1,), owner),
-            "emissive_texture": self._texture(item.get("emissiveTexture"), colors, owner, decoded=True),
-            "specular_texture": self._texture(specular.get("specularTexture"), (3,), owner),
-            "specular_color_texture": self._texture(specular.get("specularColorTexture"), colors, owner, decoded=True),
-            "anisotropy_texture": self._texture(brushed.get("anisotropyTexture"), colors, owner),
-            "normal_texture": self._texture(item.get("normalTexture"), colors, owner),
+            "base_color_texture": self._texture(pbr, "baseColorTexture", colors, owner, decoded=True),
+            "metallic_texture": self._texture(pbr, "metallicRoughnessTexture", (2,), owner),
+            "roughness_texture": self._texture(pbr, "metallicRoughnessTexture", (1,), owner),
+            "emissive_texture": self._texture(item, "emissiveTexture", colors, owner, decoded=True),
+            "specular_texture": self._texture(specular, "specularTexture", (3,), owner),
+            "specular_color_texture": self._texture(specular, "specularColorTexture", colors, owner, decoded=True),
+            "anisotropy_texture": self._texture(brushed, "anisotropyTexture", colors, owner),
+            "normal_texture": self._texture(item, "normalTexture", colors, owner),
         }
         try:
             return TexturedMaterial(**field)
@@ -77,46 +86,64 @@ class MaterialReader:
     def _number(self, item: dict[str, Any], key: str, default: float | tuple[float, ...], owner: str) -> np.ndarray:
         return self._document.numbers(item.get(key, default), np.shape(default), f"{key} of {owner}")
 
-    def _note(self, item: dict[str, Any]) -> None:
+    def _note(self, item: dict[str, Any], owner: str) -> None:
         """Records unsupported features of a material."""
-        if item.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self.ignored.add(f"alpha mode {item['alphaMode']}")
-        if item.get("doubleSided", False):
+        mode = item.get("alphaMode", "OPAQUE")
+        if mode != "OPAQUE":
+            self.ignored.add(f"alpha mode {mode if mode in ('MASK', 'BLEND') else excerpt(mode)}")
+        if self._document.boolean(item, "doubleSided", owner):
             self.ignored.add("doubleSided (backs of surfaces are black)")
         if "occlusionTexture" in item:
             self.ignored.add("occlusion textures (occlusion is computed)")
         self.ignored |= set(item.get("extensions", {}))
 
     def _texture(
-        self, info: dict[str, Any] | None, channels: tuple[int, ...], owner: str, *, decoded: bool = False
+        self, item: dict[str, Any], key: str, channels: tuple[int, ...], owner: str, *, decoded: bool = False
     ) -> Texture | None:
         """Some channels of a texture; None if there is no texture that can be read."""
-        if info is None:
+        if key not in item:
             return None
-        item = self._document.item("textures", info["index"], owner)
-        moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-        number = moved.get("texCoord", info.get("texCoord", 0))
-        if "source" not in item or number not in (0, 1):
-            self.ignored.add("textures without PNG or JPEG" if "source" not in item else "third texture coordinates")
+        document, owner = self._document, f"{key} of {owner}"
+        info = document.object(item, key, owner)
+        index = document.index("textures", info.get("index"), owner)
+        texture, name = document.items("textures")[index], f"texture {index}"
+        moved = document.object(document.object(info, "extensions", owner), "KHR_texture_transform", owner)
+        number = document.integer({**info, **moved}, "texCoord", owner, 0)
+        if "source" not in texture or number > 1:
+            self.ignored.add("textures without PNG or JPEG" if "source" not in texture else "third texture coordinates")
             return None
         sampler = {}
-        if "sampler" in item:
-            sampler = self._document.item("samplers", item["sampler"], f"texture {info['index']}")
+        if "sampler" in texture:
+            sampler = document.item("samplers", texture["sampler"], name)
         if sampler.get("magFilter") == _NEAREST:
             self.ignored.add("nearest filters (textures are interpolated)")
-        across, up = (_WRAP.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT"))
-        image = self._pixels(item["source"], channels, f"texture {info['index']}", decoded)
-        return Texture(image, self._transform(moved, owner), number, (across, up))
+        across, up = (_WRAP.get(document.integer(sampler, side, name, 0), "repeat") for side in ("wrapS", "wrapT"))
+        image = self._pixels(texture["source"], channels, name, decoded)
+        return None if image is None else Texture(image, self._transform(moved, owner), number, (across, up))
 
-    def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array:
-        key = (source, decoded, channels)
+    def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array | None:
+        """Channels of an image; None, with a record of the reason, if it cannot be decoded."""
+        index = self._document.index("images", source, owner)
+        key = (index, decoded, channels)
         if key not in self._channels:
             if key[:2] not in self._image:
-                name = f"{self._document.path}: image {source}"
-                content = self._document.image(source, owner)
-                self._image[key[:2]] = colored(images.decode_image(content, name=name, decoded=decoded))
-            self._channels[key] = jax.device_put(np.ascontiguousarray(self._image[key[:2]][..., channels]))
+                self._image[key[:2]] = self._decode(index, owner, decoded)
+            image = self._image[key[:2]]
+            if image is None:
+                return None
+            self._channels[key] = jax.device_put(np.ascontiguousarray(image[..., channels]))
         return self._channels[key]
+
+    def _decode(self, index: int, owner: str, decoded: bool) -> np.ndarray | None:
+        """The pixels of an image with four channels; None, with a record of the reason, if it cannot be decoded."""
+        content = self._document.image(index, owner)
+        item = self._document.items("images")[index]
+        name = f"image {index}" if "bufferView" in item else f"image {index}, {item['uri'][:_SHOWN]}"
+        try:
+            return colored(images.decode_image(content, name=name, decoded=decoded))
+        except ValueError as error:
+            self.ignored.add(f"textures that cannot be read ({error})")
+            return None
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
         """The affine transform of KHR_texture_transform, for texture coordinates with v up.
@@ -132,7 +159,8 @@ class MaterialReader:
         cosine, sine = np.cos(angle), np.sin(angle)
         matrix = np.array([[cosine * across, sine * down, x], [-sine * across, cosine * down, y], [0, 0, 1]])
         flip = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
-        return (flip @ matrix @ flip)[:2].astype(np.float32)
+        with np.errstate(over="ignore"):  # textures refuse transforms that are not finite
+            return (flip @ matrix @ flip)[:2].astype(np.float32)
 
 
 def colored(image: np.ndarray) -> np.ndarray:

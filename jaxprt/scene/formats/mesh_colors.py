@@ -37,9 +37,8 @@ def of_images(
     for name in content.images:
         material = plain
         if name is not None:
-            file = inputs.inside(
-                path.parent / name.replace("\\", "/"), path.parent, owner=f"{path}, TextureFile", outside=outside
-            )
+            owner = f"{path}, TextureFile"
+            file = inputs.reference(name, path.parent, folder=path.parent, owner=owner, outside=outside)
             try:
                 image = images.decode_image(inputs.content(file, "an image file"), name=str(file))
                 image = image[..., (0, 1, 2) if image.shape[-1] >= 3 else (0, 0, 0)]

@@ -1,16 +1,17 @@
 """Materials of OBJ files (Wavefront MTL), including the metallic-roughness statements of newer exporters."""
 
+import functools
 import math
 import pathlib
 import re
 import warnings
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.files import images
+from jaxprt.files import images, inputs
 from jaxprt.scene.formats import obj, text
 from jaxprt.scene.formats.obj import statement
 from jaxprt.scene.material import Texture, TexturedMaterial
@@ -33,7 +34,9 @@ _BLENDER = re.compile(
 )  # first line of OBJ files by Blender; the v is from its older exporter
 
 
-def of_regions(path: pathlib.Path, plain: TexturedMaterial) -> tuple[list[str], list[TexturedMaterial]]:
+def of_regions(
+    path: pathlib.Path, plain: TexturedMaterial, *, outside: bool = False
+) -> tuple[list[str], list[TexturedMaterial]]:
     """Names and materials of the regions of an OBJ file, in the order of their first faces.
 
     A single warning names everything that is missing (MTL files, materials, images) or not supported. Missing materials
@@ -42,19 +45,27 @@ def of_regions(path: pathlib.Path, plain: TexturedMaterial) -> tuple[list[str], 
     Args:
         path: The OBJ file.
         plain: Material of faces without one.
+        outside: Whether MTL files and images may be outside of the folder of the OBJ file.
+
+    Raises:
+        ValueError: An MTL file or an image is outside of the folder, whether it exists or not.
     """
     source = obj.content(path)
     order, files = obj.used_materials(source)
     found: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
     first = text.name(source.partition(b"\n")[0])
+    refer = functools.partial(inputs.reference, folder=path.parent, outside=outside)
     for file in files:
-        for each in [file] if (path.parent / file).is_file() else file.split():
-            if (path.parent / each).is_file():
-                material, more = read(path.parent / each, blender=_exponent(first))
+        whole = refer(file, path.parent, owner=f"{path}, mtllib")
+        words = file.split() if _absence(whole) else []
+        for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [whole]:
+            absence = _absence(library)
+            if not absence:
+                material, more = read(library, blender=_exponent(first), refer=refer)
                 found, ignored = material | found, ignored | more
             else:
-                ignored.add(f"mtllib ({path.parent / each}, which does not exist)")
+                ignored.add(f"mtllib ({library}, {absence})")
     ignored |= {f"usemtl {each} (no such material)" for each in order if each is not None and each not in found}
     if ignored:
         warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
@@ -72,7 +83,9 @@ def _exponent(line: str) -> float | None:
     return 1000.0 if version >= (3, 3) and not found[1] else 900.0
 
 
-def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str, TexturedMaterial], set[str]]:
+def read(
+    path: pathlib.Path, *, blender: float | None = None, refer: Callable[..., pathlib.Path]
+) -> tuple[dict[str, TexturedMaterial], set[str]]:
     """Reads the materials of an MTL file.
 
     Kd is the base color, multiplied by map_Kd. If there is Pr or Pm (roughness and metalness), these and Ni determine
@@ -89,12 +102,13 @@ def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str,
         path: The file.
         blender: Exponent that Blender writes for a roughness of 0, if the first line of the OBJ file names Blender;
             None for files of other programs.
+        refer: `inputs.reference` with the folder in which images must be.
 
     Returns:
         Materials by name; and names of unsupported statements and of missing or damaged images.
 
     Raises:
-        ValueError: A number is damaged or out of range. The message states where.
+        ValueError: A number is damaged or out of range, or an image is outside of the folder. The message states where.
     """
     material: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
@@ -107,7 +121,7 @@ def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str,
         key, *rest = statement(line).split() or [""]
         if key == "newmtl":
             if name is not None:
-                material[name] = _material(statements, path, name, ignored, blender)
+                material[name] = _material(statements, path, name, ignored, blender, refer)
             name, statements = " ".join(rest), {}
         elif key:
             statements[key] = rest if key in _MAPS else " ".join(rest).partition("#")[0].split()
@@ -115,7 +129,12 @@ def read(path: pathlib.Path, *, blender: float | None = None) -> tuple[dict[str,
 
 
 def _material(
-    statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str], blender: float | None
+    statements: dict[str, list[str]],
+    path: pathlib.Path,
+    name: str,
+    ignored: set[str],
+    blender: float | None,
+    refer: Callable[..., pathlib.Path],
 ) -> TexturedMaterial:
     """The material from the statements after one newmtl."""
     if blender is not None:
@@ -129,7 +148,10 @@ def _material(
     field: dict[str, Any] = {_COLORS[key]: value[key] for key in ("Kd", "Ke") if key in value}
     for key, words in statements.items():
         if key in _MAPS:
-            _add_map(field, key, words, path, ignored)
+            options, words = _options(words)
+            owner = f"{path}, {key} of material {name!r}"
+            file = refer(" ".join(words).replace("\\", "/"), path.parent, owner=owner)
+            _add_map(field, key, options, file, ignored)
         elif key in _OPAQUE and _number(statements, key, path, name) == _OPAQUE[key]:
             continue
         elif key not in value and key not in _SILENT:
@@ -194,15 +216,16 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
     return np.array(number if len(number) == 3 else number[:1] * 3)
 
 
-def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Path, ignored: set[str]) -> None:
+def _add_map(
+    field: dict[str, Any], key: str, options: dict[str, list[str]], file: pathlib.Path, ignored: set[str]
+) -> None:
     """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`."""
     name, channels, decoded = _MAPS[key]
-    options, words = _options(words)
-    file = path.parent / " ".join(words).replace("\\", "/")
     try:
-        if not file.is_file():
-            raise ValueError(f"{file}, which does not exist")
-        image = images.decode_image(file.read_bytes(), name=str(file), decoded=decoded)
+        absence = _absence(file)
+        if absence:
+            raise ValueError(f"{file}, {absence}")
+        image = images.decode_image(inputs.content(file, "an image"), name=str(file), decoded=decoded)
     except ValueError as error:
         ignored.add(f"{key} ({error})")
         return
@@ -218,6 +241,17 @@ def _add_map(field: dict[str, Any], key: str, words: list[str], path: pathlib.Pa
     wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
     transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]], np.float32)
     field[name] = Texture(jnp.asarray(image[..., channels]), transform, 0, (wrap, wrap))
+
+
+def _absence(path: pathlib.Path) -> str:
+    """Why a path is not that of a regular file; empty if it is."""
+    try:
+        inputs.check(path, "a file")
+    except FileNotFoundError:
+        return "which does not exist"
+    except ValueError:
+        return "which is not a regular file"
+    return ""
 
 
 def _options(words: list[str]) -> tuple[dict[str, list[str]], list[str]]:

@@ -10,7 +10,7 @@ from jaxprt.scene.formats.file_parts import split_parts
 from jaxprt.scene.scene import Scene
 
 
-def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
+def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = False) -> Scene:
     """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
     Geometry is read like `load_mesh` reads it. Each material in use becomes one part, named after the material; equal
@@ -18,10 +18,12 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
 
     Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
     texture coordinates, and perspective cameras, whose pictures are 512 pixels high. It supports the extensions
-    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform and KHR_mesh_quantization. A
-    single warning names all other features of the file (alpha modes, transmission, skins, animations, lights,
-    orthographic cameras, and so on). Primitives without material get the default material of the specification, a white
-    rough metal.
+    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform, KHR_mesh_quantization and
+    EXT_mesh_gpu_instancing. Meshes with a skin are in the pose that the file's joints have. Triangles without normals
+    are flat. Compressed geometry is read from its uncompressed fallback. A file that requires another extension is
+    refused. A single warning names all other features of the file (alpha modes, transmission, animations, lights,
+    orthographic cameras, images that cannot be read, and so on). Primitives without material get the default material
+    of the specification, a white rough metal.
 
     Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
     metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `mtl.read` explains how Phong materials and those of
@@ -38,31 +40,38 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any]) -> Scene:
     `mitsuba_material` lists, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective
     sensors.
 
+    A scene file from a stranger must not read other files of the user. What it refers to (buffers, images, MTL files)
+    must therefore be regular files in its folder or in folders below, after links are resolved. File names in a
+    dictionary are not restricted, because the caller writes the dictionary.
+
     Args:
         path: The file, or the dictionary.
+        outside: Whether the file may refer to files outside of its folder. Use it only for scenes that you trust.
 
     Returns:
         The scene.
 
     Raises:
-        FileNotFoundError: The file, or a file that it refers to, does not exist.
-        ValueError: The file is of an unknown kind, damaged, or has no triangles; an image cannot be read; a factor is
-            not finite or out of range; or a BSDF of a dictionary is not supported.
+        FileNotFoundError: The file, or a buffer or an image of a glTF file, does not exist.
+        ValueError: The file is of an unknown kind, damaged, or has no triangles; it refers to a file outside of its
+            folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF of a dictionary
+            is not supported.
+        MemoryError: The scene does not fit into memory.
     """
     if isinstance(path, Mapping):
         return mitsuba_dict.read(path)
     path = pathlib.Path(path)
-    if path.suffix.lower() in (".glb", ".gltf") and path.is_file():
-        return gltf.read(path)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        return gltf.read(path, outside=outside)
     mesh_file.check(path)
     content = mesh_file.content(path, groups=False)
     plain = mesh_colors.matte(content.geometry)
     if path.suffix.lower() == ".obj":
-        names, materials = mtl.of_regions(path, plain)
+        names, materials = mtl.of_regions(path, plain, outside=outside)
         if names == ["default"]:
             names = [path.stem]
     else:
-        materials, ignored = mesh_colors.of_images(content, plain, path, outside=False)
+        materials, ignored = mesh_colors.of_images(content, plain, path, outside=outside)
         names = [path.stem] * len(materials)
         if ignored:
             warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=2)

@@ -1,10 +1,7 @@
 """glTF files written by hand, real ones against trimesh, and damaged ones."""
 
-import base64
 import copy
 import json
-import pathlib
-import struct
 import warnings
 from typing import Any
 
@@ -17,82 +14,9 @@ import trimesh
 from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
 from jaxprt.scene.mesh import split
+from tests.scene.formats.gltf_writer import FACE, KIND, PLACE, SQUARE, Writer, one
 
-KIND = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-TYPE = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-# A unit square in the plane z = 0 that looks to +z, with an upright image on it (v down).
-SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
-FACE = np.array([0, 1, 2, 0, 2, 3], np.uint16)
-PLACE = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 TURN = np.array([[0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1.0]])  # A quarter turn about z, and a shift.
-
-
-class Writer:
-    """A glTF file with one scene of one node, to which objects are added; tests change its header."""
-
-    def __init__(self):
-        self.data = b""
-        self.header: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}]}
-        self.header |= {"nodes": [{"mesh": 0}], "bufferViews": [], "accessors": [], "images": [], "materials": []}
-
-    def add(self, kind: str, item: dict) -> int:
-        self.header.setdefault(kind, []).append(item)
-        return len(self.header[kind]) - 1
-
-    def view(self, content: bytes, **field) -> int:
-        self.data += b"\0" * (-len(self.data) % 4)
-        index = self.add(
-            "bufferViews", {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content), **field}
-        )
-        self.data += content
-        return index
-
-    def accessor(self, value: np.ndarray, **field) -> int:
-        value = np.asarray(value)
-        value = value[:, None] if value.ndim == 1 else value
-        value = value.astype(np.float32) if value.dtype == float else value
-        kind, view = KIND[value.dtype.str[1:]], self.view(value.tobytes())
-        item = {"bufferView": view, "componentType": kind, "count": len(value), "type": TYPE[value.shape[1]]}
-        return self.add("accessors", item | field)
-
-    def square(
-        self, *, face: np.ndarray | None = FACE, material: int | None = None, mode: int = 4, **attribute
-    ) -> dict:
-        """A primitive; attributes are arrays, or numbers of accessors."""
-        value = {"POSITION": SQUARE} | attribute
-        item: dict[str, Any] = {"mode": mode}
-        item["attributes"] = {k: v if isinstance(v, int) else self.accessor(v) for k, v in value.items()}
-        return (
-            item
-            | ({} if face is None else {"indices": self.accessor(face)})
-            | ({} if material is None else {"material": material})
-        )
-
-    def texture(self, folder: pathlib.Path, image: np.ndarray, **field) -> dict:
-        """What refers to a texture, of an image with display values."""
-        write_png(folder / "image.png", np.asarray(image, np.float32))
-        view = self.view((folder / "image.png").read_bytes())
-        source = self.add("images", {"bufferView": view, "mimeType": "image/png"})
-        return {"index": self.add("textures", {"source": source})} | field
-
-    def write(self, path: pathlib.Path) -> pathlib.Path:
-        data = self.data + b"\0" * (-len(self.data) % 4)
-        header = self.header | {"buffers": [{"byteLength": len(data)}]}
-        if path.suffix == ".gltf":
-            uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
-            path.write_text(json.dumps(header | {"buffers": [{"byteLength": len(data), "uri": uri}]}))
-            return path
-        text = json.dumps(self.header.get("whole", header)).encode()
-        text += b" " * (-len(text) % 4)
-        content = struct.pack("<4s4I", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A) + text
-        path.write_bytes(content + struct.pack("<2I", len(data), 0x004E4942) + data)
-        return path
-
-
-def one(*primitives, writer: Writer) -> Writer:
-    """The writer with these primitives in one mesh."""
-    writer.add("meshes", {"primitives": list(primitives)})
-    return writer
 
 
 def srgb(value):
@@ -424,12 +348,12 @@ def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     ]
     parts = [writer.square(material=0, COLOR_1=SQUARE) | {"targets": [{}]}, writer.square(mode=1)]
     one(*parts, writer=writer)
-    writer.header |= {"animations": [{}], "skins": [{}], "extensionsUsed": ["KHR_lights_punctual"]}
+    writer.header |= {"animations": [{}], "extensionsUsed": ["KHR_lights_punctual"]}
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(writer.write(tmp_path / "much.glb"))
     (message,) = [str(each.message) for each in caught]
     expected = ["COLOR_1", "KHR_lights_punctual", "KHR_materials_clearcoat", "alpha mode BLEND", "animations"]
-    expected += ["doubleSided", "morph targets", "occlusion textures", "points and lines", "skins"]
+    expected += ["doubleSided", "morph targets", "occlusion textures", "points and lines"]
     expected += ["textures of primitives without texture coordinates"]
     assert message.startswith(f"{tmp_path / 'much.glb'}: not supported and ignored are ")
     for each in expected:
@@ -453,7 +377,7 @@ def test_buffers_and_images_are_read_from_files_beside(tmp_path):
     np.testing.assert_allclose(load_scene(path).parts[0].surface().base_color, expected, atol=1e-6)
     (tmp_path / "a folder" / "ima ge.png").unlink()
     with pytest.raises(
-        FileNotFoundError, match=r"beside\.gltf needs the file .*ima ge\.png for image 0, which does not"
+        FileNotFoundError, match=r"ima ge\.png must be the file that .*beside\.gltf needs for image 0, and there is no"
     ):
         load_scene(path)
     assert len(load_mesh(path).position) == 4  # Which needs no images.
@@ -461,7 +385,7 @@ def test_buffers_and_images_are_read_from_files_beside(tmp_path):
     with pytest.raises(ValueError, match=rf"must have {len(writer.data)} bytes in buffer 0, got 99 bytes"):
         load_scene(path)
     (tmp_path / "a folder" / "all.bin").unlink()
-    with pytest.raises(FileNotFoundError, match=r"beside\.gltf needs the file .*all\.bin for buffer 0, which does not"):
+    with pytest.raises(FileNotFoundError, match=r"all\.bin must be the file that .*beside\.gltf needs for buffer 0"):
         load_scene(path)
 
 
@@ -482,7 +406,7 @@ DAMAGES = {
         5,
         r"accessor 0 \(POSITION of primitive 0 of mesh 0\) inside buffer view \d of 48 bytes, got 5",
     ),
-    "accessors.0.byteOffset": (-4, "inside buffer view"),
+    "accessors.0.byteOffset": (-4, r"whole number of at least 0 for byteOffset of accessor 0 \(POSITION .*, got -4"),
     "accessors.0.componentType": (5130, "must have 3 numbers per element .* got type 'VEC3' of component type 5130"),
     "accessors.0.type": ("VEC2", "must have 3 numbers per element"),
     "accessors.1.count": (3, r"must have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
@@ -509,12 +433,15 @@ DAMAGES = {
     ),
     "materials.0.pbrMetallicRoughness.roughnessFactor": (1.5, "material 0: roughness .* between 0 and 1, .* 1.5"),
     "materials.0.pbrMetallicRoughness.baseColorFactor": ([1, 1, 1], "4 finite numbers for baseColorFactor"),
-    "materials.0.pbrMetallicRoughness.baseColorTexture.index": (4, "one of its 1 textures in material 0, got 4"),
+    "materials.0.pbrMetallicRoughness.baseColorTexture.index": (
+        4,
+        "one of its 1 textures in baseColorTexture of material 0",
+    ),
     "textures.0.source": (1, "must refer to one of its 1 images in texture 0, got 1"),
-    "images.0.bufferView": (1, r"damaged.glb: image 0 must be an EXR, .* or BMP image, got one that starts with"),
     "cameras.0.perspective.yfov": (4, "must have yfov from 0 to pi"),
     "asset.version": ("1.0", "of version 2, got version 1.0"),
-    "extensionsRequired": (["KHR_draco_mesh_compression"], "uncompressed geometry, got KHR_draco"),
+    "extensionsRequired": (["EXT_a", "EXT_b"], "must not require extensions other than .*, got EXT_a, EXT_b$"),
+    "extensionsUsed": ("KHR", "must have a list for extensionsUsed of the file, got 'KHR'"),
     "accessors": ("none", "with a list of accessors, got str"),
 }
 
@@ -566,7 +493,7 @@ def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
     path.write_bytes(b"glTX" + content[4:])
     with pytest.raises(ValueError, match=r"which starts with b'glTF', got .* bytes that start b'glTX'"):
         load_scene(path)
-    with pytest.raises(FileNotFoundError, match=r"there is no mesh file .*absent\.glb"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.glb must be a glTF file, and there is no such file"):
         load_scene(tmp_path / "absent.glb")
 
 

@@ -1,0 +1,371 @@
+"""Damaged glTF files: fields of wrong types, images that cannot be read, and random damage."""
+
+import codecs
+import copy
+import json
+import pathlib
+import random
+import resource
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxprt import require
+from jaxprt.scene import load_mesh, load_scene
+from tests.scene.formats.gltf_writer import PLACE, SQUARE, Writer, one
+
+NAN = float("nan")
+
+
+def everything(folder: pathlib.Path) -> Writer:
+    """A file that uses all fields that are read."""
+    writer = Writer()
+    image = np.random.default_rng(0).random((3, 2, 4))
+    info = writer.texture(folder, image, extensions={"KHR_texture_transform": {"scale": [1, 2], "texCoord": 0}})
+    writer.header["samplers"] = [{"wrapS": 33648, "wrapT": 10497, "magFilter": 9729}]
+    writer.header["textures"][0]["sampler"] = 0
+    pbr = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0.5, "baseColorTexture": info}
+    extensions = {"KHR_materials_ior": {"ior": 1.4}, "KHR_materials_specular": {"specularTexture": info}}
+    material = {"name": "a", "pbrMetallicRoughness": pbr, "normalTexture": info, "extensions": extensions}
+    writer.header["materials"] = [material | {"doubleSided": False, "emissiveFactor": [0, 0, 1]}]
+    index, value = writer.view(np.uint8([1]).tobytes()), writer.view(SQUARE[1:2].tobytes())
+    parts = {"count": 1, "indices": {"bufferView": index, "componentType": 5121}, "values": {"bufferView": value}}
+    first = writer.square(material=0, POSITION=writer.accessor(SQUARE, sparse=parts), TEXCOORD_0=PLACE)
+    joint, weight = np.uint8([[0, 0, 0, 0]] * 4), np.float32([[1, 0, 0, 0]] * 4)
+    second = writer.square(JOINTS_0=joint, WEIGHTS_0=weight, NORMAL=None)
+    one(first, writer=writer)
+    one(second, writer=writer)
+    inverse = writer.accessor(np.eye(4, dtype=np.float32).reshape(1, 16))
+    writer.header["skins"] = [{"joints": [1], "inverseBindMatrices": inverse}]
+    shift = writer.accessor(np.float32([[0, 0, 1], [0, 0, 2]]))
+    instances = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": shift}}}
+    writer.header["nodes"] = [
+        {"mesh": 0, "children": [1], "rotation": [0, 0, 0, 1], "extensions": instances},
+        {"camera": 0, "scale": [1, 1, 1], "translation": [0, 0, 1]},
+        {"mesh": 1, "skin": 0, "matrix": np.eye(4).ravel().tolist()},
+    ]
+    writer.header["scenes"] = [{"nodes": [0, 2]}]
+    writer.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.7, "aspectRatio": 1}}]
+    writer.header["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    return writer
+
+
+def places(item: Any, way: tuple = ()) -> list[tuple]:
+    """The ways to all values of a header."""
+    found = []
+    for key, value in item.items() if isinstance(item, dict) else enumerate(item):
+        found.append((*way, key))
+        if isinstance(value, dict | list):
+            found += places(value, (*way, key))
+    return found
+
+
+def changed(header: dict, way: tuple, value: Any) -> dict:
+    """A header with another value at a place."""
+    header = copy.deepcopy(header)
+    item: Any = header
+    for key in way[:-1]:
+        item = item[key]
+    item[way[-1]] = value
+    return header
+
+
+def outcome(path: pathlib.Path) -> str:
+    """ "read", or the error that names the file; other errors pass."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=f"{path}: not supported and ignored are")
+        try:
+            load_scene(path)
+            message = "read"
+        except (ValueError, FileNotFoundError, MemoryError) as error:
+            message = str(error)
+    assert message == "read" or str(path) in message
+    assert len(message) < 2000
+    return message
+
+
+TYPES = [
+    (("nodes", 0, "mesh"), True, r"must refer to one of its 2 meshes in node 0, got True"),
+    (("nodes", 0, "mesh"), "0", r"must refer to one of its 2 meshes in node 0, got '0'"),
+    (("nodes", 0, "mesh"), None, r"must refer to one of its 2 meshes in node 0, got None"),
+    (("nodes", 0, "mesh"), 10**400, r"must refer to one of its 2 meshes in node 0, got 10{79}\.\.\.$"),
+    (("nodes", 0, "mesh"), 0.5, r"must refer to one of its 2 meshes in node 0, got 0\.5"),
+    (("nodes", 0, "children"), 1, r"must have a list for children of node 0, got 1"),
+    (("nodes", 0, "children"), "1", r"must have a list for children of node 0, got '1'"),
+    (("nodes", 0, "children"), [1, 1], r"nodes that form trees, got node 1 twice, the second time in node 0"),
+    (("nodes", 0, "rotation"), [0, 0, False, 1], r"must have 4 finite numbers for the rotation of node 0, got"),
+    (("nodes", 0, "rotation"), [0, 0, 10**400, 1], r"must have 4 finite numbers for the rotation of node 0, got"),
+    (("nodes", 0, "rotation"), {"x": 1}, r"must have 4 finite numbers for the rotation of node 0, got \{'x': 1\}"),
+    (("nodes", 1, "translation"), "abc", r"must have 3 finite numbers for the translation of node 1, got 'abc'"),
+    (("nodes", 1, "scale"), [[1], [1], [1]], r"must have 3 finite numbers for the scale of node 1"),
+    (("nodes", 2, "matrix"), [NAN] * 16, r"must have 16 finite numbers for the matrix of node 2"),
+    (("nodes", 0, "extensions"), [], r"must have an object for extensions of node 0, got \[\]"),
+    (("nodes", 0, "extensions", "EXT_mesh_gpu_instancing"), 1, r"an object for EXT_mesh_gpu_instancing of"),
+    (("nodes", 2, "skin"), 1, r"must refer to one of its 1 skins in node 2, got 1"),
+    (("nodes", 2), "node", r"with a list of nodes, all of them objects, got 'node' at 2"),
+    (("nodes",), {"0": {}}, r"with a list of nodes, got dict"),
+    (("scenes", 0, "nodes"), [0, 0], r"nodes that form trees, got node 0 twice, the second time in scene 0"),
+    (("scenes", 0, "nodes"), {"0": 2}, r"must have a list for nodes of scene 0, got \{'0': 2\}"),
+    (("skins", 0, "joints"), 1, r"must have a list for joints of skin 0, got 1"),
+    (("skins", 0, "joints"), [], r"must have one or more joints in skin 0, got none"),
+    (("meshes", 0, "primitives"), {"mode": 4}, r"must have a list for primitives of mesh 0"),
+    (("meshes", 0, "primitives"), [4], r"must have an object for primitive 0 of mesh 0, got 4"),
+    (("meshes", 0, "primitives", 0, "mode"), 7, r"must have a mode from 0 to 6 in primitive 0 of mesh 0, got 7"),
+    (
+        ("meshes", 0, "primitives", 0, "mode"),
+        True,
+        r"whole number of at least 0 for mode of primitive 0 of mesh 0, got T",
+    ),
+    (("meshes", 0, "primitives", 0, "attributes"), [0], r"must have an object for attributes of primitive 0 of mesh 0"),
+    (("meshes", 0, "primitives", 0, "material"), [0], r"one of its 1 materials in primitive 0 of mesh 0, got \[0\]"),
+    (("accessors", 0, "count"), -4, r"whole number of at least 0 for count of accessor 0 \(POSITION .*\), got -4"),
+    (("accessors", 0, "count"), 0, r"must have 1 or more elements in accessor 0 \(POSITION .*\), got 0"),
+    (("accessors", 0, "count"), 4.5, r"whole number of at least 0 for count of accessor 0 .* got 4\.5"),
+    (("accessors", 0, "count"), 2**53, r"must keep accessor 0 .* inside buffer view \d of 48 bytes"),
+    (("accessors", 0, "count"), 10**30, r"whole number of at least 0 for count of accessor 0 .* got 10{30}"),
+    (("accessors", 0, "type"), ["VEC3"], r"must have a string for type of accessor 0 .* got \['VEC3'\]"),
+    (("accessors", 0, "componentType"), "f", r"whole number of at least 0 for componentType of accessor 0"),
+    (("accessors", 0, "normalized"), 1, r"must have true or false for normalized of accessor 0 .* got 1"),
+    (("accessors", 0, "sparse"), [], r"must have an object for sparse of accessor 0"),
+    (("accessors", 0, "sparse", "count"), 5, r"must replace 1 to 4 elements, .* got 5 of component type 5121"),
+    (("accessors", 0, "sparse", "indices"), 3, r"must have an object for indices of accessor 0"),
+    (("accessors", 0, "sparse", "values"), {}, r"must refer to one of its \d+ bufferViews in accessor 0 .* got None"),
+    (("bufferViews", 1, "byteOffset"), -1, r"whole number of at least 0 for byteOffset of buffer view 1, got -1"),
+    (("bufferViews", 1, "byteLength"), "9", r"whole number of at least 0 for byteLength of buffer view 1, got '9'"),
+    (("bufferViews", 1, "byteLength"), 2**52, r"must have buffers of at least \d+ bytes for buffer view 1"),
+    (("bufferViews", 3, "byteStride"), 3, r"must keep accessor 0 .* each 3 bytes"),
+    (("bufferViews", 3, "byteStride"), 2**50, r"must keep accessor 0 .* inside buffer view 3"),
+    (("materials", 0, "extensions"), "x", r"must have an object for extensions of material 0, got 'x'"),
+    (
+        ("materials", 0, "extensions", "KHR_materials_ior"),
+        1.4,
+        r"an object for KHR_materials_ior of material 0, got 1\.4",
+    ),
+    (("materials", 0, "pbrMetallicRoughness"), 1, r"must have an object for pbrMetallicRoughness of material 0, got 1"),
+    (
+        ("materials", 0, "pbrMetallicRoughness", "metallicFactor"),
+        True,
+        r"a finite number for metallicFactor of material 0",
+    ),
+    (("materials", 0, "pbrMetallicRoughness", "metallicFactor"), [0.5], r"a finite number for metallicFactor of"),
+    (("materials", 0, "normalTexture"), 0, r"must have an object for normalTexture of material 0, got 0"),
+    (("materials", 0, "doubleSided"), "yes", r"must have true or false for doubleSided of material 0, got 'yes'"),
+    (("textures", 0, "source"), {}, r"must refer to one of its 1 images in texture 0, got \{\}"),
+    (("samplers", 0, "wrapS"), [1], r"whole number of at least 0 for wrapS of texture 0, got \[1\]"),
+    (("images", 0), {"uri": 5}, r"must name a file or hold data in image 0, got 5"),
+    (("images", 0), {"uri": ["a.png"]}, r"must name a file or hold data in image 0"),
+    (("cameras", 0, "type"), 1, r"must have a string for type of camera 0, got 1"),
+    (("cameras", 0, "perspective"), [1], r"must have an object for perspective of camera 0, got \[1\]"),
+    (("cameras", 0, "perspective"), {}, r"must have a finite number for yfov of camera 0, got None"),
+    (("asset",), "2.0", r"must have an object for asset of the file, got '2\.0'"),
+    (("asset", "version"), [2], r"of version 2, got version \[2\]"),
+    (("scene",), False, r"must refer to one of its 1 scenes in the default scene, got False"),
+    (("extensionsUsed",), "KHR", r"must have a list for extensionsUsed of the file, got 'KHR'"),
+    (("extensionsUsed",), {"KHR": 1}, r"must have a list for extensionsUsed of the file"),
+    (("extensionsUsed",), ["KHR_a", 3], r"must have a list of strings for extensionsUsed of the file, got 3 in it"),
+    (
+        ("extensionsUsed", 0),
+        ["EXT"],
+        r"must have a list of strings for extensionsUsed of the file, got \['EXT'\] in it",
+    ),
+]
+
+
+@pytest.mark.parametrize(("way", "value", "message"), TYPES)
+def test_fields_of_wrong_types_are_refused_by_name(tmp_path, way, value, message):
+    writer = everything(tmp_path)
+    writer.header = changed(writer.header, way, value)
+    with pytest.raises(ValueError, match=rf"wrong\.glb must .*{message.removeprefix('must ')}"):
+        load_scene(writer.write(tmp_path / "wrong.glb"))
+
+
+def test_required_extensions_must_be_a_list_of_strings_for_meshes_too(tmp_path):
+    writer = everything(tmp_path)
+    for value in ("KHR", [1], {}):
+        writer.header["extensionsRequired"] = value
+        for load in (load_scene, load_mesh):
+            with pytest.raises(
+                ValueError, match=r"a\.glb must have a list (of strings )?for extensionsRequired of the file"
+            ):
+                load(writer.write(tmp_path / "a.glb"))
+
+
+def test_what_is_not_used_may_be_damaged_and_extras_may_be_anything(tmp_path):
+    writer = everything(tmp_path)
+    path = tmp_path / "a.glb"
+    expected = load_scene(writer.write(path)).mesh
+    for kind in ("nodes", "meshes", "materials", "accessors", "scenes", "cameras"):
+        writer.header[kind][0] |= {"extras": [NAN, "x", {"nodes": 3}], "unknown": 10**300, "name": {"a": [1]}}
+    writer.header["accessors"].append({"count": -1})
+    writer.header["nodes"].append({"mesh": 99})
+    writer.header["materials"].append({"pbrMetallicRoughness": 3})
+    writer.header["meshes"].append({"primitives": None})
+    writer.header |= {"extras": 1, "animations": [], "whatever": NAN}
+    np.testing.assert_array_equal(load_scene(writer.write(path)).mesh.position, expected.position)
+
+
+def test_whole_numbers_may_be_written_with_a_fraction_of_zero(tmp_path):
+    writer = everything(tmp_path)
+    expected = load_scene(writer.write(tmp_path / "a.glb")).mesh
+    for way, value in (
+        (("nodes", 0, "mesh"), 0.0),
+        (("accessors", 0, "count"), 4.0),
+        (("bufferViews", 3, "byteLength"), 48.0),
+    ):
+        writer.header = changed(writer.header, way, value)
+    np.testing.assert_array_equal(load_scene(writer.write(tmp_path / "a.glb")).mesh.position, expected.position)
+
+
+def test_names_that_stand_twice_in_an_object_are_refused(tmp_path):
+    text = everything(tmp_path).write(tmp_path / "a.gltf").read_text()
+    (tmp_path / "a.gltf").write_text(text.replace('"scene": 0', '"scene": 0, "scene": 0'))
+    with pytest.raises(ValueError, match=r"a\.gltf must .* not JSON: an object has the name 'scene' 2 times"):
+        load_scene(tmp_path / "a.gltf")
+
+
+def test_headers_may_start_with_a_byte_order_mark(tmp_path):
+    path = everything(tmp_path).write(tmp_path / "a.gltf")
+    expected = load_scene(path).mesh
+    for mark, encoding in ((codecs.BOM_UTF8, "utf-8"), (b"", "utf-16"), (b"  \n", "utf-8")):
+        (tmp_path / "b.gltf").write_bytes(mark + path.read_text().encode(encoding))
+        np.testing.assert_array_equal(load_scene(tmp_path / "b.gltf").mesh.position, expected.position)
+    glb = one((writer := Writer()).square(), writer=writer).write(tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(glb[12:16], "little")
+    size = (len(glb) + 4).to_bytes(4, "little") + (length + 4).to_bytes(4, "little")
+    marked = glb[:8] + size + glb[16:20] + codecs.BOM_UTF8 + b" " + glb[20:]
+    (tmp_path / "b.glb").write_bytes(marked)
+    np.testing.assert_array_equal(load_mesh(tmp_path / "b.glb").position, SQUARE)
+
+
+def test_headers_of_depths_and_digits_without_end_are_refused(tmp_path):
+    path = tmp_path / "a.gltf"
+    for text in (
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        "9" * 5000,
+        '{"asset": {"version": ' + "9" * 5000 + "}}",
+        "",
+        "null",
+        "3",
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"a\.gltf must be an undamaged glTF file"):
+            load_scene(path)
+
+
+def test_images_that_cannot_be_read_are_left_out_and_named(tmp_path):
+    writer = everything(tmp_path)
+    path = tmp_path / "a.glb"
+    writer.header["images"][0] = {"uri": "picture.png"}
+    content = (tmp_path / "image.png").read_bytes()
+    for wrong in (b"", b"no picture", content[:40], content[:-30]):
+        (tmp_path / "picture.png").write_bytes(wrong)
+        with pytest.warns(
+            UserWarning, match=r"ignored are textures that cannot be read \(image 0, picture\.png must be"
+        ):
+            scene = load_scene(writer.write(path))
+        material = scene["a"].material
+        assert material.textures == ()
+        assert float(material.metallic) == 0.5
+        np.testing.assert_array_equal(material.emissive, [0, 0, 1])
+    writer.header["images"][0] = {"uri": "data:image/png;base64,AAAA"}
+    with pytest.warns(UserWarning, match=r"textures that cannot be read \(image 0, data:image/png;base64,AAAA must be"):
+        load_scene(writer.write(path))
+    # One that is not there can be put there, so that is an error.
+    writer.header["images"][0] = {"uri": "gone.png"}
+    with pytest.raises(FileNotFoundError, match=r"gone\.png must be the file that .*a\.glb needs for image 0"):
+        load_scene(writer.write(path))
+
+
+def test_signaling_nans_are_refused_like_others(tmp_path):
+    position = SQUARE.copy()
+    position.view(np.uint32)[1, 2] = 0x7FA00000
+    writer = one((writer := Writer()).square(POSITION=position), writer=writer)
+    with pytest.raises(ValueError, match=r"a\.glb: positions must be finite, got 1 of 4"):
+        load_scene(writer.write(tmp_path / "a.glb"))
+
+
+def test_names_of_materials_can_be_written_to_files(tmp_path):
+    writer = one((writer := Writer()).square(material=0), writer=writer)
+    for name, expected in (("\ud800x", "?x"), (7, "7"), ("", "material 0"), (None, "material 0"), ("häuser", "häuser")):
+        writer.header["materials"] = [{"name": name}]
+        (part,) = load_scene(writer.write(tmp_path / "a.glb")).parts
+        assert part.name == expected
+
+
+EXTREMES = [None, True, False, 0, -1, 1, 3, 2**31, 2**32, 2**53, 2**63, 10**30, 10**400, 0.5, -0.0, 1e308, NAN, NAN * 2]
+EXTREMES += [
+    float("inf"),
+    "",
+    "text",
+    "../../../../etc/passwd",
+    "\0",
+    [],
+    {},
+    [[]],
+    [0] * 3,
+    ["x"],
+    {"a": 1},
+    [1e300] * 16,
+]
+
+
+def mutated(content: bytes, path: pathlib.Path, rng: random.Random, header: dict, writer: Writer) -> None:
+    """Writes a file with one random damage."""
+    kind = rng.choice(["flip", "cut", "value", "value", "remove", "insert"])
+    if kind == "cut":
+        path.write_bytes(content[: rng.randrange(len(content))])
+    elif kind == "insert":
+        place = rng.randrange(len(content))
+        path.write_bytes(content[:place] + rng.randbytes(rng.choice([1, 4, 100])) + content[place:])
+    elif kind == "flip":
+        damaged = bytearray(content)
+        for _ in range(rng.choice([1, 4, 30])):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        path.write_bytes(bytes(damaged))
+    else:
+        writer.header = copy.deepcopy(header)
+        for _ in range(rng.choice([1, 1, 3])):
+            way = rng.choice(places(writer.header))
+            if kind == "value":
+                writer.header = changed(writer.header, way, rng.choice(EXTREMES))
+                continue
+            item: Any = writer.header
+            for key in way[:-1]:
+                item = item[key]
+            del item[way[-1]]
+        try:
+            writer.write(path)
+        except (KeyError, TypeError):  # the writer needs some of the fields
+            path.write_text(json.dumps(writer.header))
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_random_damage_ends_in_a_scene_or_an_error_that_names_the_file(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(require, "available_memory", lambda: 300_000_000)
+    rng = random.Random(45)
+    writer = everything(tmp_path)
+    header, path = writer.header, tmp_path / f"damaged.{suffix}"
+    content = writer.write(path).read_bytes()
+    assert outcome(path) == "read"
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    outcomes = []
+    for _ in range(250):
+        mutated(content, path, rng, header, writer)
+        outcomes.append(outcome(path))
+    assert 20 < outcomes.count("read") < 200
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 600_000  # kB
+
+
+def test_all_values_of_a_header_may_be_of_any_type(tmp_path, monkeypatch):
+    """Each value once, with a type or an extreme that differs from place to place."""
+    monkeypatch.setattr(require, "available_memory", lambda: 300_000_000)
+    writer = everything(tmp_path)
+    header, path = writer.header, tmp_path / "damaged.glb"
+    errors = 0
+    for number, way in enumerate(places(header)):
+        writer.header = changed(header, way, EXTREMES[(7 * number) % len(EXTREMES)])
+        errors += outcome(writer.write(path)) != "read"
+    assert errors > 100
