@@ -19,7 +19,6 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 """
 
-# ruff: noqa: E402
 import importlib.metadata
 import os
 

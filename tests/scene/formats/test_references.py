@@ -196,7 +196,7 @@ def test_names_that_no_file_can_have_are_refused(place, name, outside):
         with pytest.raises((ValueError, FileNotFoundError), match=r"a\.gl"):
             load_scene(kind(place, urllib.parse.quote(name)), outside=outside)
     if "\0" in name:
-        with pytest.raises(ValueError, match=r"a\.mtl.*got '.*\\x00b'"):
+        with pytest.raises(ValueError, match=r"a\.mtl must be an MTL file, got one that is not text"):
             load_scene(scene_of_map(place, name))
         return
     if name.startswith("circle") and not outside and sys.version_info < (3, 13):  # which resolves links in a circle
