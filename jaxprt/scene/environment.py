@@ -33,28 +33,28 @@ _CHUNK = 2**20  # parts of pixels per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
-def _floating(radiance):
-    """Lists and integers converted to floating-point arrays; other values unchanged."""
-    dtype = getattr(radiance, "dtype", None)
-    if dtype is None or jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_):
-        return jnp.asarray(radiance, jnp.result_type(float))
-    return radiance
-
-
 class Environment(eqx.Module):
     """Distant light: the mean linear radiance of each cubemap texel.
 
-    The radiance must be finite and have six square faces, otherwise ValueError is raised. Inside `jax.jit` values are
-    not known and not checked: a NaN then reaches every vertex that the texel lights.
+    The radiance must be finite, at most 1e15 in magnitude, and have six square faces. Lists, NumPy arrays and integers
+    are converted to JAX arrays of floating point, and half precision to float32. Negative radiance is allowed, because
+    relighting is linear: a difference of two lights, the light of one basis function and the gradient of a light are
+    environments too. `load_environment` sets negative pixels of files to zero. Inside `jax.jit` values are not known
+    and not checked: a NaN then reaches every vertex that the texel lights.
 
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
+
+    Raises:
+        TypeError: The radiance does not consist of real numbers, or is a masked array.
+        ValueError: The radiance has another shape, is not finite, or is above 1e15.
     """
 
-    radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=_floating)
+    radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
 
     def __check_init__(self):
-        """Refuses radiance that is not on six square faces, or not finite."""
+        """Refuses radiance that is not of real numbers, not on six square faces, or not finite."""
+        require.real("the light's radiance", self.radiance)
         shape = jnp.shape(self.radiance)
         if len(shape) < 4 or shape[-4] != 6 or shape[-3] != shape[-2] or 0 in shape[-3:]:
             raise ValueError(f"the light's radiance must be [..., 6, n, n, c], got {list(shape)}")

@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
+from jaxprt.scene import mesh_arrays
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry
 from jaxprt.sphere import directions
@@ -34,12 +35,16 @@ class Mesh(eqx.Module):
             there are none.
     """
 
-    position: Float[Array, "v 3"]
-    face: Int[Array, "f 3"]
-    normal: Float[Array, "v 3"]
-    tangent: Float[Array, "v 3"]
-    region: Int[Array, " v"]
-    texture: Float[Array, "v 2"] | None = None
+    position: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    face: Int[Array, "f 3"] = eqx.field(converter=mesh_arrays.as_array)
+    normal: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    tangent: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    region: Int[Array, " v"] = eqx.field(converter=mesh_arrays.as_array)
+    texture: Float[Array, "v 2"] | None = eqx.field(converter=mesh_arrays.as_array, default=None)
+
+    def __check_init__(self):
+        """Refuses arrays of other types and lengths. `make_mesh` and `jaxprt.Part` check values too."""
+        mesh_arrays.check_shapes(self)
 
 
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:

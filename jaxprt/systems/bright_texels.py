@@ -17,7 +17,7 @@ from jaxprt.compile import jit, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems import adaptive
+from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility import LEVELS
 
@@ -122,6 +122,7 @@ class BrightTexels(VertexSystem):
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
         position, frame = self.place(self.visibility)
+        eye = require.position("the eye", eye, each=self.vertices)
         return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
 
     def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
@@ -170,10 +171,8 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         TypeError: The light is not an `Environment`.
         ValueError: The light is a batch, or `count` is negative or not below the number of texels.
     """
-    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
+    light = protocol.one_light(light)
     size, colors = light.radiance.shape[-2:]
-    if light.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
     if not 0 <= count < 6 * size * size:
         raise ValueError(f"the number of texels must be from 0 to {6 * size * size - 1}, got {count}")
     radiance = light.radiance.reshape(-1, colors)
@@ -225,7 +224,7 @@ def radiance(
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)
-    require.position("the eye", eye)
+    eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
     return _sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)

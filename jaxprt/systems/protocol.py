@@ -121,6 +121,11 @@ class VertexSystem(System):
         return placed(transport.position, transport.frame, self.points)
 
 
+def _parameters(value: Any) -> Any:
+    """A list of parameters as a tuple of arrays. Anything else is left for `Blend` to refuse."""
+    return tuple(map(require.floating, value)) if isinstance(value, list | tuple) else value
+
+
 class Blend(eqx.Module):
     """Material of each vertex: a weighted sum of basis BRDFs.
 
@@ -132,12 +137,18 @@ class Blend(eqx.Module):
         parameter: BRDF parameters of each vertex, such as roughness, one array for each parameter of the table.
     """
 
-    weight: Float[Array, "v k c"]
-    parameter: tuple[Float[Array, " v"], ...] = ()
+    weight: Float[Array, "v k c"] = eqx.field(converter=require.floating)
+    parameter: tuple[Float[Array, " v"], ...] = eqx.field(converter=_parameters, default=())
 
     def __check_init__(self):
         """Refuses weights and parameters that are not finite, and parameters whose length differs from the weights'."""
         require.finite("the weights of the blend", self.weight)
+        if jnp.ndim(self.weight) != 3:
+            raise ValueError(f"the weights of the blend must be [v, k, c], got {list(jnp.shape(self.weight))}")
+        if not isinstance(self.parameter, tuple):
+            raise TypeError(
+                f"the parameters of the blend must be a list of arrays, got {type(self.parameter).__name__}"
+            )
         for each in self.parameter:
             require.finite("the parameters of the blend", each)
             require.length("values of each parameter of the blend", each, len(self.weight))
@@ -295,6 +306,33 @@ def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
     return tuple(points)
 
 
+def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> Environment:
+    """The light that a system is to relight with, checked, in float32 or float64.
+
+    Args:
+        value: The light.
+        size: Edge of the cubemap faces that the transport was precomputed for, in texels; None for any.
+        batch: Whether lights may be stacked along leading axes.
+
+    Raises:
+        TypeError: The value is not an `Environment`.
+        ValueError: The light is a batch, has faces of another size, or is not finite.
+    """
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+    shape = list(jnp.shape(value.radiance))
+    wanted = "n" if size is None else size
+    required = f"the light must be one environment [6, {wanted}, {wanted}, c], got {shape}"
+    if len(shape) != 4 and not batch:
+        raise ValueError(required)
+    if size is not None and shape[-3] != size:
+        raise ValueError(
+            f"{required}: load it with jaxprt.load_environment(path, size={size}), or precompute with size={shape[-3]}"
+        )
+    require.finite("the light", value.radiance)
+    radiance = require.floating(value.radiance)
+    return value if radiance is value.radiance else Environment(radiance)
+
+
 def total(*systems: System) -> Total:
     """The sum of systems over the same vertices, such as `total(direct, bounces)`.
 
@@ -328,9 +366,9 @@ def radiance(
         ValueError: A batch is empty, or a method of the system raises it.
     """
     _check(system)
-    require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
+    environment = one_light(environment, batch=True)
     *batch, faces, rows, columns, colors = environment.radiance.shape
-    eye = eye if isinstance(eye, jax.Array) else jnp.asarray(eye, jnp.result_type(float))
+    eye = require.position("the eye", eye)
     view = system.view(eye, materials)
     if not batch:
         return system.combine(system.shade(system.light(environment), materials), view)

@@ -16,7 +16,7 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
-from jaxprt.systems import adaptive
+from jaxprt.systems import adaptive, protocol
 
 _BLOCK = 64
 _MIRROR = np.array([-1, -1, 1], np.float32)
@@ -69,9 +69,7 @@ def radiance(
     if not error > 0:
         raise ValueError(f"error must be positive, got {error}")
     brdf = grid.as_argument(brdf)
-    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
-    require.finite("the light", light.radiance)
-    require.position("the eye", eye)
+    light, eye = protocol.one_light(light, batch=True), require.position("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     if points is None:
         start = visibility.start_points(mesh, rays)

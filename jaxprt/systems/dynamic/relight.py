@@ -19,7 +19,7 @@ from jaxprt import require
 from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import bright_texels, lobe, separable
+from jaxprt.systems import bright_texels, lobe, protocol, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
 from jaxprt.systems.lobe import LobeLight, LobeView
@@ -166,12 +166,7 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
         TypeError: `light` is not an `Environment`.
         ValueError: The light is a batch, has another size than the transport requires, or is not finite.
     """
-    size = transport.size
-    if not isinstance(light, Environment):
-        raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
-    if light.radiance.shape[:-1] != (6, size, size):
-        raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
-    require.finite("the light", light.radiance)
+    light = protocol.one_light(light, size=transport.size)
     texel, excess, rest = bright_texels.split(light, count=texels)
     met = tuple(each.terms.apply(separable.project(rest)) for each in transport.region)
     blurred = None
@@ -201,8 +196,7 @@ def view_side(
         eye: Position of the viewer in world units.
         points: Points of each region; None for the vertices.
     """
-    eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
-    require.position("the eye", eye)
+    eye = require.position("the eye", eye).astype(transport.region[0].seen.position.dtype)
     _check_all(transport, brdfs, materials)
     return _view_side(transport, brdfs, materials, eye, points)
 
