@@ -26,14 +26,14 @@ _MOST = 2**31 - 1  # largest index of 32 bits
 def real(name: str, value: Any) -> None:
     """Refuses anything but real numbers: text, booleans, complex numbers, masked arrays, None and other objects.
 
-    Numbers, nested lists of them, NumPy and JAX arrays pass. The type is checked inside `jax.jit` too. Raises TypeError.
+    Numbers, nested lists of them, NumPy and JAX arrays pass. The type is checked inside `jax.jit` too.
     """
-    wrong = _unreal(value)
+    wrong = unreal(value)
     if wrong:
         raise TypeError(f"{name} must be real numbers, got {wrong}")
 
 
-def _unreal(value: Any) -> str:
+def unreal(value: Any) -> str:
     """What a value is that does not consist of real numbers; empty if it does."""
     if isinstance(value, np.ma.MaskedArray):
         return "a masked array: fill its masked values first"
@@ -72,7 +72,7 @@ def floating(value: Any, dtype: Any = None) -> Any:
         value: A number, a list or an array.
         dtype: Type of the result; None for the value's own, or the default one for integers.
     """
-    if _unreal(value):
+    if unreal(value):
         return value
     known = _array_of(value)
     if dtype is None:
@@ -170,23 +170,24 @@ def number(name: str, value: Any, low: float, high: float = LARGEST, *, above: b
 def count(name: str, value: Any, least: int = 0, most: int = _MOST) -> None:
     """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} must be a whole number, got {_shown(value)}")
+        raise TypeError(f"{name} must be a whole number, got {shown(value)}")
     if not least <= value <= most:
-        bound = f"at least {least}" if most == _MOST else f"between {least} and {most}"
+        bound = f"at least {least}" if value < least else f"at most {most}"
+        bound = bound if most == _MOST else f"between {least} and {most}"
         raise ValueError(f"{name} must be {bound}, got {value}")
 
 
 def path(name: str, value: Any) -> None:
     """Refuses anything but the name of a file or folder, as text or a path, by TypeError."""
     if not isinstance(value, str | os.PathLike):
-        raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {_shown(value)}")
+        raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {shown(value)}")
 
 
 def executor(value: Any) -> None:
     """Refuses anything but None and objects with the method `submit` of `concurrent.futures.Executor`, by TypeError."""
     if value is not None and not callable(getattr(value, "submit", None)):
         raise TypeError(
-            f"executor must be None or an executor such as concurrent.futures.ProcessPoolExecutor, got {_shown(value)}"
+            f"executor must be None or an executor such as concurrent.futures.ProcessPoolExecutor, got {shown(value)}"
         )
 
 
@@ -392,7 +393,7 @@ def _described(value: Any) -> str:
     return f"one of class {type(value).__name__}"
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """A value in at most 40 letters, and its class."""
     if isinstance(value, jax.Array | np.ndarray):
         return _described(value)

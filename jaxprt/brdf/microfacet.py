@@ -38,7 +38,7 @@ _SMOOTHEST = 1e-3  # smallest alpha, because a perfect mirror has no density
 def _both_axes(value: Any) -> Any:
     """One number for both tangent axes, or two numbers, as an array of shape [2]."""
     value = scalar(value)
-    return jnp.broadcast_to(value, (2,)) if jnp.shape(value) == () and isinstance(value, jax.Array) else value
+    return jnp.broadcast_to(value, (2,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
 def _alpha(roughness: Array) -> Array:
@@ -202,6 +202,8 @@ class MetallicRoughness(Model):
     rotation: Float[Array, "*#b"] = eqx.field(converter=scalar, default=0.0)
 
     def __check_init__(self):
+        for name, value in vars(self).items():
+            require.real(f"{name} of MetallicRoughness", value)
         for name in ("metallic", "specular", "anisotropy"):
             require.within(f"{name} of MetallicRoughness", getattr(self, name), 0, 1)
         shape = {name: each.shape for name, each in vars(self).items()}

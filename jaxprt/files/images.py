@@ -9,6 +9,8 @@ import OpenEXR
 import OpenImageIO
 from jaxtyping import Array, Float, Float32
 
+from jaxprt import require
+
 _MAGIC = (
     (b"\x76\x2f\x31\x01", "openexr"),
     (b"#?", "hdr"),
@@ -146,6 +148,8 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
 
 
 def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
+    require.real("image", image)
+    require.array("image", image, "h w c")
     if image.dtype.kind != "f":
         raise ValueError(f"image must be of floating point, with 1 for white in pictures, got {image.dtype}")
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
@@ -154,6 +158,7 @@ def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, s
 
 
 def _check_folder(path: str | pathlib.Path) -> None:
+    require.path("path", path)
     folder = pathlib.Path(path).absolute().parent
     if not folder.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {folder}")

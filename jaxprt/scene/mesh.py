@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
+from jaxprt import require
 from jaxprt.scene import mesh_arrays
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry
@@ -299,6 +300,8 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
     """A field as an array, checked for its shape. None in `shape` stands for any size."""
+    if isinstance(value, np.ma.MaskedArray | list | tuple):  # lists of different lengths
+        require.real(f"{name}: {field}", value)
     array = np.asarray(value)
     fits = array.ndim == len(shape) and all(must in (None, n) for must, n in zip(shape, array.shape, strict=True))
     kinds = (jnp.integer,) if whole else (jnp.integer, jnp.floating)

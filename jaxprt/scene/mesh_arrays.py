@@ -17,22 +17,25 @@ _FIELDS = {
     "region": ((), True),
     "texture": ((2,), False),
 }
+_WRONG = float, complex, str, bytes, list, tuple, dict, set
 
 
 def as_array(value: Any) -> Any:
     """NumPy arrays and lists of real numbers as JAX arrays, in float32 and int32 unless float64 is enabled."""
     if isinstance(value, jax.Array) or not isinstance(value, np.ndarray | list | tuple):
         return value
+    if require.unreal(value):
+        return value
     known = np.asarray(value)
-    if jnp.issubdtype(known.dtype, jnp.integer) and np.all(np.abs(known) < 2**31):
-        return jax.device_put(known.astype(np.int32))
-    return require.floating(value) if jnp.issubdtype(known.dtype, jnp.floating) else value
+    if jnp.issubdtype(known.dtype, jnp.floating):
+        return require.floating(value)
+    return jax.device_put(known.astype(np.int32)) if np.all(np.abs(known) < 2**31) else value
 
 
 def check_shapes(mesh: Any) -> None:
     """Refuses a mesh whose arrays have other types than its fields, or other lengths than its positions.
 
-    Fields that are not arrays pass, such as the axes of `jax.vmap`. Values are not looked at.
+    Placeholders such as the axes of `jax.vmap` pass. Values are not looked at.
 
     Raises:
         TypeError: An array has a wrong type.
@@ -40,8 +43,13 @@ def check_shapes(mesh: Any) -> None:
     """
     for name, (width, whole) in _FIELDS.items():
         value = getattr(mesh, name)
-        if not isinstance(value, jax.Array | np.ndarray):  # such as the axes of `jax.vmap`
+        if not isinstance(value, jax.Array | np.ndarray):
+            if isinstance(value, _WRONG):
+                raise TypeError(
+                    f"{name} of a mesh must be an array of numbers, got one of class {type(value).__name__}"
+                )
             continue
+        require.real(f"{name} of a mesh", value)
         if not jnp.issubdtype(value.dtype, jnp.integer if whole else jnp.floating):
             kind = "integers" if whole else "real numbers"
             raise TypeError(f"{name} of a mesh must be {kind}, got {value.dtype}: `make_mesh` converts lists")
@@ -53,13 +61,26 @@ def check_shapes(mesh: Any) -> None:
             raise ValueError(f"{name} of a mesh must be [{required}], got {list(shape)}")
 
 
+def check_kinds(mesh: Any, name: str) -> None:
+    """Refuses a mesh with fields that are not arrays, which only placeholders are.
+
+    Raises:
+        TypeError: There is such a field.
+    """
+    for field in _FIELDS:
+        value = getattr(mesh, field)
+        if value is not None or field != "texture":
+            require.array(f"{field} of {name}", value, "v", "v _")
+
+
 def check_values(mesh: Any, name: str) -> None:
     """Refuses a mesh with values that are not finite, or faces that refer to missing vertices.
 
     Raises:
         ValueError: There are such values. Inside `jax.jit` they are not known and not checked.
     """
-    for field in ("position", "normal", "tangent", "texture"):
+    check_kinds(mesh, name)
+    for field in _FIELDS:
         value = getattr(mesh, field)
         if value is not None:
             require.finite(f"{field} of {name}", value)

@@ -141,7 +141,9 @@ class PointLight(eqx.Module):
 def _tuple(items: Any) -> tuple:
     """A sequence as a tuple."""
     if isinstance(items, eqx.Module | str | bytes) or not isinstance(items, Iterable):
-        raise TypeError(f"a scene takes lists of parts, cameras and environments, got one {type(items).__name__}")
+        raise TypeError(
+            f"a scene takes lists of parts, cameras, environments and point_lights, got one {type(items).__name__}"
+        )
     return tuple(items)
 
 

@@ -154,6 +154,7 @@ class BrightTexels(VertexSystem):
         return rest and (BrightTexels, self.count, rest)
 
 
+@require.arguments(light=protocol.one_light, count=partial(require.count, "the number of texels", least=-1))
 @partial(jit, static_argnames=("count",))
 def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
     """Takes the excess radiance of the brightest texels out of a light.
@@ -171,7 +172,6 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         TypeError: The light is not an `Environment`.
         ValueError: The light is a batch, or `count` is negative or not below the number of texels.
     """
-    light = protocol.one_light(light)
     size, colors = light.radiance.shape[-2:]
     if not 0 <= count < 6 * size * size:
         raise ValueError(f"the number of texels must be from 0 to {6 * size * size - 1}, got {count}")
@@ -221,6 +221,7 @@ def radiance(
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     brdf = grid.as_argument(brdf)
+    require.count("samples", samples, -1, 64)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)
@@ -235,7 +236,7 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
     require.length("rows of the excess", excess, len(texel))
     require.finite("the excess", excess)
     require.within("the texels", texel, 0, 6 * transport.size**2 - 1)
-    return jnp.asarray(excess, jnp.result_type(excess, transport.position))
+    return require.floating(excess)
 
 
 @partial(jit, static_argnames=("size", "samples"))
@@ -316,8 +317,9 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     Raises:
         ValueError: The error is not positive.
     """
-    if not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
+    require.number("error", error, 0.0, above=True)
+    require.count("size", size, 1)
+    grid.check(brdf)
     rule = [np.polynomial.legendre.leggauss(count) for count in (*_SAMPLES, _FINE)]
     place = np.concatenate([np.stack(np.meshgrid(x, x), -1).reshape(-1, 2) for x, _ in rule])
     weight = np.concatenate([np.outer(w, w).ravel() for _, w in rule])

@@ -17,12 +17,14 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive, protocol
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 _BLOCK = 64
 _MIRROR = np.array([-1, -1, 1], np.float32)
 _DARK = 1e-30
 
 
+@require.arguments(**{name: PRECOMPUTE[name] for name in ("mesh", "occluder", "vertex")})
 def radiance(
     mesh: Mesh,
     brdf: Callable,
@@ -66,8 +68,10 @@ def radiance(
             the light or the eye is not finite. Values cannot be checked inside `jax.jit`, where NaN reaches the
             vertices.
     """
-    if not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
+    if not isinstance(brdf, PerVertex):
+        grid.check(brdf)
+    if error != np.inf:
+        require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
     light, eye = protocol.one_light(light, batch=True), require.position("the eye", eye)
     rays = visibility.Occluder(mesh if occluder is None else occluder)

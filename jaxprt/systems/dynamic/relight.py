@@ -8,12 +8,14 @@ keeps the other result. `combine` computes radiance from both.
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.compile import isolated, jit
@@ -30,8 +32,10 @@ from jaxprt.visibility.points import PointVisibility
 _ROUNDED = 1e-4  # tolerance for the sum of weights in single precision
 
 
-def _floating(value: ArrayLike) -> Array:
-    return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
+def _floating(value: Any) -> Any:
+    """Numbers as an array with at least one axis. What is not of numbers is left for `Material` to refuse."""
+    value = require.floating(value, jnp.result_type(float))
+    return jnp.atleast_1d(value) if isinstance(value, jax.Array) else value
 
 
 class Material(eqx.Module):
@@ -51,6 +55,11 @@ class Material(eqx.Module):
     weight: Float[Array, " m"] = eqx.field(converter=_floating)
     diffuse: Float[Array, "*v c"] = eqx.field(converter=_floating)
     specular: Float[Array, "*w d"] = eqx.field(converter=_floating)
+
+    def __check_init__(self):
+        """Refuses anything but real numbers."""
+        for name in ("weight", "diffuse", "specular"):
+            require.real(f"{name} of the material", getattr(self, name))
 
 
 class DynamicLight(eqx.Module):

@@ -57,6 +57,10 @@ def _eyes(value: Any) -> Array:
     return require.position("the eye", value, each=shape[0] if len(shape) == 2 else None)
 
 
+def _degree(value: Any) -> None:
+    require.count("degree", value, 0, 256)
+
+
 def _probe(value: Any) -> Array:
     require.array("probes", value, "p 3")
     require.finite("probes", value)
@@ -71,7 +75,7 @@ def _probe_coefficient(value: Any) -> Array:
     return require.floating(value)
 
 
-@require.arguments(light=partial(protocol.one_light, batch=True))
+@require.arguments(light=partial(protocol.one_light, batch=True), degree=_degree)
 def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
     """Projects an environment, or each one of a batch, to spherical harmonics.
 
