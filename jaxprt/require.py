@@ -120,11 +120,7 @@ def finite(name: str, value: Any) -> None:
 def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None:
     """Refuses what `finite` refuses, and values below a bound.
 
-    Args:
-        name: Description of the value for the message, such as "the albedo".
-        value: A number or an array.
-        least: The bound.
-        slack: Tolerance for rounding errors.
+    `slack` is a tolerance for rounding errors.
     """
     finite(name, value)
     if not isinstance(value, Tracer):
@@ -191,6 +187,12 @@ def executor(value: Any) -> None:
         )
 
 
+def function(name: str, value: Any) -> None:
+    """Refuses anything but None and a function, by TypeError."""
+    if value is not None and not callable(value):
+        raise TypeError(f"{name} must be a function or None, got {shown(value)}")
+
+
 def _require(name: str, what: str, known: np.ndarray, right: np.ndarray) -> None:
     if right.all():
         return
@@ -248,9 +250,6 @@ def length(name: str, value: Any, count: int) -> None:
         name: Description of the rows for the message, such as "the light's coefficients".
         value: The array.
         count: Required number of rows.
-
-    Raises:
-        ValueError: It has another number.
     """
     shape = np.shape(value)
     if not shape or shape[0] != count:

@@ -66,7 +66,7 @@ HOSTILE: dict[str, Any] = {
     "complex array": np.ones((6, SIZE, SIZE, 3), complex),
     "object array": np.array([1, None, "x"], object),
 }
-ERRORS = TypeError, ValueError, FileNotFoundError, MemoryError
+ERRORS = TypeError, ValueError, OSError, MemoryError
 
 
 class Verb:
@@ -227,13 +227,16 @@ def scene_verbs() -> dict[str, Verb]:
         "memory": Verb(prt.memory, system=ready),
         "total": Verb(lambda system: prt.total(system, system), system=ready.direct.part[0]),
         "shard": Verb(prt.shard, value=ready, devices=jax.devices()[:1]),
-        "load_environment": Verb(prt.load_environment, path="missing.hdr", size=SIZE, layout=None),
+        "load_environment": Verb(prt.load_environment, path="missing.hdr"),
+        "environment_from_image": Verb(
+            prt.scene.environment.environment_from_image, image=np.ones((4, 8, 3)), size=4, layout=None
+        ),
         "load_mesh": Verb(prt.load_mesh, path="missing.obj"),
         "load_scene": Verb(prt.load_scene, path="missing.gltf"),
         "files.load": Verb(prt.files.load, path="missing"),
         "files.read_image": Verb(prt.files.read_image, path="missing.png"),
         "reference.radiance": Verb(
-            prt.reference.radiance, keep=("progress",), mesh=mesh(), brdf=prt.brdf.Lambert(0.5), light=environment(),
+            prt.reference.radiance, keep=("progress", "error"), mesh=mesh(), brdf=prt.brdf.Lambert(0.5), light=environment(),
             eye=EYE, occluder=None, vertex=[0], points=None, error=1e-2, progress=False, between=None,
         ),
         "mesh.join": Verb(prt.scene.mesh.join, meshes=[mesh()]),
@@ -318,7 +321,7 @@ def offense(verb: Verb, argument: str, value: Any) -> str | None:
     except ERRORS as error:
         raised = traceback.extract_tb(error.__traceback__)[-1].filename
         first = str(error).split("\n")[0]
-        if not raised.startswith(PACKAGE) and not isinstance(error, FileNotFoundError):
+        if not raised.startswith(PACKAGE) and not isinstance(error, OSError):
             return f"{type(error).__name__} out of {pathlib.Path(raised).name}: {first}"
         return None if any(word in first for word in words) else f"an error without a name: {first}"
     except Exception as error:

@@ -3,6 +3,7 @@
 import pathlib
 import tempfile
 import typing
+from functools import partial
 
 import numpy as np
 import OpenEXR
@@ -28,6 +29,7 @@ _CHANNELS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
 _MAX_PIXELS = 2**29
 
 
+@require.arguments(path=partial(require.path, "path"))
 def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     """Reads an image file as linear values.
 

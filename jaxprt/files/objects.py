@@ -13,6 +13,7 @@ import re
 import shutil
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxprt import require
 from jaxprt.files import mapped
 
 VERSION = 2
@@ -38,6 +40,7 @@ _FUNCTIONS = {
 }
 
 
+@require.arguments(path=partial(require.path, "path"))
 def save(path: str | os.PathLike, object: Any) -> None:
     """Saves an object of this package, or tuples, lists and dictionaries of such objects, without loss.
 
@@ -80,6 +83,7 @@ def save(path: str | os.PathLike, object: Any) -> None:
         shutil.rmtree(aside, ignore_errors=True)
 
 
+@require.arguments(path=partial(require.path, "path"))
 def load(path: str | os.PathLike) -> Any:
     """Loads an object that `save` has written, with the same classes, structure, types and bits.
 

@@ -11,9 +11,9 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
-from jaxprt.relit import lamps, reflection, warn
+from jaxprt.relit import lamps, reflection, tracing, warn
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.measuring import lights_of
+from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
@@ -21,6 +21,8 @@ from jaxprt.scene import Environment, Part, Scene
 from jaxprt.scene.scene import default_camera
 from jaxprt.systems.protocol import Joined
 from jaxprt.visibility import UnfinishedError
+
+_MOST = 1 << 13  # texels along the edge of a face
 
 
 def precompute(
@@ -85,9 +87,11 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
-        raise ValueError(f"size must be a power of two, got {size!r}")
+    _check_options(size, error, rate, environments, rays)
+    require.executor(executor)
     reflection.check(bounces)
+    if roughness is not None:
+        require.real("roughness", roughness)
     if roughness is not None and not (np.shape(roughness) == (2,) and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
     if roughness is not None and system is None:
@@ -95,6 +99,8 @@ def precompute(
             "roughness must be given together with a system, got no system: "
             "a plan is made for the materials of the scene"
         )
+    if path is not None:
+        require.path("path", path)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():
@@ -128,6 +134,19 @@ def precompute(
         reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
     lobes = reflection.sharp(shadings, systems, folder) if bounces and rays else None
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
+
+
+def _check_options(size, error, rate, environments, rays) -> None:
+    """Refuses sizes, errors, rates, lights and numbers of rays that no system takes."""
+    whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
+    if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
+        raise ValueError(f"size must be a power of two, at most {_MOST}, got {require.shown(size)}")
+    for name, value in (("error", error), ("rate", rate)):
+        if value is not None:
+            require.number(name, value, 0.0, above=True)
+    if environments is not None:
+        checked(environments, 1.0, 1.0)
+    tracing.check_rays(rays)
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:

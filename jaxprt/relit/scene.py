@@ -119,7 +119,7 @@ class RelitScene(System):
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
         """
-        _check_rays(rays)
+        tracing.check_rays(rays)
         # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
@@ -291,7 +291,7 @@ class RelitScene(System):
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
-        _check_rays(rays)
+        tracing.check_rays(rays)
         made = object.__new__(RelitScene)  # Works inside jax.jit too, where __init__ could not measure the curvature.
         for field in dataclasses.fields(self):
             object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
@@ -393,8 +393,3 @@ class RelitScene(System):
         given = self.appearances(materials)
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]
-
-
-def _check_rays(rays: int) -> None:
-    if type(rays) is not int or rays < 0:
-        raise ValueError(f"rays must be a whole number of at least 0, got {rays!r}")

@@ -61,6 +61,11 @@ class Environment(eqx.Module):
         require.finite("the light's radiance", self.radiance)
 
 
+def _size(value: object) -> None:
+    require.count("size", value, 1, 1 << 14)
+
+
+@require.arguments(path=functools.partial(require.path, "path"), size=_size)
 def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | None = None) -> Environment:
     """Loads distant light from an image file.
 
@@ -85,6 +90,7 @@ def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | 
     return environment_from_image(image, size=size, layout=layout, name=str(path))
 
 
+@require.arguments(image=functools.partial(require.real, "image"), size=_size)
 def environment_from_image(
     image: Float[np.ndarray | Array, "h w c"],
     *,
@@ -107,6 +113,9 @@ def environment_from_image(
         ValueError: The image has an unknown layout or number of channels, or holds NaN or infinity.
     """
     image = np.asarray(image)
+    require.array("image", image, "h w c")
+    if layout is not None and not isinstance(layout, str):
+        raise TypeError(f"layout must be one of {', '.join(LAYOUTS)}, got {require.shown(layout)}")
     layout = layout or layout_of(image, {}, name)
     _check_layout(image, layout, name)
     return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
@@ -241,7 +250,7 @@ def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) ->
 
 
 def _check_layout(image: np.ndarray, layout: str, name: str) -> None:
-    if layout not in LAYOUTS:
+    if not isinstance(layout, str) or layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     height, width = image.shape[:2]
     if 0 in image.shape:

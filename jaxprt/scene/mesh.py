@@ -2,6 +2,7 @@
 
 import pathlib
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -48,6 +49,7 @@ class Mesh(eqx.Module):
         mesh_arrays.check_shapes(self)
 
 
+@require.arguments(path=partial(require.path, "path"))
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
 
@@ -134,6 +136,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     Raises:
         ValueError: There are no meshes.
     """
+    mesh_arrays.check_meshes(meshes)
     if not meshes:
         raise ValueError("meshes must hold at least one mesh, got none")
     region, face = [], []
@@ -157,6 +160,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(position, face, normal, tangent, region, texture)
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh)
 def split(mesh: Mesh) -> list[Mesh]:
     """Splits a mesh into one mesh per region, in ascending order. Each part becomes region 0 of its mesh.
 
@@ -186,6 +190,7 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, rotation=partial(require.real, "rotation"))
 def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """Rotates a mesh about the origin: positions, normals and tangents.
 
@@ -203,6 +208,7 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture)
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, direction=partial(require.real, "direction"))
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     """Sets the tangents of a mesh to a direction of brushing, projected to the tangent plane of each vertex.
 
@@ -228,6 +234,7 @@ def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, every)[:, 0])
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, vertices=partial(require.count, "vertices", least=-1, most=1 << 26))
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
     """A square ground plane centered under a mesh.
 
@@ -248,8 +255,7 @@ def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> M
     """
     if vertices < 4:
         raise ValueError(f"vertices must be at least 4, got {vertices}")
-    if not extent > 0:
-        raise ValueError(f"extent must be positive, got {extent}")
+    require.number("extent", extent, 0.0, above=True)
     low, high = bounds(mesh)
     diagonal = float(np.linalg.norm(high - low)) or 1.0
     half = extent / 2 * (max(high[0] - low[0], high[2] - low[2]) or diagonal)

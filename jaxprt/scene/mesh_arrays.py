@@ -61,6 +61,25 @@ def check_shapes(mesh: Any) -> None:
             raise ValueError(f"{name} of a mesh must be [{required}], got {list(shape)}")
 
 
+def check_mesh(value: Any) -> None:
+    """Refuses anything but a mesh.
+
+    Raises:
+        TypeError: The value has not the fields of a mesh.
+    """
+    if not all(hasattr(value, field) for field in _FIELDS):
+        source = "jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
+        raise TypeError(f"the mesh must be of class Mesh, which {source} makes, got {require.shown(value)}")
+
+
+def check_meshes(value: Any) -> None:
+    """Refuses anything but a list of meshes, by TypeError."""
+    if not isinstance(value, list | tuple):
+        raise TypeError(f"meshes must be a list of meshes, got {require.shown(value)}")
+    for mesh in value:
+        check_mesh(mesh)
+
+
 def check_kinds(mesh: Any, name: str) -> None:
     """Refuses a mesh with fields that are not arrays, which only placeholders are.
 

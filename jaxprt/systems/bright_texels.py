@@ -23,7 +23,6 @@ from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
-_FINE = 32
 _value = jit(adaptive.value)
 
 
@@ -299,6 +298,7 @@ def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"
     return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
 
 
+@require.arguments(size=partial(require.count, "size", least=1))
 def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     """Number of sample points along the edge of a texel that `radiance` needs for a BRDF.
 
@@ -318,9 +318,8 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
         ValueError: The error is not positive.
     """
     require.number("error", error, 0.0, above=True)
-    require.count("size", size, 1)
     grid.check(brdf)
-    rule = [np.polynomial.legendre.leggauss(count) for count in (*_SAMPLES, _FINE)]
+    rule = [np.polynomial.legendre.leggauss(count) for count in (*_SAMPLES, 32)]
     place = np.concatenate([np.stack(np.meshgrid(x, x), -1).reshape(-1, 2) for x, _ in rule])
     weight = np.concatenate([np.outer(w, w).ravel() for _, w in rule])
     first = np.cumsum([0, *(len(x) ** 2 for x, _ in rule[:-1])])

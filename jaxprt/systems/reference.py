@@ -70,6 +70,7 @@ def radiance(
     """
     if not isinstance(brdf, PerVertex):
         grid.check(brdf)
+    require.function("between", between)
     if error != np.inf:
         require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
