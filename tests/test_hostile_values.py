@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import trimesh
 
 import jaxprt as prt
@@ -144,23 +143,34 @@ def constructors() -> dict[str, Verb]:
     color = prt.scene.Texture(image)
     result = {
         "Environment": Verb(prt.Environment, radiance=LIGHT),
-        "Camera": Verb(
-            prt.Camera, eye=EYE, target=[0.0, 0, 0], up=[0, 1, 0], field_of_view=0.6, width=8, height=8
-        ),
+        "Camera": Verb(prt.Camera, eye=EYE, target=[0.0, 0, 0], up=[0, 1, 0], field_of_view=0.6, width=8, height=8),
         "orbit": Verb(
             prt.scene.camera.orbit, mesh=here, azimuth=0.1, elevation=0.2, field_of_view=0.6, width=8, height=8
         ),
         "Mesh": Verb(prt.scene.Mesh, **full, texture=np.zeros((12, 2), np.float32)),
         "make_mesh": Verb(
             prt.scene.mesh.make_mesh,
-            position=here.position, face=here.face, normal=None, tangent=None, region=None, texture=None,
+            position=here.position,
+            face=here.face,
+            normal=None,
+            tangent=None,
+            region=None,
+            texture=None,
         ),
         "Part": Verb(
-            prt.Part, name="ball", mesh=here, material=material(), color=np.ones((12, 3)), second=np.ones((12, 2)),
+            prt.Part,
+            name="ball",
+            mesh=here,
+            material=material(),
+            color=np.ones((12, 3)),
+            second=np.ones((12, 2)),
             handedness=np.ones(12),
         ),
         "Scene": Verb(
-            prt.Scene, parts=[prt.Part("ball", here, material())], cameras=[camera()], environments=[environment()],
+            prt.Scene,
+            parts=[prt.Part("ball", here, material())],
+            cameras=[camera()],
+            environments=[environment()],
             point_lights=[],
         ),
         "PointLight": Verb(prt.scene.PointLight, name="lamp", position=[0, 3, 0], intensity=1.0),
@@ -169,8 +179,18 @@ def constructors() -> dict[str, Verb]:
         ),
         "TexturedMaterial": Verb(
             prt.scene.TexturedMaterial,
-            base_color=0.5, metallic=0.0, roughness=0.8, emissive=0.0, ior=1.5, specular=1.0, specular_color=1.0,
-            anisotropy=0.0, rotation=0.0, normal_scale=1.0, base_color_texture=color, normal_texture=color,
+            base_color=0.5,
+            metallic=0.0,
+            roughness=0.8,
+            emissive=0.0,
+            ior=1.5,
+            specular=1.0,
+            specular_color=1.0,
+            anisotropy=0.0,
+            rotation=0.0,
+            normal_scale=1.0,
+            base_color_texture=color,
+            normal_texture=color,
         ),
         "Blend": Verb(prt.Blend, weight=np.ones((12, 1, 3)), parameter=(np.ones(12),)),
         "Material": Verb(prt.dynamic.Material, weight=[1.0], diffuse=0.5, specular=0.5),
@@ -191,8 +211,14 @@ def constructors() -> dict[str, Verb]:
         "GGXInterface": {"eta": 1.5, "k": 0.0, "roughness": 0.3},
         "SchlickDiffuse": {"albedo": 0.5},
         "MetallicRoughness": {
-            "base_color": 0.5, "metallic": 0.0, "roughness": 0.5, "ior": 1.5, "specular": 1.0, "specular_color": 1.0,
-            "anisotropy": 0.0, "rotation": 0.0,
+            "base_color": 0.5,
+            "metallic": 0.0,
+            "roughness": 0.5,
+            "ior": 1.5,
+            "specular": 1.0,
+            "specular_color": 1.0,
+            "anisotropy": 0.0,
+            "rotation": 0.0,
         },
         "PoulinFournier": {"diffuse": 0.3, "specular": 0.5, "exponent": 20.0, "distance": 2.0, "height": 0.0},
     }.items():
@@ -213,12 +239,26 @@ def scene_verbs() -> dict[str, Verb]:
     ready = relit("harmonic")
     return {
         "precompute": Verb(
-            prt.precompute, keep=("progress",), scene=here, error=None, environments=None, rate=30.0, bounces=None,
-            rays=8, roughness=None, path=None, executor=None, **common,
+            prt.precompute,
+            keep=("progress",),
+            scene=here,
+            error=None,
+            environments=None,
+            rate=30.0,
+            bounces=None,
+            rays=8,
+            roughness=None,
+            path=None,
+            executor=None,
+            **common,
         ),
         "plan": Verb(
-            lambda **given: prt.plan(given.pop("scene"), **{"progress": False, **given}), scene=None,
-            environments=[environment()], error=0.3, rate=30.0, path=None,
+            lambda **given: prt.plan(given.pop("scene"), **{"progress": False, **given}),
+            scene=None,
+            environments=[environment()],
+            error=0.3,
+            rate=30.0,
+            path=None,
         ),
         "refine": Verb(
             prt.refine, keep=("progress",), scene=here, error=0.5, vertices=12, environments=None, progress=False
@@ -236,8 +276,18 @@ def scene_verbs() -> dict[str, Verb]:
         "files.load": Verb(prt.files.load, path="missing"),
         "files.read_image": Verb(prt.files.read_image, path="missing.png"),
         "reference.radiance": Verb(
-            prt.reference.radiance, keep=("progress", "error"), mesh=mesh(), brdf=prt.brdf.Lambert(0.5), light=environment(),
-            eye=EYE, occluder=None, vertex=[0], points=None, error=1e-2, progress=False, between=None,
+            prt.reference.radiance,
+            keep=("progress", "error"),
+            mesh=mesh(),
+            brdf=prt.brdf.Lambert(0.5),
+            light=environment(),
+            eye=EYE,
+            occluder=None,
+            vertex=[0],
+            points=None,
+            error=1e-2,
+            progress=False,
+            between=None,
         ),
         "mesh.join": Verb(prt.scene.mesh.join, meshes=[mesh()]),
         "mesh.split": Verb(prt.scene.mesh.split, mesh=mesh()),
@@ -247,7 +297,11 @@ def scene_verbs() -> dict[str, Verb]:
         "view.view": Verb(prt.view.Session, systems=ready, environments={"one": environment()}),
         "view.export": Verb(prt.view.export, scene=ready, path="/missing/x.html", environments=None, most=1e9),
         "view.export_baked": Verb(
-            prt.view.export_baked, scene=ready, path="/missing/x.glb", environment=environment(), eye=EYE,
+            prt.view.export_baked,
+            scene=ready,
+            path="/missing/x.glb",
+            environment=environment(),
+            eye=EYE,
             materials=None,
         ),
         "inverse.observe": Verb(
@@ -270,7 +324,11 @@ def image_verbs() -> dict[str, Verb]:
         "relative_l2": Verb(prt.image.relative_l2, image=image, reference=image * 0.9),
         "rasterize": Verb(prt.image.rasterize, mesh=mesh(), camera=camera(), samples=1),
         "render": Verb(
-            prt.image.render, mesh=mesh(), color=np.ones((12, 3), np.float32), camera=camera(), background=None,
+            prt.image.render,
+            mesh=mesh(),
+            color=np.ones((12, 3), np.float32),
+            camera=camera(),
+            background=None,
             samples=1,
         ),
         "write_png": Verb(prt.files.write_png, path="/missing/x.png", image=image),
@@ -286,18 +344,22 @@ def system_verbs() -> dict[str, Verb]:
     return {
         "harmonic.precompute": Verb(prt.harmonic.precompute, degree=2, **common, **quiet),
         "harmonic.precompute_diffuse": Verb(prt.harmonic.precompute_diffuse, degree=2, **common, **quiet),
-        "harmonic.tabulate": Verb(prt.harmonic.tabulate, keep=("error",), brdf=model, degree=2, error=0.5, resolution=None, knot=()),
+        "harmonic.tabulate": Verb(
+            prt.harmonic.tabulate, keep=("error",), brdf=model, degree=2, error=0.5, resolution=None, knot=()
+        ),
         "harmonic.project": Verb(prt.harmonic.project, light=environment(), degree=2),
         "lobe.precompute": Verb(prt.lobe.precompute, **common, **quiet),
         "lobe.prefilter": Verb(prt.lobe.prefilter, light=environment()),
         "lobe.tabulate": Verb(prt.lobe.tabulate, brdf=model, lobes=1, error=None, resolution=8, knot=()),
-        "separable.factor": Verb(
-            prt.separable.factor, brdf=model, terms=1, error=None, light=None, resolution=8
-        ),
+        "separable.factor": Verb(prt.separable.factor, brdf=model, terms=1, error=None, light=None, resolution=8),
         "separable.project": Verb(prt.separable.project, light=environment()),
         "lamps.precompute": Verb(
-            prt.lamps.precompute, lamps=[prt.scene.PointLight("lamp", [0, 3, 0])], samples=4, pieces=1,
-            **{name: value for name, value in common.items() if name != "size"}, **quiet,
+            prt.lamps.precompute,
+            lamps=[prt.scene.PointLight("lamp", [0, 3, 0])],
+            samples=4,
+            pieces=1,
+            **{name: value for name, value in common.items() if name != "size"},
+            **quiet,
         ),
         "bright_texels.split": Verb(prt.bright_texels.split, light=environment(), count=4),
         "bright_texels.samples_for": Verb(prt.bright_texels.samples_for, brdf=model, size=SIZE, error=0.1),
@@ -354,6 +416,7 @@ OTHER: dict[str, tuple[str, ...]] = {
     "meshes": ("mesh",),
     "radiance": ("radiance", "light"),
     "set": ("set",),
+    "reference": ("reference", "images must"),
 }
 
 

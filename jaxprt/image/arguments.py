@@ -49,9 +49,15 @@ def numbers(name: str, *axes: str) -> Callable[[Any], jax.Array]:
 
 
 def samples(value: Any) -> None:
-    """Refuses anything but a whole number; which numbers are possible, the function knows."""
+    """Refuses anything but a whole number."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"samples must be a whole number, got {require.shown(value)}")
+        raise ValueError(f"samples must be 1 or 4, got {require.shown(value)}")
+
+
+def color(value: Any) -> jax.Array:
+    """Refuses colors that are not of real numbers. NaN passes: vertices that no pixel shows may have it."""
+    require.real("color", value)
+    return require.floating(value)
 
 
 def behind(value: Any) -> jax.Array | None:

@@ -84,8 +84,7 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
 def _pair(image: Array, reference: Array) -> tuple[Array, Array]:
     """Two images of equal shape."""
     if image.shape != reference.shape:
-        shapes = f"{list(image.shape)} and {list(reference.shape)}"
-        raise ValueError(f"images must have one shape, got an image and a reference of {shapes}")
+        raise ValueError(f"images must have one shape, got {list(image.shape)} and {list(reference.shape)}")
     if not image.size:
         raise ValueError(f"the image and the reference must have pixels, got {list(image.shape)}")
     return image, reference

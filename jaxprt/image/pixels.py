@@ -164,7 +164,7 @@ def resolve(
     mesh=arguments.a_mesh,
     camera=arguments.a_camera,
     samples=arguments.samples,
-    color=arguments.numbers("color"),
+    color=arguments.color,
     background=arguments.behind,
 )
 def render(

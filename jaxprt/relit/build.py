@@ -87,11 +87,8 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    _check_options(size, error, rate, environments, rays)
-    require.executor(executor)
+    _check_options(size, error, rate, environments, rays, roughness, path, executor)
     reflection.check(bounces)
-    if roughness is not None:
-        require.real("roughness", roughness)
     if roughness is not None and not (np.shape(roughness) == (2,) and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
     if roughness is not None and system is None:
@@ -99,8 +96,6 @@ def precompute(
             "roughness must be given together with a system, got no system: "
             "a plan is made for the materials of the scene"
         )
-    if path is not None:
-        require.path("path", path)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():
@@ -136,8 +131,13 @@ def precompute(
     return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
 
 
-def _check_options(size, error, rate, environments, rays) -> None:
-    """Refuses sizes, errors, rates, lights and numbers of rays that no system takes."""
+def _check_options(size, error, rate, environments, rays, roughness, path, executor) -> None:
+    """Refuses options of wrong kinds, and numbers that no system takes."""
+    require.executor(executor)
+    if path is not None:
+        require.path("path", path)
+    if roughness is not None:
+        require.real("roughness", roughness)
     whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
     if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
         raise ValueError(f"size must be a power of two, at most {_MOST}, got {require.shown(size)}")

@@ -62,7 +62,7 @@ class Environment(eqx.Module):
 
 
 def _size(value: object) -> None:
-    require.count("size", value, 1, 1 << 14)
+    require.count("size", value, 1)
 
 
 @require.arguments(path=functools.partial(require.path, "path"), size=_size)

@@ -24,7 +24,6 @@ _MIRROR = np.array([-1, -1, 1], np.float32)
 _DARK = 1e-30
 
 
-@require.arguments(**{name: PRECOMPUTE[name] for name in ("mesh", "occluder", "vertex")})
 def radiance(
     mesh: Mesh,
     brdf: Callable,
@@ -75,6 +74,8 @@ def radiance(
         require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
     light, eye = protocol.one_light(light, batch=True), require.position("the eye", eye)
+    for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
+        PRECOMPUTE[name](value)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     if points is None:
         start = visibility.start_points(mesh, rays)

@@ -687,7 +687,9 @@ def test_lights_and_eyes_of_every_float_type_give_one_radiance(name, close):
     for dtype in (*HALF, "float64", "int32"):
         given = np.asarray(bright).astype(jnp.dtype(dtype))
         expected = radiance(Environment(jnp.asarray(given, jnp.float32)), eye=EYE)
-        color = radiance(Environment(given), eye=np.asarray(EYE).astype(jnp.dtype(dtype if dtype in HALF else "float64")))
+        color = radiance(
+            Environment(given), eye=np.asarray(EYE).astype(jnp.dtype(dtype if dtype in HALF else "float64"))
+        )
         assert color.dtype == exact.dtype
         close(color, expected, tolerance=1e-5)  # EYE is exact in half precision
     with jax.numpy_dtype_promotion("strict"):
