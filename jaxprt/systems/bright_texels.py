@@ -264,6 +264,8 @@ def _sent(
         samples: Number of sample points along the edge of each texel.
     """
     texel, excess, visible = light
+    if blend is not None:
+        protocol.check_colors(excess.shape[1], blend.weight.shape[2])
     # Vertices are the last axis, over which XLA vectorizes CPU code.
     frame, wo = jnp.moveaxis(frame, 0, 2), wo.T
     parameter = () if blend is None else blend.parameter

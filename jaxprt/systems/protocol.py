@@ -333,6 +333,18 @@ def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> En
     return value if radiance is value.radiance else Environment(radiance)
 
 
+def check_colors(light: int, view: int) -> None:
+    """Refuses light and materials of different numbers of colors, unless one of them is gray.
+
+    Raises:
+        ValueError: The numbers differ, and none is 1.
+    """
+    if light != view and 1 not in (light, view):
+        raise ValueError(
+            f"the light and the materials must have the same number of colors, or one of them one, got {light} and {view}"
+        )
+
+
 def total(*systems: System) -> Total:
     """The sum of systems over the same vertices, such as `total(direct, bounces)`.
 

@@ -76,6 +76,10 @@ def radiance(
     light, eye = protocol.one_light(light, batch=True), require.position("the eye", eye)
     for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
         PRECOMPUTE[name](value)
+    if not isinstance(brdf, PerVertex):
+        direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
+        channels = jax.eval_shape(brdf, direction, direction).shape
+        protocol.check_colors(light.radiance.shape[-1], channels[-1] if len(channels) > 1 else 1)
     rays = visibility.Occluder(mesh if occluder is None else occluder)
     if points is None:
         start = visibility.start_points(mesh, rays)

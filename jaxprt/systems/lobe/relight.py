@@ -242,6 +242,7 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
             f"the light's faces must have as many texels along an edge as the transport's, {view.size}, "
             f"got {light.size}"
         )
+    protocol.check_colors(len(light.pyramid), view.weight.shape[0])
     irradiance = light.coefficient.T @ view.vector
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)
