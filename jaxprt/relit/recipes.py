@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.kept import kept

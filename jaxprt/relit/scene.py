@@ -144,11 +144,7 @@ class RelitScene(System):
         return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """Projects an environment for the systems of all parts.
-
-        Raises:
-            ValueError: The light has neither one nor three colors, another size than was precomputed, or is a batch.
-        """
+        """Projects an environment, of one color or three, for the systems of all parts."""
         colors = protocol.one_light(environment).radiance.shape[-1]
         if colors not in (1, 3):
             raise ValueError(f"the light of a scene must have 1 or 3 colors, got {colors}")

@@ -264,8 +264,7 @@ def _sent(
         samples: Number of sample points along the edge of each texel.
     """
     texel, excess, visible = light
-    if blend is not None:
-        protocol.check_colors(excess.shape[1], blend.weight.shape[2])
+    protocol.check_colors(excess.shape[1], 1 if blend is None else blend.weight.shape[2])
     # Vertices are the last axis, over which XLA vectorizes CPU code.
     frame, wo = jnp.moveaxis(frame, 0, 2), wo.T
     parameter = () if blend is None else blend.parameter
@@ -346,10 +345,7 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
 def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "v c"]:
     """Irradiance / pi under light from the given texels: the radiance of diffuse vertices of albedo 1.
 
-    Args:
-        transport: Visibility of single texels for the vertices, such as `StoredVisibility` or `LobeTransport`.
-        texel: Indices of the texels.
-        excess: Radiance of each texel, from `split`.
+    `radiance` describes the arguments.
 
     Raises:
         ValueError: A texel index is out of range, or the excess is not finite or does not have one row for each texel.

@@ -309,10 +309,7 @@ def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
 def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> Environment:
     """The light that a system is to relight with, checked, in float32 or float64.
 
-    Args:
-        value: The light.
-        size: Edge of the cubemap faces that the transport was precomputed for, in texels; None for any.
-        batch: Whether lights may be stacked along leading axes.
+    `size` is the edge of the faces that was precomputed, None for any; with `batch` there may be leading axes.
 
     Raises:
         TypeError: The value is not an `Environment`.
@@ -334,14 +331,10 @@ def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> En
 
 
 def check_colors(light: int, view: int) -> None:
-    """Refuses light and materials of different numbers of colors, unless one of them is gray.
-
-    Raises:
-        ValueError: The numbers differ, and none is 1.
-    """
+    """Refuses light and materials of different numbers of colors, unless one of them is gray, by ValueError."""
     if light != view and 1 not in (light, view):
         raise ValueError(
-            f"the light and the materials must have the same number of colors, or one of them one, got {light} and {view}"
+            f"light and materials must have the same number of colors, or one of them a single one, got {light} and {view}"
         )
 
 
