@@ -174,9 +174,7 @@ def constructors() -> dict[str, Verb]:
             point_lights=[],
         ),
         "PointLight": Verb(prt.scene.PointLight, name="lamp", position=[0, 3, 0], intensity=1.0),
-        "Texture": Verb(
-            prt.scene.Texture, image=image, transform=np.eye(2, 3), set=0, wrap=("repeat", "repeat"), mipmap=None
-        ),
+        "Texture": Verb(prt.scene.Texture, image=image, transform=np.eye(2, 3), set=0, wrap=("repeat", "repeat")),
         "TexturedMaterial": Verb(
             prt.scene.TexturedMaterial,
             base_color=0.5,
@@ -193,10 +191,8 @@ def constructors() -> dict[str, Verb]:
             normal_texture=color,
         ),
         "Blend": Verb(prt.Blend, weight=np.ones((12, 1, 3)), parameter=(np.ones(12),)),
-        "Material": Verb(prt.dynamic.Material, weight=[1.0], diffuse=0.5, specular=0.5),
-        "Picture": Verb(
-            prt.inverse.Picture, image=np.ones((8, 8, 3)), camera=camera(), mask=None, exposure=1.0, saturation=None
-        ),
+        "Material": Verb(_material, weight=[1.0], diffuse=0.5, specular=0.5),
+        "Picture": Verb(_pictured, image=np.ones((8, 8, 3)), mask=None, exposure=1.0, saturation=None, camera=camera()),
     }
     for name, values in {
         "Lambert": {"albedo": 0.5},
@@ -226,10 +222,19 @@ def constructors() -> dict[str, Verb]:
     return result
 
 
+def _material(**given: Any) -> Any:
+    """A material that a region uses."""
+    prt.dynamic.relight.check_material(0, prt.dynamic.Material(**given), 1, 12)
+
+
+def _pictured(**given: Any) -> Any:
+    """A picture that a fit uses."""
+    return prt.inverse.observe(mesh(), [prt.inverse.Picture(**given)])
+
+
 def _values(model: Callable, **parameter: Any) -> Any:
-    """A model's values at some directions; without compiling, since the parameters' shapes vary."""
-    made = model(**parameter)
-    return made
+    """A model; without its values, since each shape of the parameters would be compiled."""
+    return model(**parameter)
 
 
 def scene_verbs() -> dict[str, Verb]:
@@ -404,12 +409,15 @@ OTHER: dict[str, tuple[str, ...]] = {
     "material": ("material", "BRDF"),
     "ball": ("material", "emit"),
     "brdf": ("BRDF",),
-    "point_lights": ("point_lights", "point light"),
+    "point_lights": ("point_lights", "point light", "two"),
     "cameras": ("camera",),
     "systems": ("system", "scene"),
     "value": ("value", "transport"),
     "pictures": ("picture",),
-    "image": ("image", "picture"),
+    "image": ("image", "picture", "pixel"),
+    "mask": ("mask",),
+    "exposure": ("exposure",),
+    "weight": ("weight",),
     "background": ("background",),
     "system": ("system",),
     "path": ("path", "missing", "/x"),
@@ -429,3 +437,20 @@ def offenses(name: str, verb: Verb) -> Iterator[str]:
             found = offense(verb, argument, value)
             if found:
                 yield f"{name}({argument}={label}): {found}"
+
+
+TABLES = {
+    "constructors": constructors,
+    "scenes": scene_verbs,
+    "pictures": image_verbs,
+    "systems": system_verbs,
+    "precomputed": lambda: methods(relit("harmonic"), "relit"),
+}
+
+
+@pytest.mark.usefixtures("unchecked", "coarse")
+@pytest.mark.parametrize("table", TABLES)
+def test_strange_values_end_in_a_result_or_an_error_by_name(table, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = [each for name, verb in TABLES[table]().items() for each in offenses(name, verb)]
+    assert not found, "\n".join(found)

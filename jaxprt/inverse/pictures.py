@@ -74,10 +74,7 @@ class Picture(eqx.Module):
     def __check_init__(self):
         """Refuses values of other kinds; `observe` checks numbers."""
         require.real("the image of a picture", self.image)
-        require.kind("the camera of a picture", self.camera, Camera, source="jaxprt.Camera")
         require.real("the exposure of a picture", self.exposure)
-        if self.saturation is not None:
-            require.number("the saturation of a picture", self.saturation, -require.LARGEST)
 
 
 class Pixels(eqx.Module):

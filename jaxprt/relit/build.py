@@ -140,7 +140,7 @@ def _check_options(size, error, rate, environments, rays, roughness, path, execu
         require.real("roughness", roughness)
     whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
     if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
-        raise ValueError(f"size must be a power of two, at most {_MOST}, got {require.shown(size)}")
+        raise ValueError(f"size must be a power of two, got {require.shown(size)}; the largest is {_MOST}")
     for name, value in (("error", error), ("rate", rate)):
         if value is not None:
             require.number(name, value, 0.0, above=True)

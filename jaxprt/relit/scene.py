@@ -261,6 +261,7 @@ class RelitScene(System):
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera
+        require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         materials, changed = scene_lamps.split(self.lamps, materials)
         surfaces = self._surfaces(materials)

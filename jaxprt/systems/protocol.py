@@ -334,7 +334,7 @@ def check_colors(light: int, view: int) -> None:
     """Refuses light and materials of different numbers of colors, unless one of them is gray, by ValueError."""
     if light != view and 1 not in (light, view):
         raise ValueError(
-            f"light and materials must have the same number of colors, or one of them a single one, got {light} and {view}"
+            f"light and materials must have the same number of colors, or one must be gray, got {light} and {view}"
         )
 
 

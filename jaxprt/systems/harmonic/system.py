@@ -192,6 +192,7 @@ def blended_view(
         ValueError: The blend has another number of vertices or channels.
     """
     protocol.check_blend(materials)
+    eye = require.position("the eye", eye, each=len(position))
     parameter = () if materials is None else materials.parameter
     row = view_coefficients(brdf, position, frame, *parameter, eye=eye)
     if materials is None:
