@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import trimesh
 
 import jaxprt as prt
@@ -257,13 +258,15 @@ def scene_verbs() -> dict[str, Verb]:
             executor=None,
             **common,
         ),
-        "plan": Verb(
-            lambda **given: prt.plan(given.pop("scene"), **{"progress": False, **given}),
-            scene=None,
+        "plan": Verb(  # Right values take minutes.
+            prt.plan,
+            keep=("error", "rate", "path", "progress"),
+            scene=here,
             environments=[environment()],
             error=0.3,
             rate=30.0,
             path=None,
+            progress=False,
         ),
         "refine": Verb(
             prt.refine, keep=("progress",), scene=here, error=0.5, vertices=12, environments=None, progress=False
@@ -416,6 +419,7 @@ OTHER: dict[str, tuple[str, ...]] = {
     "pictures": ("picture",),
     "image": ("image", "picture", "pixel"),
     "mask": ("mask",),
+    "saturation": ("saturation", "pixel"),
     "exposure": ("exposure",),
     "weight": ("weight",),
     "background": ("background",),

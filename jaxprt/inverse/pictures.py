@@ -25,11 +25,8 @@ def _mask(value) -> Array | None:
     """A mask as booleans. Image files store 0 and 1, or 0 and 255."""
     if value is None or isinstance(value, Tracer):
         return value
-    known = (
-        np.zeros((), object)
-        if np.ndim(value) == 0 or (isinstance(value, list) and require.unreal(value))
-        else np.asarray(value)
-    )
+    wrong = require.unreal(value)
+    known = np.asarray(None if (wrong and wrong != "booleans") or np.ndim(value) == 0 else value)
     if known.dtype.kind not in "biuf":
         raise TypeError(f"a mask must be of booleans, or of numbers 0 and 1 or 0 and 255, got {known.dtype}")
     most = 255 if (known == 255).any() else 1
@@ -75,6 +72,8 @@ class Picture(eqx.Module):
         """Refuses values of other kinds; `observe` checks numbers."""
         require.real("the image of a picture", self.image)
         require.real("the exposure of a picture", self.exposure)
+        if self.saturation is not None:
+            require.real("the saturation of a picture", self.saturation)
 
 
 class Pixels(eqx.Module):
