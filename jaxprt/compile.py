@@ -52,7 +52,7 @@ def jit(function: Callable, **options: Any) -> Any:
     """`jax.jit` with matrix products that have the full precision of their dtype on every device.
 
     This applies to everything that the function calls while it is traced, including user-defined BRDFs, and to its
-    derivatives.
+    derivatives. Types are promoted as in NumPy, also where the caller has set `jax_numpy_dtype_promotion` to "strict".
 
     Args:
         function: A function whose arguments are arrays and pytrees of arrays.
@@ -66,7 +66,7 @@ def _exact(function: Callable) -> Callable:
     def traced(*argument, **named):
         global _traces
         _traces += 1
-        with jax.default_matmul_precision("highest"):
+        with jax.default_matmul_precision("highest"), jax.numpy_dtype_promotion("standard"):
             return function(*argument, **named)
 
     return traced

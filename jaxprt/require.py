@@ -6,46 +6,121 @@ then reaches every vertex that depends on it.
 
 import functools
 import inspect
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 Function = TypeVar("Function", bound=Callable)
 
+LARGEST = 1e15  # magnitude of numbers: products of two of them, summed over all texels, fit into float32
+_MOST = 2**31 - 1  # largest index of 32 bits
+
+
+def real(name: str, value: Any) -> None:
+    """Refuses anything but real numbers: text, booleans, complex numbers, masked arrays, None and other objects.
+
+    Numbers, nested lists of them, NumPy and JAX arrays pass. The type is checked inside `jax.jit` too.
+    """
+    wrong = unreal(value)
+    if wrong:
+        raise TypeError(f"{name} must be real numbers, got {wrong}")
+
+
+def unreal(value: Any) -> str:
+    """What a value is that does not consist of real numbers; empty if it does."""
+    if isinstance(value, np.ma.MaskedArray):
+        return "a masked array: fill its masked values first"
+    if isinstance(value, str | bytes):
+        return f"the text {value[:40]!r}"
+    known = _array_of(value)
+    if known is None:
+        return f"{_described(value)}, which is not an array of numbers"
+    if jnp.issubdtype(known.dtype, jnp.integer) or jnp.issubdtype(known.dtype, jnp.floating):
+        return ""
+    if known.dtype == object:
+        return _described(value)
+    names = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text"}
+    return names.get(known.dtype.kind, f"values of type {known.dtype}")
+
+
+def _array_of(value: Any) -> Any:
+    """A value as an array, on the host unless it is or holds a JAX array; None if it cannot be one."""
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return value
+    for convert in (np.asarray, jnp.asarray):  # NumPy cannot convert lists of values inside `jax.jit`.
+        try:
+            return convert(value)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    return None
+
+
+def floating(value: Any, dtype: Any = None) -> Any:
+    """Real numbers as a JAX array of floating point, for the fields of classes.
+
+    Half precision becomes float32, because sums over the sphere overflow in it. float64 stays only where the caller has
+    enabled it. Anything but real numbers is returned unchanged: the check of the class refuses it by the field's name.
+
+    Args:
+        value: A number, a list or an array.
+        dtype: Type of the result; None for the value's own, or the default one for integers.
+    """
+    if unreal(value):
+        return value
+    known = _array_of(value)
+    if dtype is None:
+        dtype = _float_type(known.dtype)
+    if isinstance(known, jax.Array):
+        return known if known.dtype == dtype else known.astype(dtype)
+    with np.errstate(over="ignore"):  # The check of the class refuses infinity.
+        return jnp.asarray(known.astype(dtype))
+
+
+def _float_type(dtype: Any) -> Any:
+    """The type of floating point for numbers of a type."""
+    if not jnp.issubdtype(dtype, jnp.floating):
+        return jnp.result_type(float)
+    wide = np.float64 if dtype.itemsize > 4 else np.float32
+    return jax.dtypes.canonicalize_dtype(wide)
+
 
 def finite(name: str, value: Any) -> None:
-    """Refuses NaN and infinity.
+    """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e15 in magnitude.
+
+    Sums of products of larger numbers overflow in float32, and differences of infinities are NaN.
 
     Args:
         name: Description of the value for the message, such as "the eye".
         value: A number or an array.
 
     Raises:
-        ValueError: Some values are not finite. The message states how many, and the position of the first.
+        TypeError: The value does not consist of real numbers.
+        ValueError: Some values are not finite or too large. The message states how many, and the position of the first.
     """
-    if isinstance(value, Tracer):
+    real(name, value)
+    known = _array_of(value)
+    if isinstance(known, Tracer):
         return
-    known = np.asarray(value)
-    if known.dtype.kind == "f":
-        _require(name, "finite", known, np.asarray(np.isfinite(known)))
+    known = np.asarray(known)
+    if known.dtype.kind != "f" or known.dtype.itemsize < 4:  # In float16 the limit is infinite.
+        known = known.astype(np.float64)
+    if np.all(np.abs(known) <= LARGEST):  # false for NaN
+        return
+    _require(name, "finite", known, np.asarray(np.isfinite(known)))
+    _require(name, f"at most {LARGEST:g} in magnitude", known, np.asarray(np.abs(known) <= LARGEST))
 
 
 def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None:
-    """Refuses NaN, infinity and values below a bound.
+    """Refuses what `finite` refuses, and values below a bound.
 
-    Args:
-        name: Description of the value for the message, such as "the albedo".
-        value: A number or an array.
-        least: The bound.
-        slack: Tolerance for rounding errors.
-
-    Raises:
-        ValueError: Some values are not finite, or below the bound. The message states how many, and the position of the
-            first.
+    `slack` is a tolerance for rounding errors.
     """
     finite(name, value)
     if not isinstance(value, Tracer):
@@ -53,7 +128,7 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
         _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
 
 
-def position(name: str, value: Any, *, each: int | None = None) -> None:
+def position(name: str, value: Any, *, each: int | None = None) -> Array:
     """Refuses values that are not a finite position. The shape is checked inside `jax.jit` too.
 
     Args:
@@ -61,12 +136,61 @@ def position(name: str, value: Any, *, each: int | None = None) -> None:
         value: An array or a list.
         each: Number of points if the value may be one position for each point; None if it must be a single position.
 
+    Returns:
+        The position as an array of floating point.
+
     Raises:
+        TypeError: The value does not consist of real numbers.
         ValueError: The shape is neither [3] nor, with `each`, [each 3], or some values are not finite.
     """
+    real(name, value)
     if np.shape(value) not in ((3,), (each, 3)):
         raise ValueError(f"{name} must be one position, [3], got an array of shape {list(np.shape(value))}")
     finite(name, value)
+    return floating(value)
+
+
+def number(name: str, value: Any, low: float, high: float = LARGEST, *, above: bool = False) -> None:
+    """Refuses anything but one real number (TypeError) within a range (ValueError); with `above`, not its lower end."""
+    real(name, value)
+    if np.ndim(value):
+        raise TypeError(f"{name} must be one number, got {_described(value)}")
+    if isinstance(value, Tracer):
+        return
+    if not np.isfinite(value):
+        raise ValueError(f"{name} must be finite, got {value}")
+    if not low <= float(value) <= high or (above and float(value) == low):
+        raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
+
+
+def count(name: str, value: Any, least: int = 0, most: int = _MOST) -> None:
+    """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {shown(value)}")
+    if not least <= value <= most:
+        bound = f"at least {least}" if value < least else f"at most {most}"
+        bound = bound if most == _MOST else f"between {least} and {most}"
+        raise ValueError(f"{name} must be {bound}, got {value}")
+
+
+def path(name: str, value: Any) -> None:
+    """Refuses anything but the name of a file or folder, as text or a path, by TypeError."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {shown(value)}")
+
+
+def executor(value: Any) -> None:
+    """Refuses anything but None and objects with the method `submit` of `concurrent.futures.Executor`, by TypeError."""
+    if value is not None and not callable(getattr(value, "submit", None)):
+        raise TypeError(
+            f"executor must be None or an executor such as concurrent.futures.ProcessPoolExecutor, got {shown(value)}"
+        )
+
+
+def function(name: str, value: Any) -> None:
+    """Refuses anything but None and a function, by TypeError."""
+    if value is not None and not callable(value):
+        raise TypeError(f"{name} must be a function or None, got {shown(value)}")
 
 
 def _require(name: str, what: str, known: np.ndarray, right: np.ndarray) -> None:
@@ -91,7 +215,12 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
     Raises:
         ValueError: The number is outside the range.
     """
-    if value is not None and not low <= value <= high:
+    if value is None:
+        return
+    real(name, value)
+    if np.ndim(value):
+        raise TypeError(f"{name} must be one number, got {_described(value)}")
+    if not low <= value <= high:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
 
 
@@ -105,8 +234,10 @@ def within(name: str, value: Any, low: int, high: int) -> None:
         high: Largest allowed value.
 
     Raises:
+        TypeError: The value does not consist of real numbers.
         ValueError: Some numbers are outside the range. The message states how many, and the position of the first.
     """
+    real(name, value)
     if not isinstance(value, Tracer):
         known = np.asarray(value)
         _require(name, f"between {low} and {high}", known, np.asarray((known >= low) & (known <= high)))
@@ -119,12 +250,10 @@ def length(name: str, value: Any, count: int) -> None:
         name: Description of the rows for the message, such as "the light's coefficients".
         value: The array.
         count: Required number of rows.
-
-    Raises:
-        ValueError: The array has another number of rows.
     """
-    if value.shape[0] != count:
-        raise ValueError(f"the number of {name} must be {count}, got {value.shape[0]}")
+    shape = np.shape(value)
+    if not shape or shape[0] != count:
+        raise ValueError(f"the number of {name} must be {count}, got {shape[0] if shape else 'one number'}")
 
 
 def memory(what: str, needed: int, advice: str, *, in_files: bool = False) -> None:
@@ -220,7 +349,7 @@ def array(name: str, value: Any, *axes: str, source: str = "") -> None:
     raise TypeError(message) if shape is None else ValueError(message)
 
 
-def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
+def arguments(**check: Callable[[Any], Any]) -> Callable[[Function], Function]:
     """Decorates a function with checks of its arguments. As the outermost decorator, the checks run outside `jax.jit`.
 
         @require.arguments(eye=partial(require.finite, "the eye"))
@@ -228,7 +357,8 @@ def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
         def radiance(..., eye): ...
 
     Args:
-        check: A function for each argument, by its name, that raises an error if the argument is wrong.
+        check: A function for each argument, by its name, that raises an error if the argument is wrong. If it returns a
+            value, the decorated function is called with this value.
     """
 
     def decorate(function: Function) -> Function:
@@ -236,11 +366,13 @@ def arguments(**check: Callable[[Any], None]) -> Callable[[Function], Function]:
 
         @functools.wraps(function)
         def checked(*argument, **named):
-            given = signature.bind_partial(*argument, **named).arguments
-            for name, each in check.items():
-                if name in given:
-                    each(given[name])
-            return function(*argument, **named)
+            bound = signature.bind_partial(*argument, **named)
+            for name, door in check.items():
+                if name in bound.arguments:
+                    converted = door(bound.arguments[name])
+                    if converted is not None:
+                        bound.arguments[name] = converted
+            return function(*bound.args, **bound.kwargs)
 
         return cast(Function, checked)
 
@@ -258,3 +390,11 @@ def _described(value: Any) -> str:
     if isinstance(value, jax.Array | np.ndarray):
         return f"an array of shape {list(value.shape)}"
     return f"one of class {type(value).__name__}"
+
+
+def shown(value: Any) -> str:
+    """A value in at most 40 letters, and its class."""
+    if isinstance(value, jax.Array | np.ndarray):
+        return _described(value)
+    text = repr(value)
+    return f"{text if len(text) <= 40 else text[:37] + '...'} of class {type(value).__name__}"

@@ -1,12 +1,14 @@
 """Interpolation in tables of BRDFs over the view direction and parameters: knots, neighbors and weights."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxprt import require
 from jaxprt.compile import mapped
 
 
@@ -24,6 +26,40 @@ def as_argument(brdf: Callable) -> Callable:
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 
 
+def check(brdf: Any) -> None:
+    """Refuses anything but a function of two directions that returns real numbers.
+
+    Raises:
+        TypeError: The BRDF is not a function of wi and wo, or its values are not arrays of floating point.
+    """
+    required = "the BRDF must be a function (wi, wo) -> values in 1/sr, such as jaxprt.brdf.Lambert(0.5)"
+    if not callable(brdf):
+        raise TypeError(f"{required}, got {require.shown(brdf)}")
+    if getattr(brdf, "holds_cosine", False):
+        as_argument(brdf)
+    direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
+    try:
+        value = jax.eval_shape(brdf, direction, direction)
+    except Exception as error:
+        raise TypeError(
+            f"{required}, got {require.shown(brdf)}, which raises {type(error).__name__}: {error}"
+        ) from error
+    dtype = getattr(value, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+        got = type(value).__name__ if dtype is None else dtype
+        raise TypeError(f"the values of the BRDF must be an array of floating point, got {got}")
+
+
+def check_family(brdf: Any, knot: Any) -> None:
+    """Refuses anything but a BRDF, or, with knots, anything but a function of the parameters. `check` has the rest."""
+    if not isinstance(knot, Sequence) or isinstance(knot, str | bytes):
+        raise TypeError(f"knot must be a list with the values of each parameter, got {require.shown(knot)}")
+    if not len(knot):
+        check(brdf)
+    elif not callable(brdf):
+        raise TypeError(f"the BRDF must be a function of the parameters, with knots, got {require.shown(brdf)}")
+
+
 def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
     """The knots of each parameter, converted to float64.
 
@@ -31,6 +67,8 @@ def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
         ValueError: There are more than two parameters, or a parameter does not have at least two finite increasing
             knots.
     """
+    for number, values in enumerate(knot):
+        require.real(f"knots of parameter {number}", values)
     if len(knot) > 2:
         raise ValueError(f"at most two parameters can be tabulated, got {len(knot)}")
     every = tuple(np.asarray(values, np.float64) for values in knot)

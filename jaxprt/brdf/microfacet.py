@@ -19,9 +19,10 @@ Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BR
 anisotropic D and G; Burley 2012, "Physically based shading at Disney", for alpha = roughness^2.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -34,9 +35,10 @@ from jaxprt.compile import jit
 _SMOOTHEST = 1e-3  # smallest alpha, because a perfect mirror has no density
 
 
-def _both_axes(value) -> Array:
+def _both_axes(value: Any) -> Any:
     """One number for both tangent axes, or two numbers, as an array of shape [2]."""
-    return jnp.broadcast_to(jnp.asarray(value, jnp.result_type(float)), (2,))
+    value = scalar(value)
+    return jnp.broadcast_to(value, (2,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
 def _alpha(roughness: Array) -> Array:
@@ -200,6 +202,8 @@ class MetallicRoughness(Model):
     rotation: Float[Array, "*#b"] = eqx.field(converter=scalar, default=0.0)
 
     def __check_init__(self):
+        for name, value in vars(self).items():
+            require.real(f"{name} of MetallicRoughness", value)
         for name in ("metallic", "specular", "anisotropy"):
             require.within(f"{name} of MetallicRoughness", getattr(self, name), 0, 1)
         shape = {name: each.shape for name, each in vars(self).items()}

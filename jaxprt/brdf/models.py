@@ -10,9 +10,10 @@ reflects at most the incident flux for every incident direction, with single sca
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,20 +23,21 @@ _GRAZING = 1e-4  # smallest cosine in half vectors and denominators
 _SMOOTHEST = 1e-3  # smallest roughness, because a perfect mirror has no density
 
 
-def color(value) -> Array:
-    """A scalar or a color as an array of shape [1] or [3]."""
-    return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
+def color(value: Any) -> Any:
+    """A scalar or a color as an array of shape [1] or [3]. What is not of numbers is left for the class to refuse."""
+    value = scalar(value)
+    return jnp.atleast_1d(value) if isinstance(value, jax.Array) else value
 
 
-def scalar(value) -> Array:
-    """A number as an array of shape []."""
-    return jnp.asarray(value, jnp.result_type(float))
+def scalar(value: Any) -> Any:
+    """A number as an array of shape []. What is not of numbers is left for the class to refuse."""
+    return require.floating(value, jnp.result_type(float))
 
 
-def _lobes(value) -> Array:
+def _lobes(value: Any) -> Any:
     """One number or color per lobe as an array of shape [l, 1] or [l, 3]."""
-    value = jnp.asarray(value, jnp.result_type(float))
-    return value[..., None] if value.ndim == 1 else value
+    value = scalar(value)
+    return value[..., None] if isinstance(value, jax.Array) and value.ndim == 1 else value
 
 
 def both_above(wi: Array, wo: Array) -> Array:
@@ -97,7 +99,8 @@ class Model(eqx.Module):
         least: Smallest allowed values by parameter name, where they differ from 0.
 
     Raises:
-        ValueError: A parameter is not finite or below its smallest allowed value.
+        TypeError: A parameter does not consist of real numbers.
+        ValueError: A parameter is not finite, above 1e15, or below its smallest allowed value.
     """
 
     least: ClassVar[Mapping[str, float]] = {}

@@ -260,7 +260,7 @@ def compare(
 
 def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> dict[str, Any]:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
-    number, color = list(view.lights).index(name), made.color(view.lights[name], view.camera.eye)
+    number, color = list(view.lights).index(name), made.color(view.lights[name], jnp.asarray(view.camera.eye))
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
     rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
     error, spread = truth.pixels.relative_l2(picture, light=number)

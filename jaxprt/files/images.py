@@ -4,11 +4,13 @@ import pathlib
 import tempfile
 import typing
 import warnings
+from functools import partial
 
 import numpy as np
 import OpenImageIO
 from jaxtyping import Float32
 
+from jaxprt import require
 from jaxprt.files import color_spaces, inputs, pixels
 from jaxprt.files.exr import read_exr
 from jaxprt.files.radiance_hdr import read_radiance
@@ -27,6 +29,7 @@ _MAGIC = (
 _PNG_START = 2**20  # Chunks before the pixels are within these bytes, apart from absurd ones.
 
 
+@require.arguments(path=partial(require.path, "path"))
 def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     """Reads an image file as linear values.
 

@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxprt import require
 from jaxprt.files import fields, loading, mapped
 
 
+@require.arguments(path=partial(require.path, "path"))
 def save(path: str | os.PathLike, object: Any) -> None:
     """Saves an object of this package, or tuples, lists and dictionaries of such objects, without loss.
 
@@ -66,6 +69,7 @@ def save(path: str | os.PathLike, object: Any) -> None:
         shutil.rmtree(aside, ignore_errors=True)
 
 
+@require.arguments(path=partial(require.path, "path"))
 def load(path: str | os.PathLike) -> Any:
     """Loads an object that `save` has written, with the same classes, structure, types and bits.
 

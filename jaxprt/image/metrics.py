@@ -1,13 +1,22 @@
 """Errors of an image against a reference: relative L2, PSNR and FLIP."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.compile import jit
+from jaxprt.image.arguments import numbers
 
 
+def _peak(value: Any) -> None:
+    require.number("peak", value, 1e-15)
+
+
+@require.arguments(image=numbers("the image"), reference=numbers("the reference"))
 @jit
 def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Float[Array, ""]:
     """L2 norm of the difference divided by the L2 norm of the reference.
@@ -28,6 +37,7 @@ def relative_l2(image: Float[Array, "*b"], reference: Float[Array, "*b"]) -> Flo
     return jnp.where(same, 0, ratio)
 
 
+@require.arguments(image=numbers("the image"), reference=numbers("the reference"), peak=_peak)
 @jit
 def psnr(
     image: Float[Array, "*b"], reference: Float[Array, "*b"], *, peak: Float[Array, ""] | float = 1.0
@@ -46,6 +56,7 @@ def psnr(
     return 10 * (2 * jnp.log10(jnp.asarray(peak, image.dtype)) - jnp.log10(jnp.mean((image - reference) ** 2)))
 
 
+@require.arguments(image=numbers("the image", "h w 3"), reference=numbers("the reference", "h w 3"))
 def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> float:
     """Mean FLIP error of linear radiance, 0 to 1: the difference that a viewer sees when flipping between the images.
 
@@ -71,10 +82,9 @@ def flip(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> floa
 
 
 def _pair(image: Array, reference: Array) -> tuple[Array, Array]:
-    """Two images of equal shape, with integers converted to floating point."""
+    """Two images of equal shape."""
     if image.shape != reference.shape:
         raise ValueError(f"images must have one shape, got {list(image.shape)} and {list(reference.shape)}")
-    image, reference = (
-        x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float)) for x in (image, reference)
-    )
+    if not image.size:
+        raise ValueError(f"the image and the reference must have pixels, got {list(image.shape)}")
     return image, reference

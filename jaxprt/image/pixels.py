@@ -14,8 +14,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxprt import require
 from jaxprt.compile import jit
-from jaxprt.image import raster
+from jaxprt.image import arguments, raster
 from jaxprt.image.raster import SAMPLES, Fragments
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
@@ -160,6 +161,13 @@ def resolve(
     return image + jnp.where(share > 0, share * background, 0)
 
 
+@require.arguments(
+    mesh=arguments.a_mesh,
+    camera=arguments.a_camera,
+    samples=arguments.samples,
+    color=arguments.color,
+    background=arguments.behind,
+)
 def render(
     mesh: Mesh,
     color: Float[Array, "v c"],
@@ -186,6 +194,7 @@ def render(
     """
     if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
         raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
+    arguments.check_behind(background, camera, color.shape[1])
     pixels = shading_points(raster.rasterize(mesh, camera, samples=samples), mesh, camera)
     return resolve(pixels, interpolate(pixels, mesh.face, color), background=background)
 

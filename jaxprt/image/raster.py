@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxprt import require
 from jaxprt.compile import jit
-from jaxprt.image import depths
+from jaxprt.image import arguments, depths
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
 
@@ -48,6 +49,7 @@ class Fragments(eqx.Module):
     depth: Float[Array, "h w *s"]
 
 
+@require.arguments(mesh=arguments.a_mesh, camera=arguments.a_camera, samples=arguments.samples)
 @in_common_coordinates
 @functools.partial(jit, static_argnames="samples")
 def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:

@@ -1,20 +1,42 @@
 """Conversion from radiance to display values: exposure and the sRGB transfer function."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.compile import jit
+from jaxprt.image.arguments import STOPS, numbers
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
 
+def _stops(value: Any) -> None:
+    require.number("stops", value, -STOPS, STOPS)
+
+
+def _percentile(value: Any) -> None:
+    require.number("percentile", value, 0.0, 100.0)
+
+
+def _white(value: Any) -> None:
+    require.number("white", value, 1e-15)
+
+
+@require.arguments(radiance=numbers("the radiance"), stops=_stops)
 @jit
 def expose(radiance: Float[Array, "*b"], *, stops: Float[Array, ""] | float) -> Float[Array, "*b"]:
-    """Scales radiance by 2^stops, like a camera's exposure. Nothing is clamped."""
-    radiance = _floating(radiance)
+    """Scales radiance by 2^stops, like a camera's exposure. Nothing is clamped.
+
+    Raises:
+        TypeError: An argument does not consist of real numbers.
+        ValueError: The radiance holds NaN, or `stops` is not one number from -100 to 100.
+    """
     return radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype))
 
 
+@require.arguments(image=numbers("the image", "h w 3"), percentile=_percentile, white=_white)
 @jit
 def automatic_exposure(
     image: Float[Array, "h w 3"], *, percentile: Float[Array, ""] | float = 99.0, white: Float[Array, ""] | float = 0.9
@@ -28,8 +50,12 @@ def automatic_exposure(
         image: Linear radiance.
         percentile: Percentage of the pixels that are not black which stays at or below `white`.
         white: Linear value to which the percentile is mapped; 1 is display white.
+
+    Raises:
+        TypeError: An argument does not consist of real numbers.
+        ValueError: The image is not [h, w, 3] or holds NaN, `percentile` is not from 0 to 100, or `white` is not
+            positive.
     """
-    image = _floating(image)
     luminance = image @ jnp.asarray(LUMINANCE, image.dtype)
     lit = luminance > 0
     bright = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
@@ -37,6 +63,7 @@ def automatic_exposure(
     return jnp.log2(white / bright)
 
 
+@require.arguments(linear=numbers("the linear values"))
 @jit
 def encode_srgb(linear: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Encodes linear values by the sRGB transfer function.
@@ -51,6 +78,7 @@ def encode_srgb(linear: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, 12.92 * linear, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
+@require.arguments(encoded=numbers("the encoded values"))
 @jit
 def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Inverse of `encode_srgb`, extended beyond [0, 1] in the same way."""
@@ -59,12 +87,8 @@ def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, encoded / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
+@require.arguments(radiance=numbers("the radiance"))
 @jit
 def display(radiance: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Clamps exposed linear radiance to [0, 1] and encodes it as sRGB, for display or for files of 8 bits."""
     return encode_srgb(jnp.clip(radiance, 0, 1))
-
-
-def _floating(value: Array) -> Array:
-    """Integers converted to floating point. Otherwise options would be rounded to integers too."""
-    return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(jnp.result_type(float))

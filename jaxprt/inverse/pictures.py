@@ -1,6 +1,7 @@
 """Pixels of pictures that show a mesh, and the residual of a scene's radiance at them."""
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxprt import require
 from jaxprt.image import raster
 from jaxprt.inverse import numbers
 from jaxprt.scene.camera import Camera
@@ -23,7 +25,8 @@ def _mask(value) -> Array | None:
     """A mask as booleans. Image files store 0 and 1, or 0 and 255."""
     if value is None or isinstance(value, Tracer):
         return value
-    known = np.asarray(value)
+    wrong = require.unreal(value)
+    known = np.asarray(None if (wrong and wrong != "booleans") or np.ndim(value) == 0 else value)
     if known.dtype.kind not in "biuf":
         raise TypeError(f"a mask must be of booleans, or of numbers 0 and 1 or 0 and 255, got {known.dtype}")
     most = 255 if (known == 255).any() else 1
@@ -36,10 +39,15 @@ def _mask(value) -> Array | None:
     return jnp.asarray(known != 0)
 
 
-def _exposure(value) -> float:
-    if np.ndim(value):
+def _image(value: Any) -> Any:
+    """Numbers as an array, in their own type: `observe` refuses integers, which are not linear."""
+    return value if require.unreal(value) or isinstance(value, int) else jnp.asarray(value)
+
+
+def _exposure(value: Any) -> Any:
+    if not require.unreal(value) and np.ndim(value):
         raise TypeError(f"the exposure must be one number, got an array of shape {np.shape(value)}")
-    return float(value)
+    return value if require.unreal(value) else float(value)
 
 
 class Picture(eqx.Module):
@@ -54,11 +62,18 @@ class Picture(eqx.Module):
             clipped.
     """
 
-    image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
+    image: Float[Array, "h w c"] = eqx.field(converter=_image)
     camera: Camera
     mask: Bool[Array, "_ _"] | None = eqx.field(converter=_mask, default=None)
     exposure: float = eqx.field(converter=_exposure, default=1.0)
     saturation: float | None = None
+
+    def __check_init__(self):
+        """Refuses values of other kinds; `observe` checks numbers."""
+        require.real("the image of a picture", self.image)
+        require.real("the exposure of a picture", self.exposure)
+        if self.saturation is not None:
+            require.real("the saturation of a picture", self.saturation)
 
 
 class Pixels(eqx.Module):

@@ -11,9 +11,9 @@ import tqdm
 
 from jaxprt import require
 from jaxprt.files import objects
-from jaxprt.relit import lamps, reflection, warn
+from jaxprt.relit import lamps, reflection, tracing, warn
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.measuring import lights_of
+from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
@@ -21,6 +21,8 @@ from jaxprt.scene import Environment, Part, Scene
 from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import Joined, System
 from jaxprt.visibility import UnfinishedError
+
+_MOST = 1 << 13  # texels along the edge of a face
 
 
 def precompute(
@@ -85,8 +87,7 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    if size is not None and (not isinstance(size, int | np.integer) or size < 1 or size & (size - 1)):
-        raise ValueError(f"size must be a power of two, got {size!r}")
+    _check_options(size, error, rate, environments, rays, roughness, path, executor)
     reflection.check(bounces)
     if roughness is not None and not (np.shape(roughness) == (2,) and 0 <= roughness[0] <= roughness[1] <= 1):
         raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
@@ -136,6 +137,24 @@ def _systems(recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Se
     if unfinished:
         raise UnfinishedError("; ".join(map(str, unfinished)))
     return systems
+
+
+def _check_options(size, error, rate, environments, rays, roughness, path, executor) -> None:
+    """Refuses options of wrong kinds, and numbers that no system takes."""
+    require.executor(executor)
+    if path is not None:
+        require.path("path", path)
+    if roughness is not None:
+        require.real("roughness", roughness)
+    whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
+    if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
+        raise ValueError(f"size must be a power of two, got {require.shown(size)}; the largest is {_MOST}")
+    for name, value in (("error", error), ("rate", rate)):
+        if value is not None:
+            require.number(name, value, 0.0, above=True)
+    if environments is not None:
+        checked(environments, 1.0, 1.0)
+    tracing.check_rays(rays)
 
 
 def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:

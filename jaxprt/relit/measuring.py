@@ -164,7 +164,7 @@ def lights_of(scene: Scene) -> tuple[Environment, ...]:
 
 def checked(environments: Sequence[Environment], error: float, rate: float) -> int:
     """Refuses invalid environments, errors and frame rates; returns the edge of the environments' faces in texels."""
-    if not isinstance(environments, Sequence):
+    if not isinstance(environments, Sequence) or isinstance(environments, str | bytes):
         raise TypeError(f"environments must be a list of lights, got one {type(environments).__name__}")
     if not environments:
         raise ValueError("environments must be at least one, got none")
@@ -176,7 +176,7 @@ def checked(environments: Sequence[Environment], error: float, rate: float) -> i
     for number, light in enumerate(environments):
         require.finite(f"the radiance of environment {number}", light.radiance)
     for name, value in (("error", error), ("rate", rate)):
-        if not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
             raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return environments[0].radiance.shape[1]
 

@@ -174,6 +174,8 @@ def plan(
             then gives the smallest error that can be met.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    if path is not None:
+        require.path("path", path)
     scene = centered(scene)
     environments = lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error

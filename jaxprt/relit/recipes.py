@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.kept import kept
@@ -295,8 +295,11 @@ def _check_values(brdf: Callable) -> None:
     random[..., 2] = np.abs(random[..., 2])
     wi, wo = jnp.asarray(random / np.linalg.norm(random, axis=-1, keepdims=True), jnp.result_type(float))
     value = np.asarray(brdf(wi, wo))
+    require.real("the values of the BRDF", value)
     if value.ndim != 2 or len(value) != _PAIRS:
         raise ValueError(f"the BRDF must return [{_PAIRS}, c] for {_PAIRS} directions, got {list(value.shape)}")
+    if value.shape[1] not in (1, 3):
+        raise ValueError(f"the BRDF of a part must have 1 or 3 colors, got {value.shape[1]}")
     wrong = np.flatnonzero(~(np.isfinite(value) & (value >= 0)).all(1))
     if wrong.size:
         raise ValueError(

@@ -48,8 +48,8 @@ def check(count: int | str | None) -> None:
         raise ValueError(f"bounces must be a whole number or {ALL!r}, got {count!r}")
     if not (type(count) is int or isinstance(count, np.integer)):
         raise TypeError(f"bounces must be a whole number or {ALL!r}, got {count!r}")
-    if count < 0:
-        raise ValueError(f"bounces must be at least 0, got {count}")
+    if not 0 <= count < 1 << 31:
+        raise ValueError(f"bounces must be at least 0, and below 2^31, or {ALL!r}, got {count}")
 
 
 def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartBounces:

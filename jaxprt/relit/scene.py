@@ -122,7 +122,7 @@ class RelitScene(System):
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
         """
-        _check_rays(rays)
+        tracing.check_rays(rays)
         # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
@@ -147,7 +147,10 @@ class RelitScene(System):
         return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """Projects an environment for the systems of all parts."""
+        """Projects an environment, of one color or three, for the systems of all parts."""
+        colors = protocol.one_light(environment).radiance.shape[-1]
+        if colors not in (1, 3):
+            raise ValueError(f"the light of a scene must have 1 or 3 colors, got {colors}")
         return self.system.light(environment)
 
     def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
@@ -157,7 +160,7 @@ class RelitScene(System):
         arriving = self.system.shade(light, [each.blend for each in every])
         return arriving if self.lamps is None else SceneLight(arriving, self.lamps.radiance(every, changed))
 
-    def view(self, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
+    def view(self, eye: Float[Array | np.ndarray, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
         """What depends on the eye and the materials, for all parts.
 
         Raises:
@@ -202,14 +205,20 @@ class RelitScene(System):
         return color if view.emitted is None else color + view.emitted
 
     def radiance(
-        self, environment: Environment, *, eye: Float[Array, "3"], materials: Mapping[str, Any] | None = None
+        self,
+        environment: Environment,
+        *,
+        eye: Float[Array | np.ndarray, "3"],
+        materials: Mapping[str, Any] | None = None,
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
         given, changed = scene_lamps.split(self.lamps, materials)
-        eye = origins.local("the eye", eye, self.mesh.origin)
-        return protocol.radiance(
-            self.centered(), environment, eye=eye, materials={**self.appearances(given), **changed}
-        )
+        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(given), **changed})
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the scene's zero is in the coordinates of its file."""
+        return self.mesh.origin
 
     def centered(self) -> "RelitScene":
         """The same scene in coordinates relative to its origin, `mesh.origin`, for eyes inside of `jax.jit`.
@@ -279,6 +288,7 @@ class RelitScene(System):
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera
+        require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         materials, changed = scene_lamps.split(self.lamps, materials)
         surfaces = self._surfaces(materials)
@@ -312,7 +322,7 @@ class RelitScene(System):
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
-        _check_rays(rays)
+        tracing.check_rays(rays)
         made = object.__new__(RelitScene)  # Works inside jax.jit too, where __init__ could not measure the curvature.
         for field in dataclasses.fields(self):
             object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
@@ -415,8 +425,3 @@ class RelitScene(System):
         given = self.appearances(materials)
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]
-
-
-def _check_rays(rays: int) -> None:
-    if type(rays) is not int or rays < 0:
-        raise ValueError(f"rays must be a whole number of at least 0, got {rays!r}")

@@ -23,6 +23,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxprt import require
 from jaxprt.brdf import Lambert
 from jaxprt.compile import jit, make_room
 from jaxprt.relit.casting import caster
@@ -34,6 +35,7 @@ from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
 
 CHUNK = 1 << 13  # number of hits that are shaded together
+_MOST_RAYS = 1 << 12  # of each vertex or point
 _FEWEST = 1 << 10
 
 
@@ -361,3 +363,9 @@ def _read(own: Sequence[Carried], rows: Sequence[Array], lamp: Array | None) -> 
             read = read + jnp.einsum("nc,nvc->vc", lamp, each.lamp, precision="highest")
         result.append(read)
     return result
+
+
+def check_rays(rays: Any) -> None:
+    """Refuses anything but a number of rays for each vertex or point."""
+    if type(rays) is not int or not 0 <= rays <= _MOST_RAYS:
+        raise ValueError(f"rays must be a whole number of at least 0, at most {_MOST_RAYS}, got {require.shown(rays)}")

@@ -20,12 +20,6 @@ Function = TypeVar("Function", bound=Callable)
 _MOST = 2**31 - 1  # pixels that the rasterizer's 32-bit indices can count
 
 
-def _floating(value) -> Array:
-    """Numbers converted to a floating-point array."""
-    value = jnp.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
-
-
 class Camera(eqx.Module):
     """A pinhole camera. Lists and NumPy arrays are converted to JAX arrays.
 
@@ -44,8 +38,8 @@ class Camera(eqx.Module):
 
     eye: Float[Array | np.ndarray, "3"] = eqx.field(converter=origins.coordinates)
     target: Float[Array | np.ndarray, "3"] = eqx.field(converter=origins.coordinates)
-    up: Float[Array, "3"] = eqx.field(converter=_floating)
-    field_of_view: Float[Array, ""] = eqx.field(converter=_floating)
+    up: Float[Array, "3"] = eqx.field(converter=require.floating)
+    field_of_view: Float[Array, ""] = eqx.field(converter=require.floating)
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
 
@@ -54,9 +48,11 @@ class Camera(eqx.Module):
         for name in ("eye", "target", "up"):
             require.position(f"the camera's {name}", getattr(self, name))
         require.finite("the camera's field_of_view", self.field_of_view)
+        if jnp.ndim(self.field_of_view):
+            raise ValueError(f"the camera's field_of_view must be one number, got {self.field_of_view}")
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"the camera's {name} must be a whole number of pixels, at least 1, got {value!r}")
         if self.width * self.height > _MOST:
             raise ValueError(f"a picture must have at most {_MOST} pixels, got {self.width} x {self.height}")
@@ -137,14 +133,17 @@ def orbit(
     Raises:
         ValueError: The picture has no pixels, or an angle is out of its range.
     """
+    require.kind("the mesh", mesh, Mesh, source="jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh")
+    for name, value in (("width", width), ("height", height)):
+        require.count(name, value)
     if width < 1 or height < 1:
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+    for name, value in (("field_of_view", field_of_view), ("elevation", elevation), ("azimuth", azimuth)):
+        require.number(name, value, -require.LARGEST)
     if not 0 < field_of_view < np.pi:
         raise ValueError(f"field_of_view must be between 0 and pi, got {field_of_view}")
     if not abs(elevation) <= np.pi / 2:
         raise ValueError(f"elevation must be from -pi/2 to pi/2, got {elevation}")
-    if not np.isfinite(azimuth):
-        raise ValueError(f"azimuth must be finite, got {azimuth}")
     low, high = bounds(mesh)
     center = (low + high) / 2
     corner = np.asarray(mesh.position, np.float64)[np.unique(mesh.face)] + mesh.origin

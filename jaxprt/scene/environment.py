@@ -33,34 +33,39 @@ _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 
 
-def _floating(radiance):
-    """Lists and integers converted to floating-point arrays; other values unchanged."""
-    dtype = getattr(radiance, "dtype", None)
-    if dtype is None or jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_):
-        return jnp.asarray(radiance, jnp.result_type(float))
-    return radiance
-
-
 class Environment(eqx.Module):
     """Distant light: the mean linear radiance of each cubemap texel.
 
-    The radiance must be finite and have six square faces, otherwise ValueError is raised. Inside `jax.jit` values are
-    not known and not checked: a NaN then reaches every vertex that the texel lights.
+    The radiance must be finite, at most 1e15 in magnitude, and have six square faces. Lists, NumPy arrays and integers
+    are converted to JAX arrays of floating point, and half precision to float32. Negative radiance is allowed, because
+    relighting is linear: a difference of two lights, the light of one basis function and the gradient of a light are
+    environments too. `load_environment` sets negative pixels of files to zero. Inside `jax.jit` values are not known
+    and not checked: a NaN then reaches every vertex that the texel lights.
 
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
+
+    Raises:
+        TypeError: The radiance does not consist of real numbers, or is a masked array.
+        ValueError: The radiance has another shape, is not finite, or is above 1e15.
     """
 
-    radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=_floating)
+    radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
 
     def __check_init__(self):
-        """Refuses radiance that is not on six square faces, or not finite."""
+        """Refuses radiance that is not of real numbers, not on six square faces, or not finite."""
+        require.real("the light's radiance", self.radiance)
         shape = jnp.shape(self.radiance)
         if len(shape) < 4 or shape[-4] != 6 or shape[-3] != shape[-2] or 0 in shape[-3:]:
             raise ValueError(f"the light's radiance must be [..., 6, n, n, c], got {list(shape)}")
         require.finite("the light's radiance", self.radiance)
 
 
+def _size(value: object) -> None:
+    require.count("size", value, 1)
+
+
+@require.arguments(path=functools.partial(require.path, "path"), size=_size)
 def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | None = None) -> Environment:
     """Loads distant light from an image file.
 
@@ -89,6 +94,7 @@ def load_environment(path: str | pathlib.Path, *, size: int = 64, layout: str | 
     return environment_from_image(image, size=size, layout=layout, name=str(path))
 
 
+@require.arguments(image=functools.partial(require.real, "image"), size=_size)
 def environment_from_image(
     image: Float[np.ndarray | Array, "h w c"],
     *,
@@ -114,6 +120,9 @@ def environment_from_image(
         MemoryError: The cubemap does not fit into memory.
     """
     image = np.asarray(image)
+    require.array("image", image, "h w c")
+    if layout is not None and not isinstance(layout, str):
+        raise TypeError(f"layout must be one of {', '.join(LAYOUTS)}, got {require.shown(layout)}")
     layout = layout or layout_of(image, {}, name)
     _check_layout(image, layout, name)
     return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
@@ -249,7 +258,7 @@ def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) ->
 
 
 def _check_layout(image: np.ndarray, layout: str, name: str) -> None:
-    if layout not in LAYOUTS:
+    if not isinstance(layout, str) or layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     height, width = image.shape[:2]
     if 0 in image.shape:

@@ -1,5 +1,7 @@
 """Metallic-roughness materials with textures, and their evaluation at surface points."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,15 +14,18 @@ from jaxprt.compile import jit
 from jaxprt.scene import mipmap, texture
 from jaxprt.scene.mipmap import Mipmap
 
-
-def _scalar(value) -> Array:
-    return jnp.asarray(value, jnp.result_type(float))
+_COLORS = "base_color", "emissive", "specular_color"
 
 
-def _color(value) -> Array:
+def _scalar(value: Any) -> Any:
+    """A number as an array. What is not of numbers is left for the class to refuse."""
+    return require.floating(value, jnp.result_type(float))
+
+
+def _color(value: Any) -> Any:
     """A number or a color as an array of shape [3]."""
-    value = jnp.asarray(value, jnp.result_type(float))
-    return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
+    value = _scalar(value)
+    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
 class Texture(eqx.Module):
@@ -37,9 +42,9 @@ class Texture(eqx.Module):
         ValueError: The image or the transform is not finite, or the set or wrap mode does not exist.
     """
 
-    image: Float[Array, "h w c"] = eqx.field(converter=jnp.asarray)
+    image: Float[Array, "h w c"] = eqx.field(converter=require.floating)
     transform: Float[Array, "2 3"] = eqx.field(
-        converter=jnp.asarray, default_factory=lambda: jnp.eye(2, 3, dtype=jnp.result_type(float))
+        converter=require.floating, default_factory=lambda: jnp.eye(2, 3, dtype=jnp.result_type(float))
     )
     set: int = eqx.field(static=True, default=0)
     wrap: tuple[str, str] = eqx.field(static=True, default=("repeat", "repeat"))
@@ -49,8 +54,14 @@ class Texture(eqx.Module):
         """Refuses values that are not finite, and unknown sets and wrap modes."""
         require.finite("the texture's image", self.image)
         require.finite("the texture's transform", self.transform)
-        require.between("set", self.set, 0, 1)
-        if not set(self.wrap) <= set(texture.WRAPS):
+        shape = jnp.shape(self.image)
+        if len(shape) != 3 or 0 in shape:
+            raise ValueError(f"the texture's image must be [h, w, c] without empty axes, got {list(shape)}")
+        if jnp.shape(self.transform) != (2, 3):
+            raise ValueError(f"the texture's transform must be [2, 3], got {list(jnp.shape(self.transform))}")
+        require.count("set", self.set, 0, 1)
+        words = isinstance(self.wrap, tuple | list) and all(isinstance(word, str) for word in self.wrap)
+        if not words or len(self.wrap) != 2 or not set(self.wrap) <= set(texture.WRAPS):
             raise ValueError(f"wrap must be two of {', '.join(texture.WRAPS)}, got {self.wrap}")
 
     def at(
@@ -168,10 +179,17 @@ class TexturedMaterial(eqx.Module):
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
         for name, value in vars(self).items():
-            if name.endswith("_texture") and isinstance(value, np.ndarray | jax.Array):
+            if not name.endswith("_texture"):
+                shape = (3,) if name in _COLORS else ()
+                if jnp.shape(value) != shape:
+                    required = "one number or a color [3]" if shape else "one number"
+                    raise ValueError(f"{name} of TexturedMaterial must be {required}, got {list(jnp.shape(value))}")
+            elif isinstance(value, np.ndarray | jax.Array):
                 raise TypeError(
                     f"{name} of TexturedMaterial must be a Texture, got an array: use jaxprt.scene.Texture(image)"
                 )
+            elif value is not None:
+                require.kind(f"{name} of TexturedMaterial", value, Texture, source="jaxprt.scene.Texture")
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,6 +12,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
+from jaxprt import require
+from jaxprt.scene import mesh_arrays
 from jaxprt.scene import origin as origins
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry, rows_of
@@ -40,15 +43,20 @@ class Mesh(eqx.Module):
             and points relative to the origin.
     """
 
-    position: Float[Array, "v 3"]
-    face: Int[Array, "f 3"]
-    normal: Float[Array, "v 3"]
-    tangent: Float[Array, "v 3"]
-    region: Int[Array, " v"]
-    texture: Float[Array, "v 2"] | None = None
+    position: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    face: Int[Array, "f 3"] = eqx.field(converter=mesh_arrays.as_array)
+    normal: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    tangent: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
+    region: Int[Array, " v"] = eqx.field(converter=mesh_arrays.as_array)
+    texture: Float[Array, "v 2"] | None = eqx.field(converter=mesh_arrays.as_array, default=None)
     origin: origins.Origin = eqx.field(static=True, default=origins.ZERO)
 
+    def __check_init__(self):
+        """Refuses arrays of other types and lengths. `make_mesh` and `jaxprt.Part` check values too."""
+        mesh_arrays.check_shapes(self)
 
+
+@require.arguments(path=partial(require.path, "path"))
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
 
@@ -139,6 +147,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     Raises:
         ValueError: There are no meshes.
     """
+    mesh_arrays.check_meshes(meshes)
     if not meshes:
         raise ValueError("meshes must hold at least one mesh, got none")
     meshes = aligned(meshes)
@@ -186,6 +195,7 @@ def centered(mesh: Mesh) -> Mesh:
     return mesh if mesh.origin == origins.ZERO else dataclasses.replace(mesh, origin=origins.ZERO)
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh)
 def split(mesh: Mesh) -> list[Mesh]:
     """Splits a mesh into one mesh per region, in ascending order. Each part becomes region 0 of its mesh.
 
@@ -214,6 +224,7 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, rotation=partial(require.real, "rotation"))
 def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """Rotates a mesh about the origin: positions, normals and tangents.
 
@@ -232,6 +243,7 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z))
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, direction=partial(require.real, "direction"))
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     """Sets the tangents of a mesh to a direction of brushing, projected to the tangent plane of each vertex.
 
@@ -257,6 +269,7 @@ def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, every)[:, 0])
 
 
+@require.arguments(mesh=mesh_arrays.check_mesh, vertices=partial(require.count, "vertices", least=-1, most=1 << 26))
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
     """A square ground plane centered under a mesh.
 
@@ -277,8 +290,7 @@ def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> M
     """
     if vertices < 4:
         raise ValueError(f"vertices must be at least 4, got {vertices}")
-    if not extent > 0:
-        raise ValueError(f"extent must be positive, got {extent}")
+    require.number("extent", extent, 0.0, above=True)
     low, high = bounds(mesh)
     diagonal = float(np.linalg.norm(high - low)) or 1.0
     half = extent / 2 * (max(high[0] - low[0], high[2] - low[2]) or diagonal)
@@ -334,6 +346,8 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
 
 def _array(value, field: str, shape: tuple[int | None, ...], name: str, *, whole: bool = False) -> np.ndarray:
     """A field as an array, checked for its shape. None in `shape` stands for any size."""
+    if isinstance(value, np.ma.MaskedArray | list | tuple):  # lists of different lengths
+        require.real(f"{name}: {field}", value)
     array = np.asarray(value)
     fits = array.ndim == len(shape) and all(must in (None, n) for must, n in zip(shape, array.shape, strict=True))
     kinds = (jnp.integer,) if whole else (jnp.integer, jnp.floating)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxprt import require
 
@@ -64,20 +64,20 @@ def local(name: str, position: Any, origin: Origin) -> Any:
             f"{name} must be relative to the scene inside of jax.jit, jax.vmap and jax.grad, because {position.dtype} "
             f"rounds coordinates near the scene's origin {origin}: use relit.centered() with camera.local(mesh.origin)"
         )
+    require.real(name, position)
     require.finite(name, position)
     return jnp.asarray(np.asarray(position, np.float64) - np.asarray(origin), jnp.result_type(float))
 
 
-def coordinates(value: Any) -> Float[Array | np.ndarray, "..."]:
-    """Numbers as a floating-point array: of JAX, or of NumPy in float64 where float32 would round large coordinates."""
-    if isinstance(value, jax.Array | Tracer):
-        return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
-    exact = np.asarray(value)
-    if exact.dtype.kind in "iu" or exact.dtype == np.float64:
-        exact = exact.astype(np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            rounded = np.asarray(exact.astype(jnp.result_type(float)), np.float64)
-        if exact.size and np.isfinite(exact).all() and np.abs(exact).max() > _LARGE and np.any(rounded != exact):
-            return exact
-    converted = jnp.asarray(value)
-    return converted if jnp.issubdtype(converted.dtype, jnp.floating) else converted.astype(jnp.result_type(float))
+def coordinates(value: Any) -> Any:
+    """Real numbers as an array: of NumPy in float64 where float32 would round large coordinates, otherwise of JAX.
+
+    Anything but real numbers is returned unchanged, for the check of the class to refuse.
+    """
+    if isinstance(value, jax.Array) or require.unreal(value):
+        return require.floating(value)
+    exact = np.asarray(value, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = exact.astype(jnp.result_type(float)).astype(np.float64)
+    large = exact.size and np.isfinite(exact).all() and np.abs(exact).max() > _LARGE
+    return exact if large and np.any(rounded != exact) else require.floating(value)

@@ -1,16 +1,18 @@
 """Scenes: meshes with materials, cameras, and lights."""
 
 import collections
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene import mesh as meshes
+from jaxprt.scene import mesh_arrays
 from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
@@ -43,9 +45,9 @@ class Part(eqx.Module):
     name: str = eqx.field(static=True)
     mesh: Mesh
     material: TexturedMaterial | Callable
-    color: Float[Array, "v 3"] | None = None
-    second: Float[Array, "v 2"] | None = None
-    handedness: Float[Array, " v"] | None = None
+    color: Float[Array, "v 3"] | None = eqx.field(converter=require.floating, default=None)
+    second: Float[Array, "v 2"] | None = eqx.field(converter=require.floating, default=None)
+    handedness: Float[Array, " v"] | None = eqx.field(converter=require.floating, default=None)
 
     def __check_init__(self):
         """Refuses a wrong type of name or mesh, a mesh without vertices, and arrays of other vertices."""
@@ -54,6 +56,7 @@ class Part(eqx.Module):
         require.kind(
             f"the mesh of part {self.name!r}", self.mesh, Mesh, source="jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
         )
+        mesh_arrays.check_values(self.mesh, f"the mesh of part {self.name!r}")
         count = len(self.mesh.position)
         if not count or not len(self.mesh.face):
             raise ValueError(
@@ -62,7 +65,13 @@ class Part(eqx.Module):
         for name in ("color", "second", "handedness"):
             value = getattr(self, name)
             if value is not None:
+                require.real(f"{name} of part {self.name!r}", value)
                 require.length(f"rows of {name} of part {self.name!r}", value, count)
+                shape = {"color": (count, 3), "second": (count, 2), "handedness": (count,)}[name]
+                if jnp.shape(value) != shape:
+                    raise ValueError(
+                        f"{name} of part {self.name!r} must be {list(shape)}, got {list(jnp.shape(value))}"
+                    )
                 require.finite(f"{name} of part {self.name!r}", value)
         if not isinstance(self.material, TexturedMaterial):
             if not callable(self.material):
@@ -97,16 +106,16 @@ class Part(eqx.Module):
         return self.material.at(first, second, color=color, handedness=side, slopes=slopes)
 
 
-def _place(value: Any) -> Array | np.ndarray:
-    """Three coordinates, or one number for three."""
+def _place(value: Any) -> Any:
+    """Three coordinates, or one number for three. What is not of numbers is left for the class to refuse."""
     value = origins.coordinates(value)
-    return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
+    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
-def _three(value: Any) -> Array:
-    """A number or three numbers as an array of shape [3]."""
-    value = jnp.asarray(value, jnp.result_type(float))
-    return jnp.broadcast_to(value, (3,)) if value.ndim == 0 else value
+def _three(value: Any) -> Any:
+    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
+    value = require.floating(value, jnp.result_type(float))
+    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
 class PointLight(eqx.Module):
@@ -133,12 +142,17 @@ class PointLight(eqx.Module):
             raise TypeError(f"the name of a point light must be text, got {self.name!r}")
         require.position(f"the position of point light {self.name!r}", self.position)
         require.at_least(f"the intensity of point light {self.name!r}", self.intensity, 0.0)
+        if jnp.shape(self.intensity) != (3,):
+            got = list(jnp.shape(self.intensity))
+            raise ValueError(f"the intensity of point light {self.name!r} must be one number or a color [3], got {got}")
 
 
 def _tuple(items: Any) -> tuple:
     """A sequence as a tuple."""
-    if isinstance(items, eqx.Module):
-        raise TypeError(f"a scene takes lists of parts, cameras and environments, got one {type(items).__name__}")
+    if isinstance(items, eqx.Module | str | bytes) or not isinstance(items, Iterable):
+        raise TypeError(
+            f"a scene takes lists of parts, cameras, environments and point_lights, got one {type(items).__name__}"
+        )
     return tuple(items)
 
 

@@ -349,6 +349,7 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) 
 def _least_laplacian(coefficient: Array, kept: Array) -> Array:
     degree = degree_of(coefficient.shape[0])
     band = _band(degree)
+    coefficient = coefficient.astype(jnp.result_type(coefficient, kept))  # The loop below keeps the type of its start.
     energy = jnp.sum(coefficient.reshape(len(band), -1) ** 2, -1)
     weight = jnp.asarray((np.arange(degree + 1) * np.arange(1, degree + 2)) ** 2, coefficient.dtype)
     spectrum = jax.ops.segment_sum(energy, jnp.asarray(band), degree + 1) * weight
@@ -364,8 +365,7 @@ def _least_laplacian(coefficient: Array, kept: Array) -> Array:
         slope = jnp.where(some, jnp.sum(spectrum * factor**3 * weight), 1)
         return strength + remains / slope * (jnp.sqrt(remains / some_kept) - 1), None
 
-    # A share of 0 is the limit of infinite strength.
-    some_kept = jnp.where(kept == 0, 1, kept)
+    some_kept = jnp.where(kept == 0, 1, kept)  # A share of 0 is the limit of infinite strength.
     strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
     factor = 1 / (1 + jnp.maximum(strength, 0) * weight)
     return jnp.where((kept == 0) & some, weight == 0, factor)

@@ -17,13 +17,12 @@ from jaxprt.compile import jit, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems import adaptive
+from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
-_FINE = 32
 _value = jit(adaptive.value)
 
 
@@ -122,6 +121,7 @@ class BrightTexels(VertexSystem):
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
         position, frame = self.place(self.visibility)
+        eye = require.position("the eye", eye, each=self.vertices)
         return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
 
     def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
@@ -153,6 +153,7 @@ class BrightTexels(VertexSystem):
         return rest and (BrightTexels, self.count, rest)
 
 
+@require.arguments(light=protocol.one_light, count=partial(require.count, "the number of texels", least=-1))
 @partial(jit, static_argnames=("count",))
 def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
     """Takes the excess radiance of the brightest texels out of a light.
@@ -170,10 +171,7 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
         TypeError: The light is not an `Environment`.
         ValueError: The light is a batch, or `count` is negative or not below the number of texels.
     """
-    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     size, colors = light.radiance.shape[-2:]
-    if light.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
     if not 0 <= count < 6 * size * size:
         raise ValueError(f"the number of texels must be from 0 to {6 * size * size - 1}, got {count}")
     radiance = light.radiance.reshape(-1, colors)
@@ -222,10 +220,11 @@ def radiance(
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     brdf = grid.as_argument(brdf)
+    require.count("samples", samples, -1, 64)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)
-    require.position("the eye", eye)
+    eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
     return _sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
@@ -236,7 +235,7 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
     require.length("rows of the excess", excess, len(texel))
     require.finite("the excess", excess)
     require.within("the texels", texel, 0, 6 * transport.size**2 - 1)
-    return jnp.asarray(excess, jnp.result_type(excess, transport.position))
+    return require.floating(excess)
 
 
 @partial(jit, static_argnames=("size", "samples"))
@@ -265,6 +264,7 @@ def _sent(
         samples: Number of sample points along the edge of each texel.
     """
     texel, excess, visible = light
+    protocol.check_colors(excess.shape[1], 1 if blend is None else blend.weight.shape[2])
     # Vertices are the last axis, over which XLA vectorizes CPU code.
     frame, wo = jnp.moveaxis(frame, 0, 2), wo.T
     parameter = () if blend is None else blend.parameter
@@ -299,6 +299,7 @@ def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"
     return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
 
 
+@require.arguments(size=partial(require.count, "size", least=1))
 def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     """Number of sample points along the edge of a texel that `radiance` needs for a BRDF.
 
@@ -317,9 +318,9 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
     Raises:
         ValueError: The error is not positive.
     """
-    if not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
-    rule = [np.polynomial.legendre.leggauss(count) for count in (*_SAMPLES, _FINE)]
+    require.number("error", error, 0.0, above=True)
+    grid.check(brdf)
+    rule = [np.polynomial.legendre.leggauss(count) for count in (*_SAMPLES, 32)]
     place = np.concatenate([np.stack(np.meshgrid(x, x), -1).reshape(-1, 2) for x, _ in rule])
     weight = np.concatenate([np.outer(w, w).ravel() for _, w in rule])
     first = np.cumsum([0, *(len(x) ** 2 for x, _ in rule[:-1])])
@@ -344,10 +345,7 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
 def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "v c"]:
     """Irradiance / pi under light from the given texels: the radiance of diffuse vertices of albedo 1.
 
-    Args:
-        transport: Visibility of single texels for the vertices, such as `StoredVisibility` or `LobeTransport`.
-        texel: Indices of the texels.
-        excess: Radiance of each texel, from `split`.
+    `radiance` describes the arguments.
 
     Raises:
         ValueError: A texel index is out of range, or the excess is not finite or does not have one row for each texel.

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
+from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 
@@ -27,6 +28,15 @@ class System(eqx.Module):
     Subclasses document what `light` and `view` return. Each method may be called inside `jax.jit` and is differentiable
     in its arguments.
     """
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the system's zero is in the coordinates of eyes. Only relit scenes may have another than zero."""
+        return origins.ZERO
+
+    def centered(self) -> "System":
+        """The same system for eyes relative to `origin`."""
+        return self
 
     @abc.abstractmethod
     def light(self, environment: Environment) -> PyTree:
@@ -42,7 +52,7 @@ class System(eqx.Module):
         return light
 
     @abc.abstractmethod
-    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> PyTree:
+    def view(self, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None) -> PyTree:
         """Evaluates the view and the materials in the form that this system uses. Call it again when either changes.
 
         Args:
@@ -121,6 +131,11 @@ class VertexSystem(System):
         return placed(transport.position, transport.frame, self.points)
 
 
+def _parameters(value: Any) -> Any:
+    """A list of parameters as a tuple of arrays. Anything else is left for `Blend` to refuse."""
+    return tuple(map(require.floating, value)) if isinstance(value, list | tuple) else value
+
+
 class Blend(eqx.Module):
     """Material of each vertex: a weighted sum of basis BRDFs.
 
@@ -132,12 +147,18 @@ class Blend(eqx.Module):
         parameter: BRDF parameters of each vertex, such as roughness, one array for each parameter of the table.
     """
 
-    weight: Float[Array, "v k c"]
-    parameter: tuple[Float[Array, " v"], ...] = ()
+    weight: Float[Array, "v k c"] = eqx.field(converter=require.floating)
+    parameter: tuple[Float[Array, " v"], ...] = eqx.field(converter=_parameters, default=())
 
     def __check_init__(self):
         """Refuses weights and parameters that are not finite, and parameters whose length differs from the weights'."""
         require.finite("the weights of the blend", self.weight)
+        if jnp.ndim(self.weight) != 3:
+            raise ValueError(f"the weights of the blend must be [v, k, c], got {list(jnp.shape(self.weight))}")
+        if not isinstance(self.parameter, tuple):
+            raise TypeError(
+                f"the parameters of the blend must be a list of arrays, got {type(self.parameter).__name__}"
+            )
         for each in self.parameter:
             require.finite("the parameters of the blend", each)
             require.length("values of each parameter of the blend", each, len(self.weight))
@@ -185,7 +206,7 @@ class Total(System):
         require.kind("the light", light, tuple, source="Total.light")
         return tuple(each.shade(lit, materials) for each, lit in zip(self.part, light, strict=True))
 
-    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
+    def view(self, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
         """The view of each system."""
         return tuple(each.view(eye, materials) for each in self.part)
 
@@ -235,7 +256,7 @@ class Joined(System):
         triples = zip(self.part, light, self._given(materials), strict=True)
         return tuple(each.shade(lit, own) for each, lit, own in triples)
 
-    def view(self, eye: Float[Array, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
+    def view(self, eye: Float[Array | np.ndarray, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
         """The view of each system."""
         return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
 
@@ -295,6 +316,38 @@ def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
     return tuple(points)
 
 
+def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> Environment:
+    """The light that a system is to relight with, checked, in float32 or float64.
+
+    `size` is the edge of the faces that was precomputed, None for any; with `batch` there may be leading axes.
+
+    Raises:
+        TypeError: The value is not an `Environment`.
+        ValueError: The light is a batch, has faces of another size, or is not finite.
+    """
+    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
+    shape = list(jnp.shape(value.radiance))
+    wanted = "n" if size is None else size
+    required = f"the light must be one environment [6, {wanted}, {wanted}, c], got {shape}"
+    if len(shape) != 4 and not batch:
+        raise ValueError(required)
+    if size is not None and shape[-3] != size:
+        raise ValueError(
+            f"{required}: load it with jaxprt.load_environment(path, size={size}), or precompute with size={shape[-3]}"
+        )
+    require.finite("the light", value.radiance)
+    radiance = require.floating(value.radiance)
+    return value if radiance is value.radiance else Environment(radiance)
+
+
+def check_colors(light: int, view: int) -> None:
+    """Refuses light and materials of different numbers of colors, unless one of them is gray, by ValueError."""
+    if light != view and 1 not in (light, view):
+        raise ValueError(
+            f"light and materials must have the same number of colors, or one must be gray, got {light} and {view}"
+        )
+
+
 def total(*systems: System) -> Total:
     """The sum of systems over the same vertices, such as `total(direct, bounces)`.
 
@@ -308,7 +361,7 @@ def total(*systems: System) -> Total:
 
 
 def radiance(
-    system: System, environment: Environment, *, eye: Float[Array, "3"], materials: PyTree = None
+    system: System, environment: Environment, *, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None
 ) -> Float[Array, "*l v c"]:
     """Radiance that each vertex sends to the eye. Calls the four methods of any system in order.
 
@@ -328,9 +381,10 @@ def radiance(
         ValueError: A batch is empty, or a method of the system raises it.
     """
     _check(system)
-    require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
+    environment = one_light(environment, batch=True)
     *batch, faces, rows, columns, colors = environment.radiance.shape
-    eye = eye if isinstance(eye, jax.Array) else jnp.asarray(eye, jnp.result_type(float))
+    eye = require.position("the eye", origins.local("the eye", eye, system.origin))
+    system = system.centered()
     view = system.view(eye, materials)
     if not batch:
         return system.combine(system.shade(system.light(environment), materials), view)

@@ -17,7 +17,8 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
-from jaxprt.systems import adaptive
+from jaxprt.systems import adaptive, protocol
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 _BLOCK = 64
 _MIRROR = np.array([-1, -1, 1], np.float32)
@@ -29,7 +30,7 @@ def radiance(
     brdf: Callable,
     light: Environment,
     *,
-    eye: Float[Array, "3"],
+    eye: Float[Array | np.ndarray, "3"],
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
     points: Points | None = None,
@@ -67,13 +68,20 @@ def radiance(
             the light or the eye is not finite. Values cannot be checked inside `jax.jit`, where NaN reaches the
             vertices.
     """
-    if not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
+    if not isinstance(brdf, PerVertex):
+        grid.check(brdf)
+    require.function("between", between)
+    if error != np.inf:
+        require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
-    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
-    require.finite("the light", light.radiance)
-    require.position("the eye", eye)
-    eye = origins.local("the eye", eye, mesh.origin)
+    eye = require.position("the eye", origins.local("the eye", eye, mesh.origin))
+    light = protocol.one_light(light, batch=True)
+    for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
+        PRECOMPUTE[name](value)
+    if not isinstance(brdf, PerVertex):
+        direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
+        channels = jax.eval_shape(brdf, direction, direction).shape
+        protocol.check_colors(light.radiance.shape[-1], channels[-1] if len(channels) > 1 else 1)
     rays = visibility.Occluder(mesh if occluder is None else relative(occluder, mesh.origin))
     if points is None:
         start = visibility.start_points(mesh, rays)
@@ -108,7 +116,7 @@ def integrate(
     frame: Float[Array, "b 3 3"],
     brdf: Callable,
     light: Environment,
-    eye: Float[Array, "3"],
+    eye: Float[Array | np.ndarray, "3"],
     *,
     error: float | Float[Array, ""] = 1e-3,
 ) -> Float[Array, "..."]:

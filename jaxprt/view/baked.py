@@ -26,7 +26,7 @@ def export_baked(
     path: str | os.PathLike,
     environment: Environment,
     *,
-    eye: Float[Array, "3"] | None = None,
+    eye: Float[Array | np.ndarray, "3"] | None = None,
     materials: Mapping[str, Any] | None = None,
 ) -> float:
     """Writes a scene as binary glTF with baked lighting: radiance under one light towards one eye position.

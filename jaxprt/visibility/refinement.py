@@ -16,11 +16,13 @@ import tqdm
 from jaxtyping import Bool, Float, Float32, Int
 from threadpoolctl import threadpool_limits
 
+from jaxprt import require
 from jaxprt.scene import light_samples, subdivision
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.subdivision import Division, Edges
 from jaxprt.visibility import blocks
+from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.diffuse import DiffuseTracer
 
 _DIRECTIONS = 1024  # per light: penumbrae have steps of a thousandth of its power
@@ -34,6 +36,7 @@ _SHORTEST = 256  # length of the shortest edge that is cut, relative to the offs
 _ROUNDING = 1e-5  # relative difference that rounding may cause
 
 
+@require.arguments(**PRECOMPUTE)
 def refine(
     mesh: Mesh,
     *,

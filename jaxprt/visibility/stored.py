@@ -17,10 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from jaxprt import require
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.visibility import blocks, rays
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms; a release that changes results raises one of them.
 ALGORITHM = {"visibility": rays.ALGORITHM, "direct": 1}
@@ -78,6 +80,7 @@ class StoredVisibility(eqx.Module):
         return level
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     *,

@@ -711,3 +711,76 @@ def test_systems_of_equal_lights_say_so():
     assert made("separable").system.shared_light is None
     assert made("lobe, bright texels").system.shared_light != first.shared_light
     assert protocol.System.shared_light.fget(first) is None
+
+
+HALF = ("float16", "bfloat16")
+
+
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_lights_and_eyes_of_every_float_type_give_one_radiance(name, close):
+    system, materials, _ = made(name, "triangle")
+    radiance = partial(prt.radiance, system, materials=materials)
+    bright = light().radiance
+    exact = radiance(Environment(bright), eye=EYE)
+    for dtype in (*HALF, "float64", "int32"):
+        given = np.asarray(bright).astype(jnp.dtype(dtype))
+        expected = radiance(Environment(jnp.asarray(given, jnp.float32)), eye=EYE)
+        kind = jnp.dtype(dtype if dtype in HALF else "float64")
+        color = radiance(Environment(given), eye=np.asarray(EYE).astype(kind))
+        assert color.dtype == exact.dtype
+        close(color, expected, tolerance=1e-5)  # EYE is exact in half precision
+    with jax.numpy_dtype_promotion("strict"):
+        close(radiance(Environment(bright), eye=np.asarray(EYE, np.float16)), exact, tolerance=1e-5)
+    half = Environment(bright)
+    object.__setattr__(half, "radiance", bright.astype(jnp.bfloat16))  # such as by `jax.tree.map`
+    assert radiance(half, eye=list(map(float, EYE))).dtype == exact.dtype
+
+
+@each_system
+def test_gradients_come_back_in_the_type_of_the_light_and_the_eye(name):
+    system, materials, _ = made(name, "triangle")
+
+    def total(radiance, eye):
+        return jnp.sum(prt.radiance(system, Environment(radiance), eye=eye, materials=materials))
+
+    arguments = light().radiance.astype(jnp.bfloat16), EYE.astype(jnp.float16)
+    for slope, argument in zip(jax.grad(total, argnums=(0, 1))(*arguments), arguments, strict=True):
+        assert slope.dtype == argument.dtype
+        assert np.isfinite(np.asarray(slope, np.float32)).all()
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_light_of_float32_is_taken_where_float64_is_enabled(close):
+    table = harmonic.tabulate(GLOSSY, degree=2, error=0.5, resolution=16)
+    system = harmonic.HarmonicSystem(harmonic.precompute(mesh("triangle"), degree=2, size=4, progress=False), table)
+    bright = np.random.default_rng(0).uniform(0.2, 1.0, (6, 4, 4, 3)).astype(np.float32)
+    colors = [
+        prt.radiance(system, Environment(jnp.asarray(bright, dtype)), eye=jnp.asarray(EYE, dtype))
+        for dtype in ("float32", "float64")
+    ]
+    assert colors[0].dtype == colors[1].dtype == np.float64
+    close(*colors, tolerance=1e-5)
+
+
+@each_system
+@pytest.mark.usefixtures("unchecked")
+def test_the_largest_and_smallest_lights_make_no_nan_and_larger_ones_are_refused(name):
+    system, materials, _ = made(name, "triangle")
+    radiance = partial(prt.radiance, system, eye=EYE, materials=materials)
+    for scale in (1e15 / 6.0, 1e-20, 1e-38):
+        assert np.isfinite(radiance(Environment(light().radiance * scale))).all()
+    for wrong in (1e16, 1e38):
+        with pytest.raises(ValueError, match=r"radiance must be at most 1e\+15 in magnitude, got 384 of 384"):
+            Environment(np.full((6, SIZE, SIZE, 1), wrong, np.float32))
+
+
+@pytest.mark.parametrize("name", BLENDED)
+@pytest.mark.usefixtures("unchecked")
+def test_lights_of_two_or_four_colors_are_refused_by_number_where_the_materials_have_three(name):
+    system, _ = MADE[name].make("triangle", "channels")
+    view = system.view(EYE, prt.Blend(jnp.ones((3, 3, 3))))
+    for colors in (2, 4):
+        lit = system.shade(system.light(Environment(jnp.ones((6, SIZE, SIZE, colors)))))
+        with pytest.raises(ValueError, match=rf"colors.* got .*\b{colors}\b"):
+            system.combine(lit, view)

@@ -5,11 +5,18 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+from jaxprt import require
 from jaxprt.scene.formats import gltf, mesh_colors, mesh_file, mitsuba_dict, mtl
 from jaxprt.scene.formats.file_parts import split_parts
 from jaxprt.scene.scene import Scene
 
 
+def _path(value: Any) -> None:
+    if not isinstance(value, Mapping):
+        require.path("path", value)
+
+
+@require.arguments(path=_path)
 def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = False) -> Scene:
     """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 

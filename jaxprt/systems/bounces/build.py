@@ -20,6 +20,7 @@ from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 ALL = "all"  # as many bounces as contribute
 _MEMBERS = 230  # number of vertices of a cluster
@@ -27,6 +28,7 @@ _SEEN = 4  # edge of the visibility's faces relative to that of the light's
 _SAMPLE = 8  # number of clusters from which the worth of a bounce is estimated
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],

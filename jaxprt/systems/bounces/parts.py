@@ -114,7 +114,7 @@ class PartBounces(protocol.System):
         self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
         """Harmonics of the BRDF at each vertex or point for its view direction."""
-        require.position("the eye", eye)
+        eye = require.position("the eye", eye)
         rows = zip(self.part, self._given(materials), self._points(), strict=True)
         return tuple(part.view(eye, own, points) for part, own, points in rows)
 

@@ -23,7 +23,7 @@ from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
-from jaxprt.systems import dynamic
+from jaxprt.systems import dynamic, protocol
 from jaxprt.systems.bounces import functions
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.tensor import TransferTensor
@@ -121,12 +121,7 @@ def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
         ValueError: The light is a batch or not finite, or the edge of its faces is not a multiple of that of the
             tensor's.
     """
-    if not isinstance(light, Environment):
-        raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
-    if light.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
-    require.finite("the light", light.radiance)
-    return _lit(tensor, light.radiance)
+    return _lit(tensor, protocol.one_light(light).radiance)
 
 
 def arriving(
@@ -265,7 +260,7 @@ def view_side(
         eye: Position of the viewer in world units.
         points: Points of each region; None for the vertices.
     """
-    require.position("the eye", eye)
+    eye = require.position("the eye", eye)
     return _view_side(transport, surfaces, eye, points)
 
 

@@ -8,18 +8,20 @@ keeps the other result. `combine` computes radiance from both.
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import bright_texels, lobe, separable
+from jaxprt.systems import bright_texels, lobe, protocol, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
 from jaxprt.systems.lobe import LobeLight, LobeView
@@ -30,8 +32,10 @@ from jaxprt.visibility.points import PointVisibility
 _ROUNDED = 1e-4  # tolerance for the sum of weights in single precision
 
 
-def _floating(value: ArrayLike) -> Array:
-    return jnp.atleast_1d(jnp.asarray(value, jnp.result_type(float)))
+def _floating(value: Any) -> Any:
+    """Numbers as an array with at least one axis. What is not of numbers is left for `Material` to refuse."""
+    value = require.floating(value, jnp.result_type(float))
+    return jnp.atleast_1d(value) if isinstance(value, jax.Array) else value
 
 
 class Material(eqx.Module):
@@ -51,6 +55,11 @@ class Material(eqx.Module):
     weight: Float[Array, " m"] = eqx.field(converter=_floating)
     diffuse: Float[Array, "*v c"] = eqx.field(converter=_floating)
     specular: Float[Array, "*w d"] = eqx.field(converter=_floating)
+
+    def __check_init__(self):
+        """Refuses anything but real numbers."""
+        for name in ("weight", "diffuse", "specular"):
+            require.real(f"{name} of the material", getattr(self, name))
 
 
 class DynamicLight(eqx.Module):
@@ -166,12 +175,7 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
         TypeError: `light` is not an `Environment`.
         ValueError: The light is a batch, has another size than the transport requires, or is not finite.
     """
-    size = transport.size
-    if not isinstance(light, Environment):
-        raise TypeError(f"the light must be an Environment, got {type(light).__name__}")
-    if light.radiance.shape[:-1] != (6, size, size):
-        raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
-    require.finite("the light", light.radiance)
+    light = protocol.one_light(light, size=transport.size)
     texel, excess, rest = bright_texels.split(light, count=texels)
     met = tuple(each.terms.apply(separable.project(rest)) for each in transport.region)
     blurred = None
@@ -201,8 +205,7 @@ def view_side(
         eye: Position of the viewer in world units.
         points: Points of each region; None for the vertices.
     """
-    eye = jnp.asarray(eye, transport.region[0].seen.position.dtype)
-    require.position("the eye", eye)
+    eye = require.position("the eye", eye).astype(transport.region[0].seen.position.dtype)
     _check_all(transport, brdfs, materials)
     return _view_side(transport, brdfs, materials, eye, points)
 

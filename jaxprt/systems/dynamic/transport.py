@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.scene.mesh import Mesh
 from jaxprt.systems import lobe, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 _MEMBERS = 230  # number of vertices of a cluster in a large region
 _CLUSTERS = 64  # number of clusters of a smaller region, if each then has at least
@@ -72,6 +73,7 @@ class DynamicTransport(eqx.Module):
         return sum(each.nbytes for each in self.region)
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],

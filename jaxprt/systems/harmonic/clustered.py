@@ -29,6 +29,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import harmonics, products
 from jaxprt.systems.harmonic import transfer
 from jaxprt.visibility import members
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic clustered": 1}
@@ -139,6 +140,7 @@ def clustered_light(transport: ClusteredTransfer, light: Float[Array, "lm c"]) -
     return jnp.moveaxis(rows.reshape(-1, terms, colors)[transport.place], 0, 2)
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute_clustered(
     mesh: Mesh,
     *,

@@ -17,19 +17,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check, check_memory
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "bounce": 1}
 _RAYS = 1 << 12  # number of hits shaded at once
 
 
+@require.arguments(**PRECOMPUTE)
 def interreflect(
     mesh: Mesh,
     transport: TransferMatrix,
@@ -83,6 +85,7 @@ def interreflect(
     return TransferMatrix(jnp.asarray(total), transport.position, transport.frame)
 
 
+@require.arguments(**PRECOMPUTE)
 def interreflect_diffuse(
     mesh: Mesh,
     transport: TransferVector,

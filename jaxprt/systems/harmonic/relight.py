@@ -10,6 +10,7 @@ Lights, eyes and probes must be finite. Values cannot be checked inside `jax.jit
 in a light or an eye reaches every vertex, and NaN at a probe reaches every vertex with a weight of it.
 """
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from jaxprt.compile import jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics, rotation
+from jaxprt.systems import protocol
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, right_handed
 
@@ -28,14 +30,10 @@ def _light_shape(value: Any) -> None:
     require.array("the light", value, "lm c", "lm c v", source="jaxprt.harmonic.project")
 
 
-def _light(value: Any) -> None:
+def _light(value: Any) -> Array:
     _light_shape(value)
     require.finite("the light", value)
-
-
-def _environment(value: Any) -> None:
-    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
-    require.finite("the light", value.radiance)
+    return require.floating(value)
 
 
 def _brdf(value: Any) -> None:
@@ -50,29 +48,34 @@ def _vector(value: Any) -> None:
     require.kind("the transport", value, TransferVector, source="jaxprt.harmonic.precompute_diffuse")
 
 
-def _eye(value: Any) -> None:
-    require.array("the eye", value, "3")
-    require.finite("the eye", value)
+_eye = partial(require.position, "the eye")
 
 
-def _eyes(value: Any) -> None:
-    require.array("the eye", value, "3", "v 3")
-    require.finite("the eye", value)
+def _eyes(value: Any) -> Array:
+    require.real("the eye", value)
+    shape = jnp.shape(value)
+    return require.position("the eye", value, each=shape[0] if len(shape) == 2 else None)
 
 
-def _probe(value: Any) -> None:
+def _degree(value: Any) -> None:
+    require.count("degree", value, 0, 256)
+
+
+def _probe(value: Any) -> Array:
     require.array("probes", value, "p 3")
     require.finite("probes", value)
     if not value.shape[0]:
         raise ValueError("there must be at least one probe, got an array of shape [0, 3]")
+    return require.floating(value)
 
 
-def _probe_coefficient(value: Any) -> None:
+def _probe_coefficient(value: Any) -> Array:
     require.array("the light at the probes", value, "p lm c")
     require.finite("the light at the probes", value)
+    return require.floating(value)
 
 
-@require.arguments(light=_environment)
+@require.arguments(light=partial(protocol.one_light, batch=True), degree=_degree)
 def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
     """Projects an environment, or each one of a batch, to spherical harmonics.
 

@@ -167,10 +167,7 @@ class DiffuseSystem(protocol.VertexSystem):
 
 def _projected(environment: Environment, degree: int) -> Float[Array, "lm c"]:
     """SH coefficients of one environment."""
-    require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
-    if environment.radiance.ndim != 4:
-        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(environment.radiance.shape)}")
-    return project(environment, degree=degree)
+    return project(protocol.one_light(environment), degree=degree)
 
 
 def blended_view(
@@ -195,6 +192,7 @@ def blended_view(
         ValueError: The blend has another number of vertices or channels.
     """
     protocol.check_blend(materials)
+    eye = require.position("the eye", eye, each=len(position))
     parameter = () if materials is None else materials.parameter
     row = view_coefficients(brdf, position, frame, *parameter, eye=eye)
     if materials is None:

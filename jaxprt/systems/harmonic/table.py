@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import jit
 from jaxprt.sphere import harmonics, hemisphere, rotation
@@ -160,6 +161,11 @@ def tabulate(
     Reference: Kautz, Sloan, Snyder 2002, section 3.
     """
     wanted = _ERROR if error is None else error
+    grid.check_family(brdf, knot)
+    require.count("degree", degree, -1)
+    require.number("error", wanted, -require.LARGEST)
+    if resolution is not None:
+        require.count("resolution", resolution, -1, 1 << 12)
     if not 0 <= degree <= 50 or (resolution is not None and resolution < 2) or not wanted > 0:
         raise ValueError(
             "tabulate needs a degree of 0 to 50, a resolution of at least 2 and an error above 0, "

@@ -23,6 +23,7 @@ from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, products, rotation
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic": 1}
@@ -66,6 +67,7 @@ class TransferVector(eqx.Module):
         return self.vector.nbytes
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     *,
@@ -107,6 +109,7 @@ def precompute(
     return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute_diffuse(
     mesh: Mesh,
     *,
@@ -323,5 +326,7 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
 
 def check(degree: int, size: int) -> None:
     """Refuses a degree or a size that is out of range."""
+    require.count("degree", degree, -(2**31))
+    require.count("size", size, -(2**31))
     if not 0 <= degree <= 25 or size < 1 or size & (size - 1):
         raise ValueError(f"degree must be 0 to 25 and size a power of two, got {degree} and {size}")

@@ -88,7 +88,7 @@ class LitByLamps(eqx.Module):
             ValueError: The blend has another number of vertices or channels, or the eye is not finite.
         """
         count = len(self.transport.position if points is None else points)
-        require.position("the eye", eye, each=count)
+        eye = require.position("the eye", eye, each=count)
         check_blend(blend)
         if blend is not None:
             blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))

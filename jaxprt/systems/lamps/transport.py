@@ -28,6 +28,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
+from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.occluder import offsets
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -70,6 +71,7 @@ class LampTransport(eqx.Module):
         return self.solid_angle.nbytes + self.cosine.nbytes + self.direction.nbytes
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     lamps: Sequence[Mesh | PointLight],
@@ -103,8 +105,12 @@ def precompute(
         ValueError: There are no lamps, a lamp has no area, `pieces` is not a power of two or exceeds `samples`,
             positions or normals are not finite, or the folder holds results of other inputs.
     """
+    if not isinstance(lamps, Sequence) or isinstance(lamps, str | bytes):
+        raise TypeError(f"lamps must be a list of meshes and point lights, got {require.shown(lamps)}")
     if not lamps:
         raise ValueError("lamps must be at least one, got none")
+    require.count("samples", samples, 1)
+    require.count("pieces", pieces, -(2**63))
     if pieces < 1 or pieces & (pieces - 1) or pieces > samples:
         raise ValueError(f"pieces must be a power of two, and at most the {samples} samples, got {pieces}")
     for number, each in enumerate(lamps):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.compile import isolated, jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
@@ -25,6 +25,7 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems import harmonic
 from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
@@ -215,6 +216,7 @@ def scales(size: int) -> Scales:
     return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()))
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     *,

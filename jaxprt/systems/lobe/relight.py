@@ -31,6 +31,7 @@ from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, harmonics
+from jaxprt.systems import protocol
 from jaxprt.systems.lobe.pyramid import DEGREE, LobeTransport, Scales, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes
 
@@ -86,11 +87,7 @@ def _brdf(value: Any) -> None:
     require.kind("the BRDF", value, LobeBrdf, source="jaxprt.lobe.tabulate")
 
 
-def _environment(value: Any) -> None:
-    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
-
-
-@require.arguments(brdf=_brdf, light=_environment)
+@require.arguments(brdf=_brdf, light=protocol.one_light)
 def radiance(
     transport: LobeTransport, brdf: LobeBrdf, light: Environment, *, eye: Float[Array, "3"]
 ) -> Float[Array, "v c"]:
@@ -119,7 +116,7 @@ def radiance(
     return combine(prefilter(light), view_lobes(transport, brdf, eye=eye))
 
 
-@require.arguments(light=_environment)
+@require.arguments(light=protocol.one_light)
 def prefilter(light: Environment) -> LobeLight:
     """Blurs a light by lobes of all widths. The result is linear in the light.
 
@@ -129,8 +126,7 @@ def prefilter(light: Environment) -> LobeLight:
     Raises:
         ValueError: The light is a batch, its faces have an edge of less than 8 texels, or it is not finite.
     """
-    require.finite("the light", light.radiance)
-    if light.radiance.ndim != 4 or light.radiance.shape[1] < 8:
+    if light.radiance.shape[1] < 8:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
         )
@@ -162,7 +158,7 @@ def view_lobes(
         ValueError: The number of parameters differs from the table's, or the eye is not finite, or is neither one
             position nor one for each vertex or point.
     """
-    require.position("the eye", eye, each=len(transport.position if points is None else points))
+    eye = require.position("the eye", eye, each=len(transport.position if points is None else points))
     return _view_lobes(transport, brdf, parameter, eye, points, variance)
 
 
@@ -246,6 +242,7 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
             f"the light's faces must have as many texels along an edge as the transport's, {view.size}, "
             f"got {light.size}"
         )
+    protocol.check_colors(len(light.pyramid), view.weight.shape[0])
     irradiance = light.coefficient.T @ view.vector
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)

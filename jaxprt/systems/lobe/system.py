@@ -33,13 +33,7 @@ class LobeSystem(protocol.VertexSystem):
 
     def light(self, environment: Environment) -> LobeLight:
         """The light, blurred by lobes of about a dozen widths; see `jaxprt.lobe.prefilter`."""
-        lit = prefilter(environment)
-        if lit.size != self.transport.size:
-            raise ValueError(
-                f"the light's faces must have as many texels along an edge as the transport's, "
-                f"{self.transport.size}, got {lit.size}"
-            )
-        return lit
+        return prefilter(protocol.one_light(environment, size=self.transport.size))
 
     def view(
         self,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import jit
 from jaxprt.decompose import mixture
@@ -239,11 +240,13 @@ def tabulate(
     """
     if (lobes is None) == (error is None):
         raise ValueError(f"give either lobes or error, got lobes={lobes} and error={error}")
+    _check_options(lobes, error, resolution)
     if (lobes is not None and not lobes >= 1) or (error is not None and not error > 0) or resolution < 4:
         raise ValueError(
             f"tabulate needs at least one lobe or an error above 0, and a resolution of at least 4, "
             f"got lobes={lobes}, error={error} and resolution={resolution}"
         )
+    grid.check_family(brdf, knot)
     knots = grid.checked(knot)
     made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
     isotropic = all(is_isotropic(each) for each in made)
@@ -260,6 +263,15 @@ def tabulate(
         if error is None or reached <= error:
             return eqx.tree_at(lambda x: x.error, result, jnp.asarray(reached, wo.dtype))
     raise ValueError(f"error must be at least {reached:.3g}, which {_COUNTS[-1]} lobes reach; got {error}")
+
+
+def _check_options(lobes: int | None, error: float | None, resolution: int) -> None:
+    """Refuses options of other kinds, and numbers of lobes or nodes that no machine holds."""
+    if lobes is not None:
+        require.count("lobes", lobes, -1, 1 << 10)
+    if error is not None:
+        require.number("error", error, -1.0)
+    require.count("resolution", resolution, -1, 1 << 12)
 
 
 def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:

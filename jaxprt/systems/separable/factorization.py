@@ -11,6 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxprt import require
+from jaxprt.brdf import grid
 from jaxprt.compile import isolated, jit
 from jaxprt.decompose import eigen
 from jaxprt.files import objects
@@ -173,9 +175,14 @@ def factor(
     """
     if (terms is None) == (error is None):
         raise ValueError(f"give either terms or error, got terms={terms} and error={error}")
-    if error is not None and not error > 0:
-        raise ValueError(f"error must be positive, got {error}")
+    grid.check(brdf)
+    if error is not None:
+        require.number("error", error, 0.0, above=True)
     if light is not None:
+        if isinstance(light, Environment) or not isinstance(light, Sequence):
+            raise TypeError(f"light must be a list of Environment, got {require.shown(light)}")
+        for each in light:
+            require.kind("each light", each, Environment, source="jaxprt.load_environment")
         return _factor_for(brdf, light, terms, error, resolution)
     _check_resolution(resolution)
     direction = np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3)
@@ -373,10 +380,12 @@ def _remainder(value: Array, total: Array) -> Array:
 
 
 def _check_resolution(resolution: int) -> None:
+    require.count("resolution", resolution, -1, 1 << 12)
     if resolution < 2:
         raise ValueError(f"resolution must be at least 2, got {resolution}")
 
 
 def _check_terms(terms: int, most: int) -> None:
+    require.count("terms", terms, -1)
     if not 1 <= terms <= most:
         raise ValueError(f"terms must be between 1 and {most}, got {terms}")

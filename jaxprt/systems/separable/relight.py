@@ -15,6 +15,7 @@ from jaxprt import require
 from jaxprt.compile import isolated, jit, linear
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, haar
+from jaxprt.systems import protocol
 from jaxprt.systems.separable.factorization import SeparableBrdf, check_mark
 
 _STEPS = (1 << 15) - 1  # highest level in signed 16 bits
@@ -50,12 +51,7 @@ def _brdf(value: Any) -> None:
     require.kind("the BRDF", value, SeparableBrdf, source="jaxprt.separable.factor")
 
 
-def _environment(value: Any) -> None:
-    require.kind("the light", value, Environment, source="jaxprt.scene.load_environment")
-    require.finite("the light", value.radiance)
-
-
-@require.arguments(light=_environment)
+@require.arguments(light=protocol.one_light)
 @jit
 def project(light: Environment) -> Float[Array, "b c"]:
     """Haar coefficients of an environment. Each cubemap face is transformed separately.
@@ -188,7 +184,6 @@ def _spread_gray(fixed: Array, cotangent: Array) -> Array:
     return reduce(jnp.add, (fixed[..., c] * cotangent[:, None, c] for c in colors))[..., None]
 
 
-@require.arguments(light=_environment)
 def light_tuple(transport: Transport, light: Environment, *, light_keep: int | None = None) -> Float[Array, "v r c"]:
     """The light-modulated tuple of every vertex: light times visibility, cosine and the light factor of each term.
 
@@ -206,11 +201,8 @@ def light_tuple(transport: Transport, light: Environment, *, light_keep: int | N
     Raises:
         ValueError: The light is a batch, has another cubemap size than the transport, or is not finite.
     """
-    require.finite("the light", light.radiance)
-    size = haar.face_edge(transport.rms.shape[0])
-    if light.radiance.shape[:-1] != (6, size, size):
-        raise ValueError(f"the light must be one environment [6, {size}, {size}, c], got {list(light.radiance.shape)}")
-    coefficient = project(light)
+    require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
+    coefficient = project(protocol.one_light(light, size=haar.face_edge(transport.rms.shape[0])))
     if light_keep is not None:
         coefficient = choose_by_transport(coefficient, transport.rms, count=light_keep)
     return transport.apply(coefficient)
@@ -254,7 +246,7 @@ def view_factors(
     Raises:
         ValueError: The eye is not finite, or is neither one position nor one for each.
     """
-    require.position("the eye", eye, each=len(position))
+    eye = require.position("the eye", eye, each=len(position))
     return _view_factors(brdf, position, frame, eye)
 
 
@@ -324,7 +316,7 @@ def combine(light: Float[Array, "v r c"], view: Float[Array, "v r d"]) -> Float[
     return _product(light, view)
 
 
-@require.arguments(brdf=_brdf, light=_environment)
+@require.arguments(brdf=_brdf, light=protocol.one_light)
 def radiance(
     transport: Transport,
     brdf: SeparableBrdf,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped, UInt8
 
-from jaxprt import visibility
+from jaxprt import require, visibility
 from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
@@ -20,8 +20,10 @@ from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
 from jaxprt.systems.separable.sparse import SparseTransport
+from jaxprt.visibility.arguments import PRECOMPUTE
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
     brdf: SeparableBrdf,
