@@ -212,7 +212,7 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
             scene.brdfs,
             scene.materials[number],
             triple.light,
-            eye=eye,
+            eye=jnp.asarray(eye),
             texels=TEXELS,
             samples=samples,
         )

@@ -242,7 +242,9 @@ def gradient(
 
     def loss(light, diffuse, specular, coordinate):
         first = dynamic.Material(plane.weight(coordinate), diffuse, specular)
-        color = dynamic.radiance(transport, brdfs, [first, fixed[1]], Environment(light), eye=view.eye, texels=TEXELS)
+        color = dynamic.radiance(
+            transport, brdfs, [first, fixed[1]], Environment(light), eye=jnp.asarray(view.eye), texels=TEXELS
+        )
         return jnp.mean(interpolate(fragments, mesh.face, color) ** 2)
 
     each = (triple.light.radiance, *map(jnp.asarray, (triple.diffuse, triple.specular, triple.coordinate)))

@@ -134,11 +134,14 @@ def frames(
     """A change of view, which keeps the light's tuples, and one of light, which keeps the view's; both drawn."""
     environment = builtin.daylight(size=size)
     lights = [light_tuple(each, environment) for each, _ in parts]
-    views = [view_tuple(each, brdf, shot.eye) for each, brdf in parts]
+    views = [view_tuple(each, brdf, jnp.asarray(shot.eye)) for each, brdf in parts]
     drawn = rasterize(mesh, shot)
 
     def view():
-        colors = [combine(g, view_tuple(each, brdf, shot.eye)) for g, (each, brdf) in zip(lights, parts, strict=True)]
+        colors = [
+            combine(g, view_tuple(each, brdf, jnp.asarray(shot.eye)))
+            for g, (each, brdf) in zip(lights, parts, strict=True)
+        ]
         return interpolate(rasterize(mesh, shot), mesh.face, jnp.concatenate(colors))
 
     def light():

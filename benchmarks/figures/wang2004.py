@@ -75,7 +75,7 @@ class Stage:
             part = np.resize(number[first : first + _BLOCK], _BLOCK)
             transport = self.transport(factored, part, keep)
             size += transport.nbytes
-            color = separable.radiance(transport, factored, light, eye=self.view.eye)
+            color = separable.radiance(transport, factored, light, eye=jnp.asarray(self.view.eye))
             result.append(np.asarray(color)[: len(number) - first])
         return np.concatenate(result), size
 
@@ -181,7 +181,7 @@ def figure_3(run: Run) -> Iterator[dict[str, Any]]:
         most = stage.transport(ground, part, max(keeps))
         for keep in keeps:
             cut = dataclasses.replace(most, value=most.value * (np.arange(max(keeps)) < keep)[:, None, None, None])
-            color = separable.radiance(cut, ground, light, eye=stage.view.eye)
+            color = separable.radiance(cut, ground, light, eye=jnp.asarray(stage.view.eye))
             blocks[keep].append(np.asarray(color)[: len(number) - first])
     exact = stage.exact(Lambert(0.5), light, number)
     radiance = {keep: np.concatenate(each) for keep, each in blocks.items()}
