@@ -238,7 +238,7 @@ def _values(model: Callable, **parameter: Any) -> Any:
     return model(**parameter)
 
 
-class _Checked(Exception):
+class _CheckedError(Exception):
     """Ends a precomputation when all its arguments are checked."""
 
 
@@ -246,13 +246,13 @@ def _precompute(**given: Any) -> None:
     """`jaxprt.precompute` up to its first rays."""
 
     def stop(*arguments: Any, **options: Any) -> None:
-        raise _Checked
+        raise _CheckedError
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prt.relit.build, "Target", stop)
+        patch.setattr(prt.relit.build, "_checked", stop)
         try:
             prt.precompute(**given)
-        except _Checked:
+        except _CheckedError:
             return
 
 
