@@ -463,7 +463,7 @@ def offenses(name: str, verb: Verb) -> Iterator[str]:
 
 TABLES = {
     "constructors": constructors,
-    "scenes": scene_verbs,
+    # `scene_verbs` is for trying by hand: some of its values are right, and take minutes.
     "pictures": image_verbs,
     "systems": system_verbs,
     "precomputed": lambda: methods(relit("harmonic"), "relit"),
