@@ -489,7 +489,9 @@ def test_lights_eyes_and_cameras_of_another_kind_are_refused():
     for call in (ready.light, functools.partial(ready.radiance, eye=EYE), ready.picture):
         with pytest.raises(TypeError, match=r"the light must be of class Environment, which jaxprt\.scene\.load_env"):
             call(light().radiance)
-    with pytest.raises(ValueError, match=r"one environment \[6, 8, 8, c\], got \[6, 16, 16, 3\]: load it with .*size=8"):
+    with pytest.raises(
+        ValueError, match=r"one environment \[6, 8, 8, c\], got \[6, 16, 16, 3\]: load it with .*size=8"
+    ):
         ready.radiance(Environment(jnp.ones((6, 16, 16, 3))), eye=EYE)
     with pytest.raises(ValueError, match=r"a picture needs one light \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
         ready.picture(Environment(jnp.ones((2, 6, SIZE, SIZE, 3))))
