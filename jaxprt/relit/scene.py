@@ -170,7 +170,7 @@ class RelitScene(System):
             ValueError: There is no part of the given name, or a material needs something that was not precomputed; see
                 `jaxprt.relit.channels.appearance`.
         """
-        eye = origins.local("the eye", eye, self.mesh.origin)
+        eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
         materials = scene_lamps.split(self.lamps, materials)[0]
         every = self._all(materials)
         counts = [len(part.mesh.position) for part in self.scene.parts]

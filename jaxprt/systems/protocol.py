@@ -53,7 +53,7 @@ class System(eqx.Module):
         return light
 
     @abc.abstractmethod
-    def view(self, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None) -> PyTree:
+    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> PyTree:
         """Evaluates the view and the materials in the form that this system uses. Call it again when either changes.
 
         Args:
@@ -207,7 +207,7 @@ class Total(System):
         require.kind("the light", light, tuple, source="Total.light")
         return tuple(each.shade(lit, materials) for each, lit in zip(self.part, light, strict=True))
 
-    def view(self, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
+    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
         """The view of each system."""
         return tuple(each.view(eye, materials) for each in self.part)
 
@@ -257,7 +257,7 @@ class Joined(System):
         triples = zip(self.part, light, self._given(materials), strict=True)
         return tuple(each.shade(lit, own) for each, lit, own in triples)
 
-    def view(self, eye: Float[Array | np.ndarray, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
+    def view(self, eye: Float[Array, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
         """The view of each system."""
         return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
 

@@ -264,7 +264,7 @@ def test_arguments_of_other_kinds_are_refused(transport, family, fixed, line, li
     materials = [material(line, 0.3), None]
     with pytest.raises(ValueError, match=r"the eye must be one position, \[3\], got an array of shape \[2, 3\]"):
         dynamic.view_side(transport, [family, fixed], materials, eye=jnp.ones((2, 3)))
-    with pytest.raises(TypeError, match="the light must be of class Environment, which .* makes, got"):
+    with pytest.raises(TypeError, match=r"the light must be of class Environment, which .* makes, got"):
         dynamic.light_side(transport, light.radiance)
     with pytest.raises(TypeError, match="the material of region 0 must be a Material, got list"):
         dynamic.view_side(transport, [family, fixed], [[0.3, 0.1], None], eye=EYE)
