@@ -137,7 +137,7 @@ def shadowed(
     weight = np.where(inside[:, None], np.asarray(pixels.barycentric), np.array([1.0, 0, 0]))
     points = on_triangles(mesh.face, triangle, weight.astype(np.float32))
     there = system.at(points)
-    color = there.combine(there.light(light), there.view(view.eye))
+    color = there.combine(there.light(light), there.view(jnp.asarray(view.eye)))
     number = drawing.some(shaded.point, view.eye, 20 if run.quick else POINTS)
     few = on_triangles(mesh.face, triangle[number], weight[number].astype(np.float32))
     exact = reference.radiance(mesh, brdf, light, eye=view.eye, points=few)
