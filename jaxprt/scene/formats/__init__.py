@@ -1,1 +1,1 @@
-"""Readers of file formats: glTF, OBJ with MTL, dictionaries of Mitsuba, and mesh formats that trimesh reads."""
+"""Readers of file formats: glTF, OBJ with MTL, PLY, OFF, STL, and dictionaries of Mitsuba."""
