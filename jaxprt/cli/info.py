@@ -14,6 +14,7 @@ import click
 import jax
 import numpy as np
 
+import jaxprt
 from jaxprt import brdf, compile
 from jaxprt.cli import inputs, materials, options
 from jaxprt.cli.options import option
@@ -80,9 +81,10 @@ def command(**given: Any) -> None:
 def installation() -> dict[str, Any]:
     """Describes this installation, as JSON: versions, the device, and wrong sums of its compiler."""
     device = jax.devices()[0]
-    versions = {name: importlib.metadata.version(name) for name in ("jaxprt", "jax", "jaxlib", "numpy", "embreex")}
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "embreex")}
     return {
         "python": platform.python_version(),
+        "jaxprt": jaxprt.__version__,
         **versions,
         "device": device.device_kind,
         "platform": device.platform,
