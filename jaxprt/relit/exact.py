@@ -202,7 +202,9 @@ def exact_picture(
     way = raster.ray_direction(camera)
     skies = [background(each, way) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, skies, strict=True)]
-    return ExactPicture(dataclasses.replace(asked, width=camera.width, height=camera.height), np.stack(pictures))
+    if (camera.width, camera.height) != (asked.width, asked.height):
+        asked = dataclasses.replace(asked, width=camera.width, height=camera.height)
+    return ExactPicture(asked, np.stack(pictures))
 
 
 def _near(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:

@@ -273,7 +273,7 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--brdf", "velvet"], "must be one of lambert, phong, .* got 'velvet'"),
         (["--brdf", "ward:along=nan"], "along of ward must be a finite number, got 'nan'"),
         (["--brdf", "lambert:albedo=.1/.2"], "albedo of lambert must be numbers, or colors as .1/.2/.3, got '.1/.2'"),
-        (["--brdf", "merl:absent.binary"], "absent.binary: No such file"),
+        (["--brdf", "merl:absent.binary"], "absent.binary must be a BRDF in MERL's format, and there is no such file"),
         (["--order", "16"], "'--order': must be a whole number from 1 to 15, got 16"),
         (["--lobes", "0"], "'--lobes': must be a whole number from 1 to 64, got 0"),
         (["--lobes", "6,x"], "'--lobes': must be a whole number from 1 to 64, got 'x'"),

@@ -436,7 +436,7 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
             prt.precompute(scene(), system="harmonic", roughness=rough)
     with pytest.raises(ValueError, match="roughness must be given together with a system"):
         prt.precompute(scene(), roughness=(0.1, 0.5))
-    with pytest.raises(ValueError, match="bounces must be at least 0, got -1"):
+    with pytest.raises(ValueError, match=r"bounces must be at least 0, .* got -1"):
         prt.precompute(scene(), system="harmonic", bounces=-1)
     for count, error in ((1.5, TypeError), (True, TypeError), ("2", ValueError)):
         with pytest.raises(error, match=f"bounces must be a whole number or 'all', got {count!r}"):

@@ -200,10 +200,10 @@ def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
     rough = lobe.tabulate(prt.brdf.CookTorrance(diffuse=0.2, specular=0.7, roughness=0.6), lobes=4)
     assert not traced.is_sharp(rough)
     assert not traced.is_sharp(lobe.tabulate(prt.brdf.Lambert(0.5), lobes=2))
-    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, got -1"):
+    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, at most 4096, got -1"):
         relit().with_rays(-1)
     assert relit().with_rays(0).view(EYE).reflected is None
-    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, got -2"):
+    with pytest.raises(ValueError, match="rays must be a whole number of at least 0, at most 4096, got -2"):
         prt.precompute(relit().scene, system="lobe", bounces=1, rays=-2)
 
 
