@@ -85,7 +85,7 @@ def main(options: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(options)
     for name in SCENES[:1] if arguments.quick else SCENES:
         if arguments.only in (None, name):
-            sizes = Sizes(1, 4, quick=True) if arguments.quick else Sizes(arguments.triples, arguments.samples)
+            sizes = Sizes(1, 16, quick=True) if arguments.quick else Sizes(arguments.triples, arguments.samples)
             for line in measure(name, arguments.quick, arguments.store, arguments.pictures, sizes):
                 harness.report(line, arguments.output)
 
