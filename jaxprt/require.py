@@ -150,6 +150,12 @@ def position(name: str, value: Any, *, each: int | None = None) -> Array:
     return floating(value)
 
 
+def colors(name: str, radiance: Any) -> None:
+    """Refuses light that has neither one color nor three, by ValueError: scenes have these."""
+    if np.shape(radiance)[-1:] not in ((1,), (3,)):
+        raise ValueError(f"{name} must have 1 or 3 colors, got {np.shape(radiance)[-1]}")
+
+
 def number(name: str, value: Any, low: float, high: float = LARGEST, *, above: bool = False) -> None:
     """Refuses anything but one real number (TypeError) within a range (ValueError); with `above`, not its lower end."""
     real(name, value)
@@ -177,6 +183,8 @@ def path(name: str, value: Any) -> None:
     """Refuses anything but the name of a file or folder, as text or a path, by TypeError."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {shown(value)}")
+    if not os.fspath(value) or "\0" in os.fspath(value):
+        raise ValueError(f"{name} must be a path, got {shown(value)}")
 
 
 def executor(value: Any) -> None:

@@ -8,6 +8,7 @@ import OpenEXR
 import OpenImageIO
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.files import outputs, pixels
 
 _PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"  # the last chunk, with its checksum
@@ -79,6 +80,8 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
 
 
 def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
+    require.real("image", image)
+    require.array("image", image, "h w c")
     if image.dtype.kind != "f":
         raise ValueError(f"image must be of floating point, with 1 for white in pictures, got {image.dtype}")
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
@@ -87,6 +90,7 @@ def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, s
 
 
 def _check_suffix(path: str | pathlib.Path, suffix: str) -> None:
+    require.path("path", path)
     if pathlib.Path(path).suffix.lower() != suffix:
         raise ValueError(f"path must end in {suffix}, because the file will be of that format, got {os.fspath(path)!r}")
 

@@ -40,8 +40,10 @@ def _mask(value) -> Array | None:
 
 
 def _image(value: Any) -> Any:
-    """Numbers as an array, in their own type: `observe` refuses integers, which are not linear."""
-    return value if require.unreal(value) or isinstance(value, int) else jnp.asarray(value)
+    """Numbers as an array. Integers stay, because `observe` refuses them: they are not linear."""
+    if require.unreal(value) or isinstance(value, int):
+        return value
+    return require.floating(value) if jnp.issubdtype(jnp.asarray(value).dtype, jnp.floating) else jnp.asarray(value)
 
 
 def _exposure(value: Any) -> Any:

@@ -170,6 +170,7 @@ def checked(environments: Sequence[Environment], error: float, rate: float) -> i
         raise ValueError("environments must be at least one, got none")
     for number, light in enumerate(environments):
         require.kind(f"environment {number}", light, Environment, source="jaxprt.load_environment")
+        require.colors(f"environment {number}", light.radiance)
     shapes = sorted({str(list(light.radiance.shape)) for light in environments})
     if len(shapes) != 1 or environments[0].radiance.ndim != 4:
         raise ValueError(f"environments must all have the same size [6, n, n, c], got {', '.join(shapes)}")

@@ -81,6 +81,7 @@ class PictureView(eqx.Module):
             ValueError: The environment is a batch, or has another size than the systems require.
         """
         require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
+        require.colors("the light", environment.radiance)
         if environment.radiance.ndim != 4:
             raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
         blends = [each.appearance.blend for each in self.surface]

@@ -17,7 +17,12 @@ from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, bounds, centered
 
 Function = TypeVar("Function", bound=Callable)
-_MOST = 2**31 - 1  # pixels that the rasterizer's 32-bit indices can count
+_MOST = 2**29 - 1  # pixels whose four samples the rasterizer's 32-bit indices can count
+
+
+def _whole(value):
+    """NumPy's integers as Python's, which may be static."""
+    return int(value) if isinstance(value, np.integer) else value
 
 
 class Camera(eqx.Module):
@@ -40,8 +45,8 @@ class Camera(eqx.Module):
     target: Float[Array | np.ndarray, "3"] = eqx.field(converter=origins.coordinates)
     up: Float[Array, "3"] = eqx.field(converter=require.floating)
     field_of_view: Float[Array, ""] = eqx.field(converter=require.floating)
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
+    width: int = eqx.field(static=True, converter=_whole)
+    height: int = eqx.field(static=True, converter=_whole)
 
     def __check_init__(self):
         """Refuses places, directions and angles that are not finite."""

@@ -45,7 +45,7 @@ def local(name: str, position: Any, origin: Origin) -> Any:
 
     Args:
         name: Description of the position for the message, such as "the eye".
-        position: Positions in the coordinates of the file, [..., 3].
+        position: The position in the coordinates of the file.
         origin: The origin of the mesh.
 
     Returns:
@@ -64,8 +64,7 @@ def local(name: str, position: Any, origin: Origin) -> Any:
             f"{name} must be relative to the scene inside of jax.jit, jax.vmap and jax.grad, because {position.dtype} "
             f"rounds coordinates near the scene's origin {origin}: use relit.centered() with camera.local(mesh.origin)"
         )
-    require.real(name, position)
-    require.finite(name, position)
+    require.position(name, position)
     return jnp.asarray(np.asarray(position, np.float64) - np.asarray(origin), jnp.result_type(float))
 
 
@@ -76,7 +75,10 @@ def coordinates(value: Any) -> Any:
     """
     if isinstance(value, jax.Array) or require.unreal(value):
         return require.floating(value)
-    exact = np.asarray(value, np.float64)
+    try:
+        exact = np.asarray(value, np.float64)
+    except TypeError:  # a list of values inside of `jax.jit`
+        return require.floating(value)
     with np.errstate(over="ignore", invalid="ignore"):
         rounded = exact.astype(jnp.result_type(float)).astype(np.float64)
     large = exact.size and np.isfinite(exact).all() and np.abs(exact).max() > _LARGE

@@ -228,7 +228,7 @@ def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Flo
     def step(most, each):
         return jnp.maximum(most, each[0] * each[1]), None
 
-    return jax.lax.scan(step, jnp.zeros(light.shape[1:], light.dtype), (light, weight))[0]
+    return jax.lax.scan(step, jnp.zeros(light.shape[1:], jnp.result_type(light, weight)), (light, weight))[0]
 
 
 def _nodes(cell: Array, frame: Array, size: int) -> tuple[list[Array], Array, Array]:

@@ -62,6 +62,11 @@ class Session:
             ValueError: There is no system or light, the scenes differ, the lights have different sizes, or one is a
                 batch.
         """
+        if not isinstance(systems, RelitScene | Mapping):
+            require.kind("the scene", systems, RelitScene, source="jaxprt.precompute")
+        if environments is not None and not isinstance(environments, Mapping):
+            got = require.shown(environments)
+            raise TypeError(f"environments must be a dictionary from names to lights, got {got}")
         every = {"system": systems} if isinstance(systems, RelitScene) else dict(systems)
         if not every:
             raise ValueError("a viewer must have a system, got none")
@@ -272,6 +277,7 @@ def _check_lights(lights: Mapping[str, Environment]) -> None:
         raise ValueError("a viewer must have a light, got none")
     for name, each in lights.items():
         require.kind(f"the light {name!r}", each, Environment, source="jaxprt.load_environment")
+        require.colors(f"the light {name!r}", each.radiance)
         if each.radiance.ndim != 4:
             raise ValueError(f"the light {name!r} must be one light, [6, n, n, c], got {list(each.radiance.shape)}")
     sizes = {each.radiance.shape[-2] for each in lights.values()}

@@ -1,5 +1,6 @@
 """Meshes at map coordinates: float32 keeps their digits, and everything speaks the coordinates of the file."""
 
+import base64
 import json
 import struct
 
@@ -144,6 +145,30 @@ def test_eyes_inside_of_jit_are_relative_to_the_origin(relit):
     np.testing.assert_allclose(
         moved.radiance(SKY, eye=jnp.asarray(local, jnp.float32)), near.radiance(SKY, eye=eye), rtol=2e-3, atol=2e-3
     )
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("eye", [5.0, [1.0], [1.0, 2.0], [[1.0], [2.0], [3.0]], "front"])
+def test_eyes_that_are_no_position_are_refused_far_from_zero_too(relit, eye):
+    with pytest.raises((ValueError, TypeError), match=r"the eye must be (one position|real numbers)"):
+        relit[1].radiance(SKY, eye=eye)
+
+
+def test_cameras_of_gltf_files_keep_their_digits(tmp_path):
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    place = [512345.35, 10.7, 4987658.495]
+    data = base64.b64encode(corner.tobytes()).decode()
+    scene = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0, "translation": FAR.tolist()}, {"camera": 0, "translation": place}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 0}}]}],
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.1}}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": "DATA:application/octet-stream;BASE64," + data}],
+    }
+    (tmp_path / "far.gltf").write_text(json.dumps(scene))
+    np.testing.assert_array_equal(np.asarray(prt.load_scene(tmp_path / "far.gltf").cameras[0].eye), place)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -85,5 +85,5 @@ def _camera(document: Document, item: dict[str, Any], owner: str, matrix: np.nda
         raise document.error(f"must have invertible transforms for {owner}", "a scale of zero")
     target = eye - back / length * (np.linalg.norm(center - eye) or 1.0)
     with np.errstate(over="ignore"):  # cameras refuse what is not finite
-        eye, target, up, angle = (np.asarray(value, np.float32) for value in (eye, target, up, angle))
+        up, angle = (np.asarray(value, np.float32) for value in (up, angle))  # eye and target keep their digits
     return Camera(eye, target, up, angle, max(1, round(_HEIGHT * float(aspect))), _HEIGHT)

@@ -198,7 +198,7 @@ class Document(Header):
             kind, _, data = uri.partition(",")
             plain = urllib.parse.unquote_to_bytes(data)
             try:
-                return base64.b64decode(plain, validate=True) if kind.endswith(";base64") else plain
+                return base64.b64decode(plain, validate=True) if kind.lower().endswith(";base64") else plain
             except ValueError as error:
                 raise self.error(f"must have undamaged base64 data in {owner}", str(error)) from error
         if _SCHEME.match(uri):

@@ -65,6 +65,8 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
             is not supported.
         MemoryError: The scene does not fit into memory.
     """
+    if not isinstance(outside, bool):
+        raise TypeError(f"outside must be True or False, got {require.shown(outside)}")
     if isinstance(path, Mapping):
         return mitsuba_dict.read(path)
     path = pathlib.Path(path)

@@ -301,3 +301,10 @@ def test_vertex_colors_of_a_ply_do_not_change_the_material_that_a_mitsuba_dictio
     shape = {"type": "ply", "filename": str(path), "bsdf": {"type": "diffuse"}}
     (part,) = load_scene({"type": "scene", "shape": shape}).parts
     assert part.color is None
+
+
+def test_a_float_a_hair_above_one_is_white_and_not_a_byte():
+    from jaxprt.scene.formats.colors import linear
+
+    np.testing.assert_allclose(linear(np.array([[1.0000001, 1, 0], [0.5, 0.5, 0]]))[:, 0], [1, 0.21404], rtol=1e-4)
+    np.testing.assert_allclose(linear(np.array([[255.0, 0, 0], [127.5, 0, 0]]))[:, 0], [1, 0.21404], rtol=1e-4)

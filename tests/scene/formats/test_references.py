@@ -250,3 +250,10 @@ def test_a_backslash_may_belong_to_a_name(tmp_path):
     name = "a\\b"
     path = inputs.reference(name, tmp_path, folder=tmp_path, owner="a scene", outside=False)
     assert path == tmp_path / pathlib.Path(name)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("outside", ["no", 1, None])
+def test_only_true_opens_files_outside(place, outside):
+    with pytest.raises(TypeError, match="outside must be True or False, got"):
+        load_scene(scene_of_map(place, "../secret.png"), outside=outside)
