@@ -1,5 +1,6 @@
 """Arrays of meshes: conversion, and checks of their types, shapes and values."""
 
+import math
 from typing import Any
 
 import jax
@@ -41,6 +42,13 @@ def check_shapes(mesh: Any) -> None:
         TypeError: An array has a wrong type.
         ValueError: An array has a wrong shape.
     """
+    origin = mesh.origin
+    if (
+        not isinstance(origin, tuple)
+        or len(origin) != 3
+        or not all(type(x) is float and math.isfinite(x) for x in origin)
+    ):
+        raise ValueError(f"origin of a mesh must be a tuple of three finite numbers, got {require.shown(origin)}")
     for name, (width, whole) in _FIELDS.items():
         value = getattr(mesh, name)
         if not isinstance(value, jax.Array | np.ndarray):

@@ -1,6 +1,7 @@
 """Meshes at map coordinates: float32 keeps their digits, and everything speaks the coordinates of the file."""
 
 import base64
+import dataclasses
 import json
 import struct
 
@@ -152,6 +153,13 @@ def test_eyes_inside_of_jit_are_relative_to_the_origin(relit):
 def test_eyes_that_are_no_position_are_refused_far_from_zero_too(relit, eye):
     with pytest.raises((ValueError, TypeError), match=r"the eye must be (one position|real numbers)"):
         relit[1].radiance(SKY, eye=eye)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("wrong", ["x", (1.0, 2.0), [1.0, 2.0, 3.0], (np.nan, 0.0, 0.0)])
+def test_origins_that_are_no_place_are_refused(wrong):
+    with pytest.raises(ValueError, match="origin of a mesh must be a tuple of three finite numbers, got"):
+        dataclasses.replace(builtin.sphere(), origin=wrong)
 
 
 def test_cameras_of_gltf_files_keep_their_digits(tmp_path):
