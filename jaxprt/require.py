@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 Function = TypeVar("Function", bound=Callable)
 
-LARGEST = 1e15  # magnitude of numbers: products of two of them, summed over all texels, fit into float32
+LARGEST = 1e30  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
 _MOST = 2**31 - 1  # largest index of 32 bits
 
 
@@ -62,7 +62,7 @@ def _array_of(value: Any) -> Any:
     return None
 
 
-def floating(value: Any, dtype: Any = None) -> Any:
+def floating(value: Any, *, dtype: Any = None) -> Any:
     """Real numbers as a JAX array of floating point, for the fields of classes.
 
     Half precision becomes float32, because sums over the sphere overflow in it. float64 stays only where the caller has
@@ -92,7 +92,7 @@ def _float_type(dtype: Any) -> Any:
 
 
 def finite(name: str, value: Any) -> None:
-    """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e15 in magnitude.
+    """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e30 in magnitude.
 
     Sums of products of larger numbers overflow in float32, and differences of infinities are NaN.
 
@@ -156,7 +156,7 @@ def colors(name: str, radiance: Any) -> None:
         raise ValueError(f"{name} must have 1 or 3 colors, got {np.shape(radiance)[-1]}")
 
 
-def number(name: str, value: Any, low: float, high: float = LARGEST, *, above: bool = False) -> None:
+def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: bool = False) -> None:
     """Refuses anything but one real number (TypeError) within a range (ValueError); with `above`, not its lower end."""
     real(name, value)
     if np.ndim(value):
@@ -169,7 +169,7 @@ def number(name: str, value: Any, low: float, high: float = LARGEST, *, above: b
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
 
 
-def count(name: str, value: Any, least: int = 0, most: int = _MOST) -> None:
+def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
     """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {shown(value)}")

@@ -31,7 +31,7 @@ def color(value: Any) -> Any:
 
 def scalar(value: Any) -> Any:
     """A number as an array of shape []. What is not of numbers is left for the class to refuse."""
-    return require.floating(value, jnp.result_type(float))
+    return require.floating(value, dtype=jnp.result_type(float))
 
 
 def _lobes(value: Any) -> Any:
@@ -100,7 +100,7 @@ class Model(eqx.Module):
 
     Raises:
         TypeError: A parameter does not consist of real numbers.
-        ValueError: A parameter is not finite, above 1e15, or below its smallest allowed value.
+        ValueError: A parameter is not finite, above 1e30, or below its smallest allowed value.
     """
 
     least: ClassVar[Mapping[str, float]] = {}

@@ -13,11 +13,11 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
 
 def _stops(value: Any) -> None:
-    require.number("stops", value, -STOPS, STOPS)
+    require.number("stops", value, -STOPS, high=STOPS)
 
 
 def _percentile(value: Any) -> None:
-    require.number("percentile", value, 0.0, 100.0)
+    require.number("percentile", value, 0.0, high=100.0)
 
 
 def _white(value: Any) -> None:

@@ -43,7 +43,7 @@ def refine(
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     require.number("error", error, 0.0)
-    require.count("vertices", vertices, 1)
+    require.count("vertices", vertices, least=1)
     mesh = scene.mesh
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
     return subdivision.subdivide_scene(scene, refinement.divisions(mesh, mesh, **options))

@@ -19,7 +19,7 @@ _COLORS = "base_color", "emissive", "specular_color"
 
 def _scalar(value: Any) -> Any:
     """A number as an array. What is not of numbers is left for the class to refuse."""
-    return require.floating(value, jnp.result_type(float))
+    return require.floating(value, dtype=jnp.result_type(float))
 
 
 def _color(value: Any) -> Any:
@@ -59,7 +59,7 @@ class Texture(eqx.Module):
             raise ValueError(f"the texture's image must be [h, w, c] without empty axes, got {list(shape)}")
         if jnp.shape(self.transform) != (2, 3):
             raise ValueError(f"the texture's transform must be [2, 3], got {list(jnp.shape(self.transform))}")
-        require.count("set", self.set, 0, 1)
+        require.count("set", self.set, least=0, most=1)
         words = isinstance(self.wrap, tuple | list) and all(isinstance(word, str) for word in self.wrap)
         if not words or len(self.wrap) != 2 or not set(self.wrap) <= set(texture.WRAPS):
             raise ValueError(f"wrap must be two of {', '.join(texture.WRAPS)}, got {self.wrap}")

@@ -114,7 +114,7 @@ def _place(value: Any) -> Any:
 
 def _three(value: Any) -> Any:
     """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
-    value = require.floating(value, jnp.result_type(float))
+    value = require.floating(value, dtype=jnp.result_type(float))
     return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 

@@ -220,7 +220,7 @@ def radiance(
     Reference: Wang, Tran, Luebke 2004, equation 1, for single texels.
     """
     brdf = grid.as_argument(brdf)
-    require.count("samples", samples, -1, 64)
+    require.count("samples", samples, least=-1, most=64)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     excess = _checked(transport, texel, excess)

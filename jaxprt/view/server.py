@@ -73,7 +73,7 @@ class Server:
             ValueError: `address` is not that of a page.
             OSError: The port is in use or not permitted.
         """
-        require.count("port", port, 0, 65535)
+        require.count("port", port, least=0, most=65535)
         token, coming = secrets.token_urlsafe(16), None if address is None else parse(address)
         self._server = _Listener(port, session, token, coming)
         start = f"http://127.0.0.1:{self._server.server_port}" if coming is None else coming.url

@@ -13,7 +13,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 _GRAY = 0.5  # base color of surfaces without material and color
 
 
-def matte(geometry: Geometry | None = None) -> TexturedMaterial:
+def matte(*, geometry: Geometry | None = None) -> TexturedMaterial:
     """The material of faces without one: a matte gray, or white where vertex colors multiply it."""
     white = geometry is not None and geometry.color is not None
     return TexturedMaterial(base_color=1.0 if white else _GRAY, metallic=0.0, specular=0.0)

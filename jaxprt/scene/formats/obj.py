@@ -196,7 +196,7 @@ def _indices(tails: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
         separate = text.words(words.text.replace(b"//", b"/%d/" % _NONE).replace(b"/", b" ").split(b"\n"))
         if (separate.per_row == columns * words.per_row).all():
             try:
-                index[:, :columns] = text.numbers(separate, int).reshape(-1, columns)
+                index[:, :columns] = text.numbers(separate, kind=int).reshape(-1, columns)
             except ValueError:
                 pass
             else:

@@ -74,7 +74,7 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
         return gltf.read(path, outside=outside)
     mesh_file.check(path)
     content = mesh_file.content(path, groups=False)
-    plain = mesh_colors.matte(content.geometry)
+    plain = mesh_colors.matte(geometry=content.geometry)
     if path.suffix.lower() == ".obj":
         names, materials = mtl.of_regions(path, plain, outside=outside)
         if names == ["default"]:

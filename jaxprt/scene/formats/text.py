@@ -93,7 +93,7 @@ def words(rows: Sequence[bytes]) -> Words:
     return Words(joined, start, np.diff(np.searchsorted(start, end), prepend=0))
 
 
-def numbers(words: Words, kind: type = float) -> np.ndarray:
+def numbers(words: Words, *, kind: type = float) -> np.ndarray:
     """Numbers from words, in 64 bits.
 
     Args:

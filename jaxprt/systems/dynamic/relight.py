@@ -34,7 +34,7 @@ _ROUNDED = 1e-4  # tolerance for the sum of weights in single precision
 
 def _floating(value: Any) -> Any:
     """Numbers as an array with at least one axis. What is not of numbers is left for `Material` to refuse."""
-    value = require.floating(value, jnp.result_type(float))
+    value = require.floating(value, dtype=jnp.result_type(float))
     return jnp.atleast_1d(value) if isinstance(value, jax.Array) else value
 
 

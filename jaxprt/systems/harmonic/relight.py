@@ -58,7 +58,7 @@ def _eyes(value: Any) -> Array:
 
 
 def _degree(value: Any) -> None:
-    require.count("degree", value, 0, 256)
+    require.count("degree", value, least=0, most=256)
 
 
 def _probe(value: Any) -> Array:

@@ -162,10 +162,10 @@ def tabulate(
     """
     wanted = _ERROR if error is None else error
     grid.check_family(brdf, knot)
-    require.count("degree", degree, -1)
+    require.count("degree", degree, least=-1)
     require.number("error", wanted, -require.LARGEST)
     if resolution is not None:
-        require.count("resolution", resolution, -1, 1 << 12)
+        require.count("resolution", resolution, least=-1, most=1 << 12)
     if not 0 <= degree <= 50 or (resolution is not None and resolution < 2) or not wanted > 0:
         raise ValueError(
             "tabulate needs a degree of 0 to 50, a resolution of at least 2 and an error above 0, "

@@ -109,8 +109,8 @@ def precompute(
         raise TypeError(f"lamps must be a list of meshes and point lights, got {require.shown(lamps)}")
     if not lamps:
         raise ValueError("lamps must be at least one, got none")
-    require.count("samples", samples, 1)
-    require.count("pieces", pieces, -(2**63))
+    require.count("samples", samples, least=1)
+    require.count("pieces", pieces, least=-(2**63))
     if pieces < 1 or pieces & (pieces - 1) or pieces > samples:
         raise ValueError(f"pieces must be a power of two, and at most the {samples} samples, got {pieces}")
     for number, each in enumerate(lamps):

@@ -268,10 +268,10 @@ def tabulate(
 def _check_options(lobes: int | None, error: float | None, resolution: int) -> None:
     """Refuses options of other kinds, and numbers of lobes or nodes that no machine holds."""
     if lobes is not None:
-        require.count("lobes", lobes, -1, 1 << 10)
+        require.count("lobes", lobes, least=-1, most=1 << 10)
     if error is not None:
         require.number("error", error, -1.0)
-    require.count("resolution", resolution, -1, 1 << 12)
+    require.count("resolution", resolution, least=-1, most=1 << 12)
 
 
 def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:

@@ -380,12 +380,12 @@ def _remainder(value: Array, total: Array) -> Array:
 
 
 def _check_resolution(resolution: int) -> None:
-    require.count("resolution", resolution, -1, 1 << 12)
+    require.count("resolution", resolution, least=-1, most=1 << 12)
     if resolution < 2:
         raise ValueError(f"resolution must be at least 2, got {resolution}")
 
 
 def _check_terms(terms: int, most: int) -> None:
-    require.count("terms", terms, -1)
+    require.count("terms", terms, least=-1)
     if not 1 <= terms <= most:
         raise ValueError(f"terms must be between 1 and {most}, got {terms}")
