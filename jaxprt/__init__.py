@@ -19,7 +19,7 @@ Conventions, everywhere in this package:
 * Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
 * Lights, eyes and materials may have any float type. Half precision is converted to float32 where it enters, and
   integers and lists too. Results have the widest type of the system and these. Gradients have the type of the argument.
-* Numbers that enter are at most 1e30 in magnitude, so that products and sums over all directions fit into float32.
+* Numbers that enter are at most 1e32 in magnitude, so that products and sums over all directions fit into float32.
   Masked arrays, text, booleans and complex numbers are refused. Light in memory may be negative: relighting is linear.
 """
 

@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 Function = TypeVar("Function", bound=Callable)
 
-LARGEST = 1e30  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
+LARGEST = 1e32  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
 _MOST = 2**31 - 1  # largest index of 32 bits
 
 
@@ -92,7 +92,7 @@ def _float_type(dtype: Any) -> Any:
 
 
 def finite(name: str, value: Any) -> None:
-    """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e30 in magnitude.
+    """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e32 in magnitude.
 
     Sums of products of larger numbers overflow in float32, and differences of infinities are NaN.
 

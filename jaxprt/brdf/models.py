@@ -100,7 +100,7 @@ class Model(eqx.Module):
 
     Raises:
         TypeError: A parameter does not consist of real numbers.
-        ValueError: A parameter is not finite, above 1e30, or below its smallest allowed value.
+        ValueError: A parameter is not finite, above 1e32, or below its smallest allowed value.
     """
 
     least: ClassVar[Mapping[str, float]] = {}

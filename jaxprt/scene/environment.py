@@ -36,7 +36,7 @@ LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 class Environment(eqx.Module):
     """Distant light: the mean linear radiance of each cubemap texel.
 
-    The radiance must be finite, at most 1e30 in magnitude, and have six square faces. Lists, NumPy arrays and integers
+    The radiance must be finite, at most 1e32 in magnitude, and have six square faces. Lists, NumPy arrays and integers
     are converted to JAX arrays of floating point, and half precision to float32. Negative radiance is allowed, because
     relighting is linear: a difference of two lights, the light of one basis function and the gradient of a light are
     environments too. `load_environment` sets negative pixels of files to zero. Inside `jax.jit` values are not known
@@ -47,7 +47,7 @@ class Environment(eqx.Module):
 
     Raises:
         TypeError: The radiance does not consist of real numbers, or is a masked array.
-        ValueError: The radiance has another shape, is not finite, or is above 1e30.
+        ValueError: The radiance has another shape, is not finite, or is above 1e32.
     """
 
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
@@ -62,7 +62,7 @@ class Environment(eqx.Module):
 
 
 def _size(value: object) -> None:
-    require.count("size", value, least=1)
+    require.count("size", value, least=1, most=2**63)  # memory bounds it
 
 
 @require.arguments(path=functools.partial(require.path, "path"), size=_size)

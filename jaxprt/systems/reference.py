@@ -74,10 +74,10 @@ def radiance(
     if error != np.inf:
         require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
-    eye = require.position("the eye", origins.local("the eye", eye, mesh.origin))
-    light = protocol.one_light(light, batch=True)
     for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
         PRECOMPUTE[name](value)
+    light = protocol.one_light(light, batch=True)
+    eye = require.position("the eye", origins.local("the eye", eye, mesh.origin))
     if not isinstance(brdf, PerVertex):
         direction = jax.ShapeDtypeStruct((1, 3), jnp.result_type(float))
         channels = jax.eval_shape(brdf, direction, direction).shape

@@ -111,7 +111,7 @@ def test_prior_is_a_covariance():
     [
         ({}, "either terms or error"),
         ({"terms": 2, "error": 0.1}, "either terms or error"),
-        ({"error": 0.0}, "error must be positive"),
+        ({"error": 0.0}, "error must be above 0"),
         ({"terms": 0}, "terms must be between 1 and"),
         ({"terms": 1000, "resolution": 8}, "terms must be between 1 and 52, got 1000"),
         ({"terms": 1, "resolution": 1}, "resolution must be at least 2"),
