@@ -23,13 +23,6 @@ Conventions, everywhere in this package:
   Masked arrays, text, booleans and complex numbers are refused. Light in memory may be negative: relighting is linear.
 """
 
-import importlib.metadata
-import os
-
-# These versions of jaxlib report two false errors for each program that they load from JAX's cache of programs.
-if importlib.metadata.version("jaxlib") in ("0.10.0", "0.10.1"):
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-
 from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
 from jaxprt.relit import RelitScene, plan, precompute, refine
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene

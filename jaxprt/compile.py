@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src import xla_bridge
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -37,15 +38,18 @@ _FULL = 0.85  # of the largest number of mappings; one part of a picture takes u
 _FEW = 50  # traces that need no count; counting takes 20 ms
 _traces = 0  # since the last count
 
-# jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103). Requirements exclude it; a flag avoids these fusions.
-_WRONG, _CURE = "0.10.2", "--xla_cpu_experimental_ynn_fusion_type="
+# jaxlib 0.10.2, the newest for Python 3.11, fuses sums of products wrongly on CPUs (jax-ml/jax#39103). Without these
+# fusions it is right, and no slower. Flags are read when the first array is made.
+_FLAG = "--xla_cpu_experimental_ynn_fusion_type="
 _CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
-if importlib.metadata.version("jaxlib") == _WRONG and _CURE not in os.getenv("XLA_FLAGS", ""):
-    warnings.warn(
-        f"jaxlib {_WRONG} computes wrong sums on CPUs (jax-ml/jax#39103): install another version, or set the "
-        f"environment variable XLA_FLAGS={_CURE} before Python starts",
-        stacklevel=2,
-    )
+if importlib.metadata.version("jaxlib") == "0.10.2" and _FLAG not in os.environ.get("XLA_FLAGS", ""):
+    if xla_bridge.backends_are_initialized():
+        warnings.warn(
+            f"jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103) unless XLA_FLAGS={_FLAG} is set before the "
+            "first array is made: import jaxprt before that, or set the variable",
+            stacklevel=2,
+        )
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
 
 
 def jit(function: Callable, **options: Any) -> Any:

@@ -21,7 +21,6 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).pa
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Its threads, in jax's QR, wait by spinning beside other processes.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the package sets it; here JAX is imported first
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and 3 % of the time
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Splitting small
 # programs for several compiling threads costs a fifth of the time of compiling them.

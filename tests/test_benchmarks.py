@@ -39,7 +39,7 @@ MOST_ERROR = {
     "failures": 0.3,
     "gradients": 1e-7,
     "interreflection": 0.65,
-    "inverse": 0.2,  # .14 by jaxlib 0.10.1, .09 by 0.12: rounding of pictures, which hardly determine some numbers
+    "inverse": 0.1,
     "lobes": 0.15,
     "low_frequency": 0.06,  # of nine coefficients of irradiance
     "million": 1e-5,

@@ -13,7 +13,7 @@ from jaxprt.image.arguments import numbers
 
 
 def _peak(value: Any) -> None:
-    require.number("peak", value, 1e-15)
+    require.number("peak", value, 1e-15, high=1e15)
 
 
 @require.arguments(image=numbers("the image"), reference=numbers("the reference"))

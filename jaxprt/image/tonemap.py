@@ -21,7 +21,7 @@ def _percentile(value: Any) -> None:
 
 
 def _white(value: Any) -> None:
-    require.number("white", value, 1e-15)
+    require.number("white", value, 1e-15, high=1e15)
 
 
 @require.arguments(radiance=numbers("the radiance"), stops=_stops)

@@ -518,7 +518,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     for job, (kind, fields) in zip(before, kinds, strict=True):
         again = kind.make(mesh, None, None, 8, **rounded(fields))
         assert json.dumps(again.header) == json.dumps(job.header)
-        assert job.header["algorithm"]["visibility"] == 2
+        assert job.header["algorithm"]["visibility"] == visibility.rays.ALGORITHM
         assert len(job.header["algorithm"]) == 2
         assert kind.make(turned, None, None, 8, **fields).header["mesh"] != job.header["mesh"]
         for name, told in again.near.items():

@@ -178,7 +178,10 @@ def test_gradients_by_light_eye_and_table_are_finite_differences(transport, tabl
 
 
 def test_a_light_of_another_size_is_refused(transport, tables):
-    with pytest.raises(ValueError, match=r"one environment .6, 16, 16, c., got .6, 32, 32, 3."):
+    with pytest.raises(
+        ValueError,
+        match=r"(environment .6, 16, 16, c., got .6, 32, 32, 3.|along an edge as the transport.s, 16, got 32)",
+    ):
         lobe.radiance(transport, tables["matte"], Environment(np.ones((6, 32, 32, 3), np.float32)), eye=EYE)
 
 

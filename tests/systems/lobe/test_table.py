@@ -401,7 +401,7 @@ def test_either_lobes_or_error_must_be_given(options):
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(
         ValueError,
-        match=r"needs at least one lobe or an error above 0, and a resolution of at least 4|error must be finite, got nan",
+        match=r"needs at least one lobe or an error above 0, and a resolution of at least 4|error must be finite",
     ):
         lobe.tabulate(GLOSSY, **options)
 
