@@ -73,8 +73,8 @@ def test_deviations_are_those_of_many_noisy_pictures(mesh, cameras, glossy, sky)
     spread = np.std([np.asarray(each.value) for each in fits], axis=0, ddof=1)
     said = np.mean([np.asarray(each.deviation) for each in fits], axis=0)
     ratio = np.sqrt(np.mean((spread / said) ** 2))
-    # Of 1,152 numbers: 2 % is one standard deviation, were they independent. Float32 sums of jaxlib 0.10.2 without the
-    # fusions that are wrong elsewhere leave .89, those of 0.12 above .93.
+    # There are 1,152 numbers: 2 % would be one standard deviation if they were independent. The ratio is .89 on jaxlib
+    # 0.10.2 and the flag that the package sets, and above .93 without the flag and with 0.12. The cause is not traced.
     assert 0.87 < ratio < 1.07
 
 
