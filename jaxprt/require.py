@@ -169,13 +169,13 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
 
 
-def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
-    """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
+def count(name: str, value: Any, *, least: int = 0, most: int | None = _MOST) -> None:
+    """Refuses anything but a whole number (TypeError) within a range (ValueError); None for no upper end."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {shown(value)}")
-    if not least <= value <= most:
-        bound = f"at least {least}" if value < least else f"at most {most}"
-        bound = bound if most == _MOST else f"between {least} and {most}"
+    if value < least or (most is not None and value > most):
+        bound = f"at most {most}" if value > least else f"at least {least}"
+        bound = bound if most in (None, _MOST) else f"between {least} and {most}"
         raise ValueError(f"{name} must be {bound}, got {value}")
 
 

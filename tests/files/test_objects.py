@@ -25,7 +25,7 @@ from jaxprt.sphere import hemisphere
 
 # Host records of the command line and of reports; they hold functions and file names.
 UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.__main__", "jaxprt.view.piece", "jaxprt.view.messages"}
-UNSAVED |= {"jaxprt.scene.formats.geometry", "jaxprt.scene.formats.ply_table"}
+UNSAVED |= {"jaxprt.scene.formats.geometry", "jaxprt.scene.formats.ply_table", "jaxprt.scene.formats.text"}
 
 
 def classes():

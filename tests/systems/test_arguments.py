@@ -7,7 +7,7 @@ import pytest
 
 from jaxprt import bright_texels, dynamic, harmonic, lobe, reference, separable
 from jaxprt.brdf import Lambert
-from jaxprt.scene import Environment
+from jaxprt.scene import Environment, builtin
 from jaxprt.systems.harmonic import HarmonicBrdf, TransferMatrix, TransferVector
 
 MODEL, EYE = Lambert(0.5), jnp.ones(3)
@@ -16,6 +16,7 @@ TABLE = HarmonicBrdf(jnp.ones((9, 1, 4)), (), jnp.zeros(()))
 MATRIX = TransferMatrix(jnp.ones((2, 1, 9, 9)), jnp.zeros((2, 3)), jnp.stack([jnp.eye(3)] * 2))
 VECTOR = TransferVector(jnp.ones((9, 1, 2)), jnp.zeros((2, 3)))
 POINT = jnp.zeros((2, 3))
+MESH = builtin.plane(cells=1)
 WANTED = {
     "jaxprt.harmonic.project": [
         lambda: harmonic.radiance(MATRIX, TABLE, LIGHT, eye=EYE),
@@ -45,7 +46,7 @@ WANTED = {
         lambda: separable.light_tuple(None, COEFFICIENT),
         lambda: separable.project(COEFFICIENT),
         lambda: lobe.prefilter(COEFFICIENT),
-        lambda: reference.radiance(None, MODEL, COEFFICIENT, eye=EYE),
+        lambda: reference.radiance(MESH, MODEL, COEFFICIENT, eye=EYE),
         lambda: bright_texels.split(COEFFICIENT, count=3),
     ],
 }

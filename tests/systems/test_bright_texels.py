@@ -73,7 +73,7 @@ def weighed(brdf, excess, eye, texel, transport, weight):
 
 
 @pytest.mark.parametrize("colors", [1, 3])
-@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e30])
+@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e28])
 def test_excess_and_rest_are_the_light(random, colors, strength):
     radiance = strength * random.exponential(size=(6, SIZE, SIZE, colors)).astype(np.float32) ** 3
     texel, excess, rest = bright_texels.split(Environment(jnp.asarray(radiance, jnp.float32)), count=COUNT)
