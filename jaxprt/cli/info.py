@@ -107,10 +107,10 @@ def about(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = {"path": str(path), **_about(path, light_size, outside)}
+        description = {"path": str(path), **_about(path, light_size, outside)}
     if caught:
-        found["left_out"] = [str(each.message) for each in caught]
-    return found
+        description["left_out"] = [str(warning.message) for warning in caught]
+    return description
 
 
 def _about(path: Path, light_size: int, outside: bool) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def _fits(value: Any, hint: Any, batched: bool) -> bool:
     if hint is None or hint is type(None):
         return value is None
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one, batched) for one in arguments)
+        return any(_fits(value, option, batched) for option in arguments)
     if _is_callable(hint):
         return callable(value)
     if origin in (tuple, list):
@@ -125,7 +125,7 @@ def _text(hint: Any) -> str:
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(_text, arguments))
     if origin is tuple:
-        return f"a tuple of {', '.join('...' if one is ... else _text(one) for one in arguments)}"
+        return f"a tuple of {', '.join('...' if item is ... else _text(item) for item in arguments)}"
     if hint is type(None):
         return "None"
     return getattr(hint, "__name__", str(hint))

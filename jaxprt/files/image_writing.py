@@ -29,7 +29,7 @@ def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
         OSError: The file cannot be written. An old file is unchanged.
     """
     names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
-    _check_suffix(path, ".exr")
+    outputs.target(path, ".exr")
     # OpenEXR silently writes wrong values for arrays that are not contiguous.
     values = np.asarray(image, np.float32)
     channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
@@ -56,7 +56,7 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
         OSError: The file cannot be written. An old file is unchanged.
     """
     _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
-    _check_suffix(path, ".png")
+    outputs.target(path, ".png")
     values = np.asarray(image, np.float64)
     wrong = np.argwhere(np.isnan(values).any(axis=-1))
     if len(wrong):
@@ -87,12 +87,6 @@ def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, s
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
         raise ValueError(f"image must be [h, w, c] with c one of {list(names)} and no empty axis, got {image.shape}")
     return names[image.shape[-1]]
-
-
-def _check_suffix(path: str | pathlib.Path, suffix: str) -> None:
-    require.path("path", path)
-    if pathlib.Path(path).suffix.lower() != suffix:
-        raise ValueError(f"path must end in {suffix}, because the file will be of that format, got {os.fspath(path)!r}")
 
 
 def _compare(path: pathlib.Path, values: np.ndarray, form: str) -> None:

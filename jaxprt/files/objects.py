@@ -47,7 +47,9 @@ def save(path: str | os.PathLike, object: Any) -> None:
     arrays: list[tuple[Any, np.ndarray]] = []
     modules: set[str] = set()
     tree = _describe(object, type(object).__name__, arrays, modules)
-    table = [{"dtype": each.dtype.name, "shape": each.shape, "checksum": loading.checksum(each)} for _, each in arrays]
+    table = [
+        {"dtype": array.dtype.name, "shape": array.shape, "checksum": loading.checksum(array)} for _, array in arrays
+    ]
     algorithm = {name: loading.algorithm(name) for name in modules}
     content = json.dumps({"tree": tree, "array": table, "algorithm": algorithm})
     header = {"format": loading.FORMAT, "version": loading.VERSION}
@@ -104,7 +106,7 @@ def reduced(object: Any) -> tuple:
 
 
 def _restored(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
-    return loading.filled(kind, field | {key: loading.function(each) for key, each in name.items()})
+    return loading.filled(kind, field | {key: loading.function(path) for key, path in name.items()})
 
 
 def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: bool = False) -> dict[str, Any]:

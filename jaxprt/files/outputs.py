@@ -7,6 +7,24 @@ import secrets
 import stat
 from collections.abc import Iterator
 
+from jaxprt import require
+
+
+def target(path: str | os.PathLike, suffix: str) -> pathlib.Path:
+    """Checks, before the work begins, that a file with this suffix can be written.
+
+    Raises:
+        TypeError: The path is not a path.
+        ValueError: The suffix is another one.
+        OSError: For the reasons of `beside`, as far as they are known before the file is written.
+    """
+    require.path("path", path)
+    if pathlib.Path(path).suffix.lower() != suffix:
+        raise ValueError(f"path must end in {suffix}, because the file will be of that format, got {os.fspath(path)!r}")
+    path = pathlib.Path(path)
+    _old_mode(path, pathlib.Path(os.path.realpath(path)))
+    return path
+
 
 @contextlib.contextmanager
 def beside(path: str | os.PathLike) -> Iterator[pathlib.Path]:

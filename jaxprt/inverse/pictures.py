@@ -230,11 +230,12 @@ class Residual(eqx.Module):
 
 def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:
     """Mean squared difference between neighboring texels, across the edges of faces too: a prior of light."""
+    require.real("the radiance", radiance)
     if np.ndim(radiance) != 4 or np.shape(radiance)[0] != 6:
         got = list(radiance.shape) if hasattr(radiance, "shape") else type(radiance).__name__
         raise ValueError(
             f"the radiance must be that of texels, [6, n, n, c], got {got}: for an Environment, give its `.radiance`"
         )
-    wide = cubemap.pad(radiance)
+    wide = cubemap.pad(jnp.asarray(radiance))
     down, right = wide[:, 1:, 1:-1] - wide[:, :-1, 1:-1], wide[:, 1:-1, 1:] - wide[:, 1:-1, :-1]
     return jnp.mean(down**2) + jnp.mean(right**2)

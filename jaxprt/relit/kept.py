@@ -27,14 +27,14 @@ def kept(path: pathlib.Path | None, key: Any, make: Callable[[], Made]) -> Made:
     if path is None:
         return make()
     try:
-        before, found = objects.load(path)
-        if eqx.tree_equal(before, key):
-            return found
+        stored_key, result = objects.load(path)
+        if eqx.tree_equal(stored_key, key):
+            return result
     except (OSError, ValueError, TypeError):
         pass  # There is no stored result, or it cannot be read.
-    made = make()
+    result = make()
     shutil.rmtree(path, ignore_errors=True)
     # Another process may have stored it meanwhile, or the key may hold objects that cannot be stored.
     with contextlib.suppress(FileExistsError, TypeError):
-        objects.save(path, (key, made))
-    return made
+        objects.save(path, (key, result))
+    return result

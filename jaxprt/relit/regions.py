@@ -73,9 +73,9 @@ def of_regions(
     # Index of each vertex among those of its region.
     place = np.zeros(len(region), np.int32)
     for number in range(len(every)):
-        own = np.flatnonzero(region == number)
-        place[own] = np.arange(len(own))
+        member = np.flatnonzero(region == number)
+        place[member] = np.arange(len(member))
     corner = jnp.asarray(place[face])
     points = tuple(tuple(points_of(pixels, corner, 0, each) for each in row) for row in index)
-    kept = tuple(system.at(each).view(jnp.asarray(camera.eye), materials) for each in points) if keep else None
+    kept = tuple(system.at(row).view(jnp.asarray(camera.eye), materials) for row in points) if keep else None
     return RegionsView(system, materials, camera, lay_out(pixels, list(index), camera), points, kept)

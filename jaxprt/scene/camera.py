@@ -96,14 +96,14 @@ def in_common_coordinates(function: Function) -> Function:
     @functools.wraps(function)
     def moved(*argument, **named):
         bound = signature.bind(*argument, **named)
-        given, camera = bound.arguments, bound.arguments["camera"]
+        arguments, camera = bound.arguments, bound.arguments["camera"]
         if not isinstance(camera, Camera):
             return function(*argument, **named)
         if "mesh" not in signature.parameters:
-            exact = any(isinstance(each, np.ndarray) for each in (camera.eye, camera.target))
-            given["camera"] = camera.local(tuple(np.asarray(camera.eye, float).tolist())) if exact else camera
-        elif isinstance(given["mesh"], Mesh):
-            given["mesh"], given["camera"] = localized(given["mesh"], camera)
+            exact = any(isinstance(position, np.ndarray) for position in (camera.eye, camera.target))
+            arguments["camera"] = camera.local(tuple(np.asarray(camera.eye, float).tolist())) if exact else camera
+        elif isinstance(arguments["mesh"], Mesh):
+            arguments["mesh"], arguments["camera"] = localized(arguments["mesh"], camera)
         return function(*bound.args, **bound.kwargs)
 
     return cast(Function, moved)

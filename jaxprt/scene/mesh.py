@@ -330,17 +330,17 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     position = (position.astype(np.float64) - origin).astype(np.float32)
     if texture is not None:
         texture = jax.device_put(_finite(texture, "texture", (count, 2), name).astype(np.float32))
-    given = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
-    length = np.linalg.norm(given, axis=1, keepdims=True)
+    normal = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
-    given = np.where(bad, 0, given) / np.where(bad, 1, length)
+    normal = np.where(bad, 0, normal) / np.where(bad, 1, length)
     if bad.any():
-        given = np.where(bad, vertex_normals(position.astype(np.float64), face, welded), given)
-    brought = np.zeros((count, 3)) if tangent is None else _array(tangent, "tangent", (count, 3), name)
-    brought = brought.astype(np.float64)
-    brought = np.where(np.isfinite(brought).all(1, keepdims=True), brought, 0)
-    normal, tangent = _frame(given, brought)
-    face, region = (jax.device_put(each.astype(np.int32)) for each in (face, region))
+        normal = np.where(bad, vertex_normals(position.astype(np.float64), face, welded), normal)
+    tangent = np.zeros((count, 3)) if tangent is None else _array(tangent, "tangent", (count, 3), name)
+    tangent = tangent.astype(np.float64)
+    tangent = np.where(np.isfinite(tangent).all(1, keepdims=True), tangent, 0)
+    normal, tangent = _frame(normal, tangent)
+    face, region = (jax.device_put(index.astype(np.int32)) for index in (face, region))
     return Mesh(jax.device_put(position), face, normal, tangent, region, texture, origin)
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import struct
 from collections.abc import Mapping
 from typing import Any
@@ -49,14 +48,13 @@ def export_baked(
     Raises:
         TypeError: `scene` is not a relit scene, or `environment` is not an `Environment`.
         ValueError: The suffix of the file is not .glb, or `RelitScene.radiance` refuses the light, eye or materials.
+        OSError: The file cannot be written, found before the radiance is computed where possible.
 
     Reference: Khronos, glTF 2.0 specification, sections 3.7.2 and 4.4; KHR_materials_unlit.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
     require.kind("the light", environment, Environment, source="jaxprt.load_environment")
-    path = pathlib.Path(path)
-    if path.suffix.lower() != ".glb":
-        raise ValueError(f"path must end in .glb, got {path.name!r}")
+    path = outputs.target(path, ".glb")
     eye = scene.camera.eye if eye is None else eye
     color = np.asarray(scene.radiance(environment, eye=eye, materials=materials), np.float32)
     if color.ndim != 2:

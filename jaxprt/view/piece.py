@@ -93,14 +93,15 @@ def export(
         includes that they are missing in the page.
 
     Raises:
-        TypeError: `scene` is not a relit scene, or `environments` holds something other than lights.
+        TypeError: `scene` is not a relit scene, `path` is not a path, `most` is not a number, or `environments` holds
+            something other than lights.
         ValueError: The suffix of the file is not .html, a part has another system or is anisotropic, or the page does
             not fit into `most` bytes.
+        OSError: The file cannot be written, found before the page is computed where possible.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
-    path = pathlib.Path(path)
-    if path.suffix.lower() != ".html":
-        raise ValueError(f"path must end in .html, got {path.name!r}")
+    require.number("most", most, 1)
+    path = outputs.target(path, ".html")
     scene = scene.centered()
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))

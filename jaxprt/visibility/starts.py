@@ -79,12 +79,12 @@ def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     sided = np.stack(
         [np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)[:, None] * facing for corner in face.T]
     )
-    own = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
+    of_vertex = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
-    joint = _added(place, own, len(normal))[place]
-    # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
-    shared = np.sum(joint * own, 1) > 1e-6 * np.sum(own * own, 1)
-    total = np.where(shared[:, None], joint, own)
+    joint = _added(place, of_vertex, len(normal))[place]
+    # The normals of the two sides of a sheet cancel; each vertex then uses its of_vertex faces only.
+    shared = np.sum(joint * of_vertex, 1) > 1e-6 * np.sum(of_vertex * of_vertex, 1)
+    total = np.where(shared[:, None], joint, of_vertex)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     out = np.where(length > 1e-6, total / np.maximum(length, 1e-6), normal)
     # Vertices with the same faces have the same vector: number them, and keep the faces with an area.
@@ -162,16 +162,16 @@ def _off_contact(
     for beside in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
         triangle, distance, _ = occluder.hit(start + offset / 2 * beside, -out)
         # Distances of a few spacings of float32 are themselves rounded by one or two.
-        met = np.flatnonzero(open_start & (triangle >= 0) & (distance < _BACK * offset[:, 0]))
-        if not met.size:
+        hit = np.flatnonzero(open_start & (triangle >= 0) & (distance < _BACK * offset[:, 0]))
+        if not hit.size:
             continue
-        back = facing[triangle[met]]
-        corner = occluder.position[occluder.face[triangle[met]]]
+        back = facing[triangle[hit]]
+        corner = occluder.position[occluder.face[triangle[hit]]]
         # The two sides of a seam may differ by rounding.
-        seam = np.abs(corner - position[met, None]).max(2).min(1, initial=np.inf) <= offset[met, 0] / 4
-        touching = ~seam & (np.sum(back * out[met], 1) < 0)
-        met, back, corner = met[touching], back[touching], corner[touching]
-        height = np.sum((corner[:, 0] - start[met]) * back, 1, keepdims=True)
-        result[met] = start[met] + 2 * height * back
-        open_start[met] = False
+        seam = np.abs(corner - position[hit, None]).max(2).min(1, initial=np.inf) <= offset[hit, 0] / 4
+        touching = ~seam & (np.sum(back * out[hit], 1) < 0)
+        hit, back, corner = hit[touching], back[touching], corner[touching]
+        height = np.sum((corner[:, 0] - start[hit]) * back, 1, keepdims=True)
+        result[hit] = start[hit] + 2 * height * back
+        open_start[hit] = False
     return result

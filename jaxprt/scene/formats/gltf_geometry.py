@@ -116,8 +116,8 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     region = np.repeat([rank[label] for label in labels], [len(part.position) for part in parts])
     lacking = {
         (primitive.material, number)
-        for each in primitives.values()
-        for primitive in each
+        for listed in primitives.values()
+        for primitive in listed
         for number in (0, 1)
         if f"TEXCOORD_{number}" not in primitive.attribute
     }
@@ -199,8 +199,10 @@ def _check_memory(
     """Refuses geometry that does not fit into memory, before it is read."""
     size: dict[int, np.ndarray] = {}
     for mesh, listed in primitives.items():
-        vertices, faces = (sum(getattr(each, name) for each in listed) for name in ("most_vertices", "face_count"))
-        joints = sum(each.most_vertices for each in listed if each.joints)
+        vertices, faces = (
+            sum(getattr(primitive, name) for primitive in listed) for name in ("most_vertices", "face_count")
+        )
+        joints = sum(primitive.most_vertices for primitive in listed if primitive.joints)
         need = vertices * _VERTEX + joints * _JOINTS + faces * _FACE + len(listed) * _PART
         size[mesh] = np.array([vertices, faces, need], object)  # Python's integers, which do not overflow
     times = [instance_count(document, node) for node in drawn]

@@ -158,7 +158,7 @@ def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
     if wrong.size:
         got = f"numbers that are not finite at node {order[wrong[0]]}"
         raise document.error("must have finite transforms to world coordinates", got)
-    return [Node(index, items[index], each) for index, each in zip(order, matrix, strict=True)]
+    return [Node(index, items[index], transform) for index, transform in zip(order, matrix, strict=True)]
 
 
 def _transforms(document: Document, order: list[int]) -> np.ndarray:

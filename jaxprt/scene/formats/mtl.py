@@ -52,24 +52,24 @@ def of_regions(
     """
     source = obj.content(path)
     order, files = obj.used_materials(source)
-    found: dict[str, TexturedMaterial] = {}
+    materials: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
     first = text.name(source.partition(b"\n")[0])
     refer = functools.partial(inputs.reference, folder=path.parent, outside=outside)
     for file in files:
-        whole = refer(file, path.parent, owner=f"{path}, mtllib")
-        words = file.split() if _absence(whole) else []
-        for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [whole]:
+        named = refer(file, path.parent, owner=f"{path}, mtllib")
+        words = file.split() if _absence(named) else []
+        for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [named]:
             absence = _absence(library)
             if not absence:
                 material, more = read(library, blender=_exponent(first), refer=refer)
-                found, ignored = material | found, ignored | more
+                materials, ignored = material | materials, ignored | more
             else:
                 ignored.add(f"mtllib ({library}, {absence})")
-    ignored |= {f"usemtl {each} (no such material)" for each in order if each is not None and each not in found}
+    ignored |= {f"usemtl {label} (no such material)" for label in order if label is not None and label not in materials}
     if ignored:
         warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
-    return [each or "default" for each in order], [found.get(each or "", plain) for each in order]
+    return [label or "default" for label in order], [materials.get(label or "", plain) for label in order]
 
 
 def _exponent(line: str) -> float | None:

@@ -253,6 +253,7 @@ def _same(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
 
 
 def _suffix(path: str | os.PathLike) -> str:
+    require.path("path", path)
     suffix = pathlib.Path(path).suffix.lower()
     if suffix not in (".npz", ".npy", ".ply"):
         raise ValueError(f"the file must end in .npz, .npy or .ply, got {os.fspath(path)!r}")
