@@ -311,7 +311,7 @@ def scene_verbs() -> dict[str, Verb]:
         "reference.radiance": Verb(
             prt.reference.radiance,
             keep=("progress", "error"),
-            right=("occluder",),
+            right=("occluder", "vertex"),
             mesh=mesh(),
             brdf=prt.brdf.Lambert(0.5),
             light=environment(),

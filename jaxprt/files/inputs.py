@@ -3,6 +3,7 @@
 import collections
 import errno
 import json
+import os
 import pathlib
 import stat
 from typing import Any
@@ -123,7 +124,8 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str, outside: bool) -> pathlib.Path:
     r"""The path of a file that a scene names, with the checks of `inside`.
 
-    A \ may separate folders, as on Windows, or belong to a name, as elsewhere. The file must be inside either way.
+    A \ belongs to the name, or separates folders, as on Windows, if there is no file of that name. Both paths must be
+    inside.
 
     Args:
         name: Name of the file in the scene.
@@ -135,5 +137,6 @@ def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str
     Raises:
         ValueError: The file is outside of the folder. The message names the file.
     """
-    inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
-    return inside(base / name, folder, owner=owner, outside=outside)
+    on_windows = inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
+    path = inside(base / name, folder, owner=owner, outside=outside)
+    return path if os.path.lexists(path) else on_windows

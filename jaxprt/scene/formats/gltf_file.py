@@ -96,7 +96,7 @@ class Document(Header):
         """The elements of an accessor (section 3.6.2).
 
         Args:
-            value: Its index, as it stands in the file.
+            value: Index of the accessor, read from the file and not checked yet.
             owner: The object that refers to it, for error messages.
             widths: Allowed numbers of components of an element.
             whole: Whether the elements must be integers, such as indices.

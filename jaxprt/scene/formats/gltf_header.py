@@ -68,7 +68,7 @@ class Header:
 
         Args:
             kind: The kind, such as "meshes".
-            value: The index, as it stands in the file.
+            value: The index, read from the file and not checked yet.
             owner: The object that refers to it, for error messages.
 
         Raises:

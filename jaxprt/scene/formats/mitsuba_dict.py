@@ -45,7 +45,7 @@ _SILENT |= {"prb_projective", "independent", "multijitter", "orthogonal", "strat
 def read(scene: Mapping[str, Any]) -> Scene:
     """Reads the scene of a dictionary, as `load_scene` documents.
 
-    Its file names may lead anywhere: the caller writes the dictionary, as Python code does that opens files itself.
+    It may refer to files in any folder: unlike a scene file, a dictionary is written by the caller.
     """
     if scene.get("type") != "scene":
         raise ValueError(f"a dictionary of Mitsuba must have the type 'scene', got {scene.get('type')!r}")

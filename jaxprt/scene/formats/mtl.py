@@ -150,7 +150,7 @@ def _material(
         if key in _MAPS:
             options, words = _options(words)
             owner = f"{path}, {key} of material {name!r}"
-            file = refer(" ".join(words).replace("\\", "/"), path.parent, owner=owner)
+            file = refer(" ".join(words), path.parent, owner=owner)
             _add_map(field, key, options, file, ignored)
         elif key in _OPAQUE and _number(statements, key, path, name) == _OPAQUE[key]:
             continue

@@ -150,6 +150,14 @@ def test_materials_in_an_inner_folder_may_name_images_anywhere_in_the_scenes_fol
         load_scene(path)
 
 
+def test_folders_are_separated_by_backslashes_as_on_windows_unless_a_file_has_that_name(place):
+    (place / "inner" / "a.mtl").write_text("newmtl a\nKd 0 1 0\n")
+    path = scene_of_library(place, "inner\\a.mtl")
+    np.testing.assert_array_equal(load_scene(path).parts[0].material.base_color, [0, 1, 0])
+    (place / "inner\\a.mtl").write_text("newmtl a\nKd 0 0 1\n")
+    np.testing.assert_array_equal(load_scene(path).parts[0].material.base_color, [0, 0, 1])
+
+
 def test_several_libraries_in_one_line_are_all_refused_outside(place):
     (place / "a.mtl").write_text("newmtl a\nKd 0 1 0\n")
     with pytest.raises(ValueError, match=r"a\.obj, mtllib must refer to files in the folder"):
@@ -248,6 +256,7 @@ def test_the_command_line_allows_it_by_an_option(place):
 def test_a_backslash_may_belong_to_a_name(tmp_path):
     """Where folders are separated by slashes."""
     name = "a\\b"
+    (tmp_path / name).touch()
     path = inputs.reference(name, tmp_path, folder=tmp_path, owner="a scene", outside=False)
     assert path == tmp_path / pathlib.Path(name)
 
