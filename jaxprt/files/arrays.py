@@ -7,6 +7,7 @@ and correct. A process may therefore be killed at any moment, and files may be l
 read is either as written or reported missing.
 """
 
+import contextlib
 import errno
 import functools
 import json
@@ -300,10 +301,11 @@ def _check_files(path: Path, name: str) -> None:
 
     Files are also written, so a link in a folder from a stranger could replace other files of the user.
     """
-    for file in (path / name, *path.glob(".lock.*")):
-        if file.is_symlink():
-            raise ValueError(f"{file.name} must be a file in the folder, got a link")
-        inputs.check(file, "a part of a store of arrays")
+    what = "a part of a store of arrays"
+    inputs.check_unlinked(path / name, what)
+    for lock in path.glob(".lock.*"):
+        with contextlib.suppress(FileNotFoundError):  # released by another process
+            inputs.check_unlinked(lock, what)
 
 
 def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:

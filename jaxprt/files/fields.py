@@ -31,7 +31,7 @@ def check(value: Any, *, batched: bool = False) -> None:
     """Refuses an object whose fields do not hold what its class says, and runs the checks of the class.
 
     Arrays must have the annotated kind of numbers and the annotated axes. Axes of one name have one size in all fields.
-    Constructors check the same, but loading does not call them.
+    They may be NumPy arrays where the class says JAX. Loading calls no constructors, which run the checks of classes.
 
     Args:
         value: An object of a data class or a named tuple.

@@ -37,6 +37,18 @@ def check(path: pathlib.Path, what: str) -> None:
         raise ValueError(f"{path} must be {what}, got a {'directory' if stat.S_ISDIR(mode) else 'special file'}")
 
 
+def check_unlinked(path: pathlib.Path, what: str) -> None:
+    """Refuses, besides what `check` refuses, links, which may lead out of a folder from a stranger.
+
+    Args:
+        path: The file.
+        what: Kind of the file for messages, such as "an array of a saved object".
+    """
+    if path.is_symlink():
+        raise ValueError(f"{path.name} must be a file in the folder, got a link")
+    check(path, what)
+
+
 def content(path: pathlib.Path, what: str) -> bytes:
     """The bytes of a regular file.
 

@@ -195,7 +195,7 @@ def _read(path: Path, number: int, entry: Any) -> np.ndarray:
             raise ValueError("it is not of numbers")
         kind = storable(np.empty(0, dtype)).dtype.str
         file = path / f"{number}.npy"
-        _check_file(file)
+        inputs.check_unlinked(file, "an array of a saved object")
         value = mapped.open_array(file, mapped.read_header(file, tuple(shape), kind), tuple(shape), kind).view(dtype)
         right = checksum(value) == expected
     except Exception as error:
@@ -203,13 +203,6 @@ def _read(path: Path, number: int, entry: Any) -> np.ndarray:
     if not right:
         raise ValueError(f"{what} is not what was saved")
     return value
-
-
-def _check_file(file: Path) -> None:
-    """Refuses links, which may lead out of the folder, and pipes, which would block."""
-    if file.is_symlink():
-        raise ValueError(f"{file.name} must be a file in the folder, got a link")
-    inputs.check(file, "an array of a saved object")
 
 
 def _class(path: Path, name: str) -> type:
@@ -282,9 +275,9 @@ def checksum(value: np.ndarray) -> int:
 def _header(path: Path) -> dict[str, Any]:
     """The header of a saved object, of the current version or of version 1, which zarr wrote."""
     if (path / HEADER).exists():
-        _check_file(path / HEADER)
+        inputs.check_unlinked(path / HEADER, "an object that jaxprt.files.save wrote")
         return inputs.json_object(path / HEADER, "the description of a saved object")
     if (path / "zarr.json").exists():
-        _check_file(path / "zarr.json")
+        inputs.check_unlinked(path / "zarr.json", "an object that jaxprt.files.save wrote")
         return dict(inputs.json_object(path / "zarr.json", "the description of a saved object").get("attributes", {}))
     return {}

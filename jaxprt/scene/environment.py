@@ -31,6 +31,7 @@ _CUBES = {
 _AROUND = 4096  # smallest number of parts around the horizon into which a latlong picture is divided
 _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
+_STATED = {"latlong": "openexr-latlong", "cube": "openexr-cube"}  # values of the EXR attribute envmap
 
 
 class Environment(eqx.Module):
@@ -243,8 +244,8 @@ def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) ->
     Raises:
         ValueError: The image has the shape of no layout.
     """
-    if "envmap" in attributes:
-        return {"latlong": "openexr-latlong", "cube": "openexr-cube"}[str(attributes["envmap"])]
+    if (stated := _STATED.get(str(attributes.get("envmap")))) is not None:
+        return stated
     height, width = image.shape[:2]
     if width == 2 * height or height == width == 1:
         return "latlong"

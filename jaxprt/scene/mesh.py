@@ -186,7 +186,9 @@ def relative(mesh: Mesh, origin: origins.Origin) -> Mesh:
     if mesh.origin == origin:
         return mesh
     shift = np.asarray(mesh.origin) - np.asarray(origin)
-    position = jax.device_put((np.asarray(mesh.position, np.float64) + shift).astype(mesh.position.dtype))
+    exact = np.asarray(mesh.position, np.float64) + shift
+    origins.warn_of_rounding(exact, np.asarray(mesh.face), "the mesh, joined with others")
+    position = jax.device_put(exact.astype(mesh.position.dtype))
     return dataclasses.replace(mesh, position=position, origin=origin)
 
 
@@ -327,7 +329,9 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     used = np.zeros(count, bool)
     used[face.ravel()] = True
     origin = origins.of(position[used])
-    position = (position.astype(np.float64) - origin).astype(np.float32)
+    exact = position.astype(np.float64) - origin
+    origins.warn_of_rounding(exact, face, name)
+    position = exact.astype(np.float32)
     if texture is not None:
         texture = jax.device_put(_finite(texture, "texture", (count, 2), name).astype(np.float32))
     normal = np.zeros((count, 3)) if normal is None else _array(normal, "normal", (count, 3), name).astype(np.float64)
@@ -335,7 +339,7 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     bad = ~(np.isfinite(length) & (length > 0))
     normal = np.where(bad, 0, normal) / np.where(bad, 1, length)
     if bad.any():
-        normal = np.where(bad, vertex_normals(position.astype(np.float64), face, welded), normal)
+        normal = np.where(bad, vertex_normals(exact, face, welded), normal)
     tangent = np.zeros((count, 3)) if tangent is None else _array(tangent, "tangent", (count, 3), name)
     tangent = tangent.astype(np.float64)
     tangent = np.where(np.isfinite(tangent).all(1, keepdims=True), tangent, 0)

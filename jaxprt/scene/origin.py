@@ -5,32 +5,37 @@ positions relative to an origin near them. Cameras, eyes, lamps and points are g
 come in through `local`.
 """
 
+import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxprt import require
 
 Origin = tuple[float, float, float]
 ZERO: Origin = (0.0, 0.0, 0.0)
 _FAR = 64  # distance from zero, in diagonals of the bounding box, from which on a mesh gets an origin of its own
+_OUTLIERS = 0.01  # share of the vertices at each end of an axis that do not count: stray ones are common in surveys
+_FINE = 64  # steps of float32 that the extent of a triangle should have: its normal then is right to about a degree
+_BLOCK = 1 << 18  # triangles
 _LARGE = 64.0  # coordinates above this are kept in float64 where float32 would round them
 
 
 def of(position: Float[np.ndarray, "v 3"]) -> Origin:
     """The origin of a mesh: zero unless the mesh is farther from it than 64 times its size.
 
-    The origin is the middle of the bounding box, rounded to a multiple of a power of two that is about the size of the
-    mesh. Subtracting it is exact in float64 for coordinates that have at most 53 bits.
+    The origin is the middle of the bounding box, without the outermost hundredth of the vertices, rounded to a multiple
+    of a power of two that is about the size of the mesh. Subtracting it is exact in float64 for coordinates that have
+    at most 53 bits.
 
     Args:
         position: Positions of the vertices that faces use, finite.
     """
-    low, high = np.min(position, 0).astype(np.float64), np.max(position, 0).astype(np.float64)
+    low, high = np.quantile(np.asarray(position, np.float64), [_OUTLIERS, 1 - _OUTLIERS], axis=0, method="nearest")
     size = float(np.linalg.norm(high - low))
     if not np.maximum(np.abs(low), np.abs(high)).max() > _FAR * size:
         return ZERO
@@ -38,6 +43,32 @@ def of(position: Float[np.ndarray, "v 3"]) -> Origin:
     step = 2.0 ** np.ceil(np.log2(size)) if size > 0 else 0.0
     x, y, z = (np.round(middle / step) * step if step > 0 else middle).tolist()
     return (x, y, z)
+
+
+def warn_of_rounding(position: Float[np.ndarray, "v 3"], face: Int[np.ndarray, "f 3"], name: str) -> None:
+    """Warns if float32 cannot hold the triangles of a mesh, because it has parts that are too far apart.
+
+    Args:
+        position: Positions relative to the origin, in float64.
+        face: Vertices of each triangle.
+        name: Description of the mesh for the message.
+    """
+    rounded, first = 0, None
+    for start in range(0, len(face), _BLOCK):
+        corner = position[face[start : start + _BLOCK]]
+        size = np.ptp(corner, axis=1).max(1)
+        coarse = np.flatnonzero((size > 0) & (size < _FINE * np.spacing(np.abs(corner).max((1, 2)).astype(np.float32))))
+        if first is None and coarse.size:
+            first = start + coarse[0], corner[coarse[0]].mean(0)
+        rounded += coarse.size
+    if first is not None and rounded > _OUTLIERS * len(face):
+        step = float(np.spacing(np.float32(np.abs(first[1]).max())))
+        warnings.warn(
+            f"{name}: float32 rounds {rounded} of {len(face)} triangles visibly, because the mesh is wide and they are "
+            f"small and far from its middle: triangle {first[0]} has steps of {step:.2g}. Remove stray vertices, or "
+            "load parts that are far apart as scenes of their own",
+            stacklevel=5,
+        )
 
 
 def local(name: str, position: Any, origin: Origin) -> Any:

@@ -109,6 +109,8 @@ class Part(eqx.Module):
 def _place(value: Any) -> Any:
     """Three coordinates, or one number for three. What is not of numbers is left for the class to refuse."""
     value = origins.coordinates(value)
+    if isinstance(value, np.ndarray) and value.ndim == 0:  # in float64, where float32 would round it
+        return np.broadcast_to(value, (3,))
     return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 

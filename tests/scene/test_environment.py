@@ -527,3 +527,11 @@ def test_light_of_lists_and_whole_numbers_is_floating_point():
         light = Environment(radiance)
         assert jnp.issubdtype(light.radiance.dtype, jnp.floating)
         np.testing.assert_array_equal(light.radiance, 200)
+
+
+def test_a_header_line_that_names_no_layout_leaves_the_shape_to_decide(tmp_path):
+    pixels = np.full((4, 8, 4), [128, 128, 128, 129], np.uint8)
+    path = tmp_path / "sky.hdr"
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nenvmap=dome\n\n-Y 4 +X 8\n" + pixels.tobytes())
+    light = environment.load_environment(path, size=2)
+    np.testing.assert_allclose(light.radiance, 1.0, rtol=0.01)

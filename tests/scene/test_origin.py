@@ -55,6 +55,29 @@ def test_a_file_far_from_zero_keeps_its_digits_and_normals(tmp_path, shift):
         np.testing.assert_allclose(bounds(mesh), [position.min(0), position.max(0)], rtol=0, atol=1e-6)
 
 
+def test_stray_vertices_do_not_move_the_origin_away_from_the_mesh():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=3.0)
+    place = ball.vertices + FAR
+    stray = np.eye(3)
+    face = np.concatenate([ball.faces, [[len(place), len(place) + 1, len(place) + 2]]])
+    mesh = make_mesh(np.concatenate([place, stray]), face)
+    np.testing.assert_allclose(in_file(mesh)[:-3], place, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(mesh.normal[:-3], ball.vertices / 3, atol=0.03)
+
+
+def test_a_mesh_too_wide_for_float32_is_named_and_keeps_normals_from_before_rounding():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=3.0)
+    place = np.concatenate([ball.vertices + FAR, ball.vertices])
+    face = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
+    with pytest.warns(UserWarning, match=r"two\.obj: float32 rounds 1280 of 2560 triangles visibly.* triangle 0 has"):
+        mesh = make_mesh(place, face, name="two.obj")
+    # Faces that float32 cannot tell from lines do not count in them. From rounded positions they turn by 33 degrees.
+    np.testing.assert_allclose(mesh.normal, np.tile(ball.vertices / 3, (2, 1)), atol=0.1)
+    near, far = make_mesh(ball.vertices, ball.faces), make_mesh(ball.vertices + FAR, ball.faces)
+    with pytest.warns(UserWarning, match="the mesh, joined with others: float32 rounds 1280 of 1280 triangles"):
+        join([near, far])
+
+
 def test_a_mesh_near_zero_has_its_origin_there():
     for shift in (0.0, 30.0, [0.0, 200.0, 0.0]):
         assert make_mesh(np.asarray(ball().vertices) + shift, ball().faces).origin == origin.ZERO
@@ -209,3 +232,8 @@ def test_systems_of_far_meshes_say_that_eyes_are_relative():
     mesh = make_mesh(np.asarray(ball().vertices) + FAR, ball().faces)
     with pytest.warns(UserWarning, match=r"positions are relative to mesh\.origin, \(512352"):
         prt.visibility.precompute(mesh, size=4, vertex=np.array([0]), progress=False)
+
+
+def test_one_number_stands_for_three_coordinates_also_where_float32_rounds_it():
+    for number in (1.5, 100.1):
+        np.testing.assert_array_equal(prt.scene.PointLight("bulb", number).position, [number] * 3)

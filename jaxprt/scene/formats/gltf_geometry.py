@@ -241,7 +241,7 @@ def _placements(
                 here = next(rest)
                 if skin is not None and binding is not None:
                     here = gltf_skin.pose(document, geometry, binding, skin, primitive.name)
-                    here = here._replace(normal=_face_normals(here.position)) if primitive.flat else here
+                    here = here._replace(normal=_face_normals(here.position[here.face])) if primitive.flat else here
                 yield node, primitive, here
 
 

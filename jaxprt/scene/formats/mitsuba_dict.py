@@ -175,7 +175,6 @@ def _camera(name: str, item: Mapping[str, Any], ignored: set[str]) -> Camera:
     matrix = transform(item.get("to_world"), f"to_world of {name}")
     eye, up, forward = matrix[:3, 3], matrix[:3, 1], matrix[:3, 2]
     target = eye + forward / (np.linalg.norm(forward) or 1.0) * (np.linalg.norm(eye) or 1.0)
-    eye, target, up, angle = (np.asarray(each, np.float32) for each in (eye, target, up, angle))
     return Camera(eye, target, up, angle, width, height)
 
 

@@ -285,6 +285,12 @@ def test_normals_tangents_and_flat_normals_turn_with_the_skin(tmp_path):
     assert len(mesh.position) == 6
     flat = np.repeat(face_normals(mesh)[:, None], 3, 1)
     np.testing.assert_allclose(np.asarray(mesh.normal)[np.asarray(mesh.face)], flat, atol=1e-6)
+    # Flat normals of mirrored triangles are those of their fronts.
+    skinned(writer := Writer(), *all_second, SHIFTED, NORMAL=None)
+    writer.header["nodes"][2]["scale"] = [-1, 1, 1]
+    mesh = load_mesh(writer.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(face_normals(mesh), [[0, 0, 1]] * 2, atol=1e-6)
+    np.testing.assert_allclose(mesh.normal, [[0, 0, 1]] * 6, atol=1e-6)
 
 
 def test_nodes_without_a_skin_show_the_same_mesh_where_they_are(tmp_path):

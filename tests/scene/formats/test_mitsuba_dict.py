@@ -167,6 +167,14 @@ def test_what_has_no_equal_is_said_by_name():
     assert message == f"the dictionary: not supported and ignored are {expected}"
 
 
+def test_cameras_at_map_coordinates_keep_their_digits():
+    place = np.eye(4)
+    place[:3, 3] = 512345.3, 100.7, 4987649.3
+    camera = {"type": "perspective", "fov": 40.0, "to_world": place}
+    scene = load_scene({"type": "scene", "sheet": {"type": "rectangle", "to_world": place}, "camera": camera})
+    np.testing.assert_array_equal(scene.cameras[0].eye, place[:3, 3])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
