@@ -131,6 +131,8 @@ def _color_part(headers: list[dict[str, typing.Any]], name: str) -> _Part:
     channel = {item.name: item for item in part.header["channels"]}
     if {"RY", "BY"} & set(channel):
         raise ValueError(f"{name} must have channels R, G, B or Y and perhaps A, got {', '.join(channel)}")
+    if part.channels[0] == "Y" and {"X", "Z"} <= set(channel):
+        raise ValueError(f"{name} must have channels R, G, B or Y and perhaps A, got X, Y, Z: convert CIE XYZ to RGB")
     if any(channel[key].xSampling != 1 or channel[key].ySampling != 1 for key in part.channels):
         raise ValueError(f"{name} must have all its channels at full resolution, got subsampled ones")
     # These attributes hold for all parts, and some writers put them into the first part only.

@@ -44,6 +44,7 @@ def front(
     """
     at = occluder.position[corner]
     across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    across = across / np.maximum(np.abs(across).max(-1, keepdims=True), np.finfo(np.float32).tiny)
     side = np.sum(across * np.sum(normal[corner], 1), -1)
     return side * np.sum(across * direction, -1) < 0
 

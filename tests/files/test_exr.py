@@ -53,6 +53,15 @@ def test_mip_mapped_tiles_are_read_at_the_finest_level(data):
     assert attributes["envmap"] == "cube"
 
 
+def test_tristimulus_values_do_not_pass_for_gray_and_a_depth_beside_gray_is_ignored(tmp_path):
+    image = random_image(4, 6, 3)
+    write_exr_channels(tmp_path / "xyz.exr", planes(image, "XYZ"))
+    with pytest.raises(ValueError, match=r"xyz\.exr must have .*, got X, Y, Z: convert CIE XYZ to RGB"):
+        read_image(tmp_path / "xyz.exr")
+    write_exr_channels(tmp_path / "depth.exr", planes(image, "YZ"))
+    np.testing.assert_array_equal(read_image(tmp_path / "depth.exr")[0][..., 0], image[..., 0])
+
+
 def test_exr_channels_are_found_in_any_order_and_type(tmp_path):
     red, green, blue = (np.ascontiguousarray(random_image(4, 4, 3)[..., i]) for i in range(3))
     half = {"R": red.astype(np.float16), "G": green.astype(np.float16), "B": blue.astype(np.float16)}

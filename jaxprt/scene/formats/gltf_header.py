@@ -42,9 +42,13 @@ class Header:
         if not isinstance(header, dict):
             raise self.error("must be an undamaged glTF file with an object as its header", excerpt(header))
         self.header: dict[str, Any] = header
-        version = str(self.object(header, "asset", "the file").get("version", "none"))
+        asset = self.object(header, "asset", "the file")
+        version = str(asset.get("version", "none"))
         if not version.startswith("2."):
             raise self.error("must be an undamaged glTF file of version 2", f"version {version[:_SHOWN]}")
+        least = str(asset.get("minVersion", "2.0"))
+        if least != "2.0":
+            raise self.error("must be a glTF file that needs no more than version 2.0", f"minVersion {least[:_SHOWN]}")
 
     def error(self, required: str, got: str) -> ValueError:
         """An error that names the file."""

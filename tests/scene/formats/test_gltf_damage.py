@@ -161,6 +161,7 @@ TYPES = [
     (("cameras", 0, "perspective"), {}, r"must have a finite number for yfov of camera 0, got None"),
     (("asset",), "2.0", r"must have an object for asset of the file, got '2\.0'"),
     (("asset", "version"), [2], r"of version 2, got version \[2\]"),
+    (("asset", "minVersion"), "2.1", r"must be a glTF file that needs no more than version 2\.0, got minVersion 2\.1"),
     (("scene",), False, r"must refer to one of its 1 scenes in the default scene, got False"),
     (("extensionsUsed",), "KHR", r"must have a list for extensionsUsed of the file, got 'KHR'"),
     (("extensionsUsed",), {"KHR": 1}, r"must have a list for extensionsUsed of the file"),
