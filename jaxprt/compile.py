@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from jaxtyping import Array, PyTree
 
 Between = Callable[[], None] | None  # called between the steps of a long computation
 Fixed = TypeVar("Fixed", bound=PyTree)
+Function = TypeVar("Function", bound=Callable)
 
 _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
@@ -42,14 +43,16 @@ _traces = 0  # since the last count
 # fusions it is right, and no slower. Flags are read when the first array is made.
 _FLAG = "--xla_cpu_experimental_ynn_fusion_type="
 _CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
-if importlib.metadata.version("jaxlib") == "0.10.2" and _FLAG not in os.environ.get("XLA_FLAGS", ""):
-    if xla_bridge.backends_are_initialized():
+_flags = os.environ.get("XLA_FLAGS", "").split()
+if importlib.metadata.version("jaxlib") == "0.10.2" and _FLAG not in _flags:
+    if xla_bridge.backends_are_initialized() or any(flag.startswith(_FLAG) for flag in _flags):
         warnings.warn(
             f"jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103) unless XLA_FLAGS={_FLAG} is set before the "
             "first array is made: import jaxprt before that, or set the variable",
             stacklevel=2,
         )
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}".strip()
+    if not any(flag.startswith(_FLAG) for flag in _flags):
+        os.environ["XLA_FLAGS"] = " ".join([*_flags, _FLAG])
 
 
 def jit(function: Callable, **options: Any) -> Any:
@@ -76,14 +79,25 @@ def _exact(function: Callable) -> Callable:
     return traced
 
 
-def wrong_sums() -> int:
-    """Number of rows in which this machine's compiler gets a small sum of squares wrong; 0 from a correct compiler.
+def promoted(function: Function) -> Function:
+    """Decorates a function that computes outside of `jit`: types are promoted as in NumPy, as `jit` does."""
 
-    The sum is that of three products of a matrix, squared, at numbers of rows where a compiler was wrong in silence. It
-    compiles two programs.
+    @functools.wraps(function)
+    def called(*argument, **named):
+        with jax.numpy_dtype_promotion("standard"):
+            return function(*argument, **named)
+
+    return cast(Function, called)
+
+
+def wrong_sums() -> int:
+    """Number of rows in which the default device's compiler gets a small sum wrong; 0 from a correct compiler.
+
+    For each row vector r it is the squared norm of M r with a 3 x 3 matrix M, at numbers of rows where a compiler was
+    wrong in silence. It compiles two programs.
     """
     matrix = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
-    squares = jax.jit(jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2)))
+    squares = jit(jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2)))
     wrong = 0
     for count in _CANARIES:
         row = np.random.default_rng(1).normal(size=(count, 3)).astype(np.float32)

@@ -7,6 +7,7 @@ then reaches every vertex that depends on it.
 import functools
 import inspect
 import os
+import pathlib
 import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -20,6 +21,7 @@ from jaxtyping import Array
 Function = TypeVar("Function", bound=Callable)
 
 LARGEST = 1e32  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
+_ORTHOGONAL = 1e-4  # deviation of M M^T from the identity, due to rounding
 _MOST = 2**31 - 1  # largest index of 32 bits
 
 
@@ -47,13 +49,15 @@ def unreal(value: Any) -> str:
     if known.dtype == object:
         return _described(value)
     names = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text"}
-    return names.get(known.dtype.kind, f"values of type {known.dtype}")
+    return names.get(getattr(known.dtype, "kind", ""), f"values of type {known.dtype}")
 
 
 def _array_of(value: Any) -> Any:
-    """A value as an array, on the host unless it is or holds a JAX array; None if it cannot be one."""
+    """A value as an array; None if it cannot be one. JAX arrays, and lists of values inside `jax.jit`, are JAX's."""
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 2**63:  # NumPy makes objects of these
+        return np.float64(value) if abs(value) < 1e300 else np.copysign(np.inf, np.sign(value))
     for convert in (np.asarray, jnp.asarray):  # NumPy cannot convert lists of values inside `jax.jit`.
         try:
             return convert(value)
@@ -123,8 +127,9 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
     `slack` is a tolerance for rounding errors.
     """
     finite(name, value)
-    if not isinstance(value, Tracer):
-        known = np.asarray(value)
+    known = _array_of(value)
+    if not isinstance(known, Tracer):
+        known = np.asarray(known)
         _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
 
 
@@ -144,22 +149,46 @@ def position(name: str, value: Any, *, each: int | None = None) -> Array:
         ValueError: The shape is neither [3] nor, with `each`, [each 3], or some values are not finite.
     """
     real(name, value)
-    if np.shape(value) not in ((3,), (each, 3)):
-        raise ValueError(f"{name} must be one position, [3], got an array of shape {list(np.shape(value))}")
+    shape = np.shape(_array_of(value))
+    if shape not in ((3,), (each, 3)):
+        raise ValueError(f"{name} must be one position, [3], got an array of shape {list(shape)}")
     finite(name, value)
     return floating(value)
 
 
 def colors(name: str, radiance: Any) -> None:
-    """Refuses light that has neither one color nor three, by ValueError: scenes have these."""
+    """Refuses light that has neither one color nor three, as materials of scenes have, by ValueError."""
     if np.shape(radiance)[-1:] not in ((1,), (3,)):
         raise ValueError(f"{name} must have 1 or 3 colors, got {np.shape(radiance)[-1]}")
+
+
+def rotation(name: str, value: Any) -> Array:
+    """Refuses anything but a proper rotation matrix [3 3]. Inside `jax.jit` only its shape is checked.
+
+    Returns:
+        The matrix as an array of floating point.
+
+    Raises:
+        TypeError: The value does not consist of real numbers.
+        ValueError: The shape is another one, or the matrix mirrors, scales or shears.
+    """
+    real(name, value)
+    known = _array_of(value)
+    fits = known.shape == (3, 3)
+    if fits and not isinstance(known, Tracer):
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix = np.asarray(known, np.float64)
+            fits = np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL) and np.linalg.det(matrix) > 0
+    if not fits:
+        got = known.tolist() if np.ndim(known) < 3 and not isinstance(known, Tracer) else _described(known)
+        raise ValueError(f"{name} must be a 3 x 3 rotation matrix, got {got}")
+    return floating(value)
 
 
 def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: bool = False) -> None:
     """Refuses anything but one real number (TypeError) within a range (ValueError); with `above`, not its lower end."""
     real(name, value)
-    if np.ndim(value):
+    if np.ndim(_array_of(value)):
         raise TypeError(f"{name} must be one number, got {_described(value)}")
     if isinstance(value, Tracer):
         return
@@ -169,13 +198,13 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
 
 
-def count(name: str, value: Any, *, least: int = 0, most: int | None = _MOST) -> None:
-    """Refuses anything but a whole number (TypeError) within a range (ValueError); None for no upper end."""
+def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
+    """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {shown(value)}")
-    if value < least or (most is not None and value > most):
+    if not least <= value <= most:
         bound = f"at most {most}" if value > least else f"at least {least}"
-        bound = bound if most in (None, _MOST) else f"between {least} and {most}"
+        bound = bound if most == _MOST else f"between {least} and {most}"
         raise ValueError(f"{name} must be {bound}, got {value}")
 
 
@@ -183,7 +212,7 @@ def path(name: str, value: Any) -> None:
     """Refuses anything but the name of a file or folder, as text or a path, by TypeError."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {shown(value)}")
-    if not os.fspath(value) or "\0" in os.fspath(value):
+    if isinstance(os.fspath(value), bytes) or not os.fspath(value) or "\0" in os.fspath(value):
         raise ValueError(f"{name} must be a path, got {shown(value)}")
 
 
@@ -226,7 +255,7 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
     if value is None:
         return
     real(name, value)
-    if np.ndim(value):
+    if np.ndim(_array_of(value)):
         raise TypeError(f"{name} must be one number, got {_described(value)}")
     if not low <= value <= high:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
@@ -246,8 +275,9 @@ def within(name: str, value: Any, low: int, high: int) -> None:
         ValueError: Some numbers are outside the range. The message states how many, and the position of the first.
     """
     real(name, value)
-    if not isinstance(value, Tracer):
-        known = np.asarray(value)
+    known = _array_of(value)
+    if not isinstance(known, Tracer):
+        known = np.asarray(known)
         _require(name, f"between {low} and {high}", known, np.asarray((known >= low) & (known <= high)))
 
 
@@ -312,8 +342,10 @@ def _host_memory() -> int | None:
     except (OSError, KeyError, ValueError):
         return None
     try:
-        with open("/sys/fs/cgroup/memory.max") as limit, open("/sys/fs/cgroup/memory.current") as used:
-            return min(free, int(limit.read()) - int(used.read()))
+        group = pathlib.Path("/sys/fs/cgroup")
+        most, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stated = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return min(free, most - used + int(stated.get("inactive_file", 0)))  # cached files that can be dropped
     except (OSError, ValueError):  # no control group, or one without a limit
         return free
 

@@ -82,7 +82,8 @@ def command(**given: Any) -> None:
         relight.make_folder(given["output"])
     made, lights = ready(SimpleNamespace(**given))
     server = _serve(made, lights, given["port"], given["address"])
-    click.echo(f"jaxprt: {server.url} shows the scene; Ctrl-C ends it")
+    way = "" if given["address"] is None else f" through port {server.port} of this machine"
+    click.echo(f"jaxprt: {server.url} shows the scene{way}; Ctrl-C ends it")
     sys.stdout.flush()
     if given["browser"] and given["address"] is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()

@@ -10,6 +10,7 @@ import numpy as np
 import tqdm
 
 from jaxprt import require
+from jaxprt.compile import promoted
 from jaxprt.files import objects
 from jaxprt.relit import lamps, reflection, tracing, warn
 from jaxprt.relit.channels import Shading, of_part
@@ -25,6 +26,7 @@ from jaxprt.visibility import UnfinishedError
 _MOST = 1 << 13  # texels along the edge of a face
 
 
+@promoted
 def precompute(
     scene: Scene,
     *,
@@ -112,7 +114,8 @@ def precompute(
     mesh = near.mesh
     warn.of_gain(near, shadings)
     warn.of_shells(near)
-    warn.of_backs(scene, scene.mesh, default_camera(scene, scene.mesh))
+    whole = scene.mesh
+    warn.of_backs(scene, whole, default_camera(scene, whole))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
@@ -182,7 +185,7 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
         found, environments = objects.load(kept), options["environments"]
         if not isinstance(found, Plan):
             raise ValueError(f"{kept} is damaged: it must hold a plan, got a {type(found).__name__}")
-        if found.key != key_of(scene, lights_of(scene) if environments is None else environments):
+        if found.key != key_of(centered(scene), lights_of(scene) if environments is None else environments):
             raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
         asked = ERROR if options["error"] is None else options["error"]
         if (found.asked, found.rate) != (asked, options["rate"]):

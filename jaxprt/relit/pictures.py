@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
-from jaxprt.compile import Between, finished, jit, make_room
+from jaxprt.compile import Between, finished, jit, make_room, promoted
 from jaxprt.image import rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import interpolation, tracing
@@ -71,6 +71,7 @@ class PictureView(eqx.Module):
     reflected: tracing.Reflections | None = None
     fold: int = eqx.field(static=True, default=1)
 
+    @promoted
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
         """Renders the picture under an environment, in linear radiance.
 

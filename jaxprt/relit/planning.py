@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from jaxprt import require
 from jaxprt.brdf import Lambert
+from jaxprt.compile import promoted
 from jaxprt.files import objects
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import of_part
@@ -134,6 +135,7 @@ class Plan(eqx.Module):
         return "\n".join([*rows, f"in all: {total}{slow}"])
 
 
+@promoted
 def plan(
     scene: Scene,
     *,

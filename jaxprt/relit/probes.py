@@ -34,19 +34,19 @@ def sample(
         size: Edge of the environments' cubemap faces in texels.
 
     Raises:
-        TypeError: `scene` is not a `RelitScene`.
+        TypeError: `scene` is not a `RelitScene`, `positions` are not real numbers, or `size` is not a whole number.
         ValueError: `positions` is not [p, 3] or not finite, `size` is below 1, or for the reasons that
             `RelitScene.picture` gives.
 
     Reference: Kautz, Sloan, Snyder 2002, section 4 (finite lighting).
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
+    require.real("the positions", positions)
+    require.count("size", size, least=1)
     place = np.asarray(positions, np.float64)
     if place.ndim != 2 or place.shape[1] != 3:
         raise ValueError(f"positions must be [p, 3], got {list(place.shape)}")
     require.finite("the positions", place)
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
     return [Environment(jnp.stack(_faces(scene, environment, each, materials, size))) for each in place]
 
 

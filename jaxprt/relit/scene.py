@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
-from jaxprt.compile import Between
+from jaxprt.compile import Between, promoted
 from jaxprt.relit import interpolation, measuring, pictures, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
@@ -147,6 +147,7 @@ class RelitScene(System):
         """The system of all vertices without emission: direct light of the environment, and bounces if requested."""
         return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
 
+    @promoted
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """Projects an environment, of one color or three, for the systems of all parts."""
         colors = protocol.one_light(environment).radiance.shape[-1]
@@ -154,6 +155,7 @@ class RelitScene(System):
             raise ValueError(f"the light of a scene must have 1 or 3 colors, got {colors}")
         return self.system.light(environment)
 
+    @promoted
     def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
         """The light that arrives at all parts, given the materials. Redone when the light or the materials change."""
         given, changed = scene_lamps.split(self.lamps, materials)
@@ -161,6 +163,7 @@ class RelitScene(System):
         arriving = self.system.shade(light, [each.blend for each in every])
         return arriving if self.lamps is None else SceneLight(arriving, self.lamps.radiance(every, changed))
 
+    @promoted
     def view(self, eye: Float[Array | np.ndarray, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
         """What depends on the eye and the materials, for all parts.
 
@@ -191,6 +194,7 @@ class RelitScene(System):
         ]
         return SceneView(view, jnp.concatenate(emitted), lit, reflected)
 
+    @promoted
     def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, including emission."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
@@ -205,6 +209,7 @@ class RelitScene(System):
             color = color + tracing.read(view.reflected, self._surfaces(None), light, lamp, self.points)
         return color if view.emitted is None else color + view.emitted
 
+    @promoted
     def radiance(
         self,
         environment: Environment,
@@ -235,6 +240,7 @@ class RelitScene(System):
             return result
         return eqx.tree_at(lambda each: each.lamps.point_lights, result, result.scene.point_lights)
 
+    @promoted
     def picture(
         self,
         environment: Environment,
@@ -271,6 +277,7 @@ class RelitScene(System):
         view = self._picture_view(camera, materials, samples=samples, keep=False, between=between)
         return view.picture(environment, between=between)
 
+    @promoted
     def picture_view(
         self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
     ) -> PictureView:
@@ -329,6 +336,7 @@ class RelitScene(System):
             object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
         return made
 
+    @promoted
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
         """Measures errors against the exact sum over all texels, times and bytes, on this machine.
 
@@ -351,6 +359,7 @@ class RelitScene(System):
         alone = RelitScene(near.scene, self.direct, self.shading)
         return measuring.measure(alone.picture, near.camera, self.direct, self.system, near.scene, self.shading, lights)
 
+    @promoted
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
         """Evaluates materials at the vertices, so that this is done once for many views.
 

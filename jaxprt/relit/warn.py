@@ -21,6 +21,7 @@ from jaxprt.visibility.hits import front
 _RAYS = 64  # along an edge of the picture
 _SMALLEST = 0.01  # share of the picture's rays that a part must meet: at silhouettes, normals may face away
 _POINTS = 64  # vertices of other parts that tell whether a part encloses them
+_SHELLS = 4  # parts with the extent of the whole scene that are looked at
 _HIDDEN = 0.99  # share of the upper hemisphere that an enclosing part hides
 _GAIN = 1.02  # mean albedo up to which a BRDF may be 1 and rounded
 
@@ -83,12 +84,10 @@ def enclosing(scene: Scene) -> list[int]:
     """Indices of the parts that hide the upper hemisphere from the other parts, however their faces are turned."""
     meshes = [part.mesh for part in scene.parts]
     low, high = (np.stack(corner) for corner in zip(*map(bounds, meshes), strict=True))
+    around = (low <= low.min(0))[:, ::2].all(1) & (high >= high.max(0)).all(1)
     result = []
-    for number, mesh in enumerate(meshes):
-        rest = [other for other in range(len(meshes)) if other != number]
-        around = (low[number] <= low[rest])[:, ::2].all(1) & (high[number] >= high[rest]).all(1)
-        if not rest or not around.all():
-            continue
+    for number in np.flatnonzero(around)[:_SHELLS].tolist() if len(meshes) > 1 else []:
+        mesh, rest = meshes[number], [other for other in range(len(meshes)) if other != number]
         step = max(1, sum(len(meshes[other].position) for other in rest) // _POINTS)
         start = np.concatenate([np.asarray(meshes[other].position) for other in rest])[::step]
         way = _upper(_RAYS)

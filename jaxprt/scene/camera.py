@@ -32,9 +32,9 @@ class Camera(eqx.Module):
     ValueError. Inside `jax.jit` values are not known and therefore not checked.
 
     Attributes:
-        eye: Position in world units, in the coordinates of the scene's file. Coordinates above 64 that float32 would
-            round stay in a NumPy array in float64, and so for the target.
-        target: Point at the center of the picture, in world units.
+        eye: Position in world units, in the coordinates of the scene's file. It stays a NumPy array in float64 if it is
+            farther than 64 units from zero and float32 would round it.
+        target: Point at the center of the picture, in world units. It is stored as the eye is.
         up: Direction that points up in the picture; not parallel to the view direction.
         field_of_view: Full vertical angle of view in radians, between 0 and pi.
         width: Picture width in pixels.
@@ -88,8 +88,8 @@ def localized(mesh: Mesh, camera: Camera) -> tuple[Mesh, Camera]:
 def in_common_coordinates(function: Function) -> Function:
     """Decorates a function of a mesh and a camera: outside `jax.jit`, it moves both near zero.
 
-    A function of a camera alone gets one whose eye is at zero if its coordinates are in float64: directions only need
-    differences, which float32 would lose.
+    A function of a camera alone gets one whose eye is at zero if its coordinates are in float64, because directions are
+    differences of positions, and those of large float32 numbers are rounded.
     """
     signature = inspect.signature(function)
 

@@ -4,6 +4,7 @@ import functools
 import pathlib
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -63,7 +64,7 @@ class Environment(eqx.Module):
 
 
 def _size(value: object) -> None:
-    require.count("size", value, least=1, most=None)  # memory bounds it
+    require.count("size", value, least=1)
 
 
 @require.arguments(path=functools.partial(require.path, "path"), size=_size)
@@ -169,6 +170,15 @@ def resample(
     return resampling.from_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size, around=_AROUND)
 
 
+def _environment(value: object) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.load_environment")
+
+
+@require.arguments(
+    light=_environment,
+    rotation=functools.partial(require.rotation, "rotation"),
+    samples=functools.partial(require.count, "samples", least=1),
+)
 @functools.partial(jit, static_argnames="samples")
 def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
     """Rotates distant light: radiance from direction s arrives from direction R s afterwards.
@@ -185,20 +195,19 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
     Args:
         light: One light, or a batch of them.
-        rotation: A proper rotation matrix. It is not checked, because this function is jitted; other matrices give
-            wrong results.
+        rotation: A proper rotation matrix. Inside `jax.jit` it is not checked, and others give wrong results.
         samples: Parts along the edge of a texel.
 
     Returns:
         The rotated light.
 
     Raises:
-        ValueError: The number of samples is below 1.
+        TypeError: The light is not an `Environment`, the rotation does not consist of real numbers, or the number of
+            samples is not a whole number.
+        ValueError: The rotation is another matrix, or the number of samples is below 1.
 
     Reference: the weights are one step of the balancing in Sinkhorn and Knopp 1967.
     """
-    if samples < 1:
-        raise ValueError(f"samples must be at least 1, got {samples}")
     radiance = light.radiance
     n = radiance.shape[-2]
     # Points on the cube have coordinates in fractions of texels, which quarter turns preserve exactly.
@@ -224,6 +233,15 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
+def _direction(value: Any) -> Array:
+    require.real("direction", value)
+    direction = require.floating(value)
+    if direction.shape[-1:] != (3,):
+        raise ValueError(f"direction must be [..., 3], got an array of shape {list(direction.shape)}")
+    return direction
+
+
+@require.arguments(light=_environment, direction=_direction)
 @jit
 def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
     """Radiance that arrives from given directions in world coordinates, interpolated bilinearly between texels.

@@ -22,7 +22,6 @@ from jaxprt.sphere import directions
 
 _GAP = 5e-4  # gap above the ground, relative to the diagonal; larger than the offset of ray origins
 _BLOCK = 8192
-_ORTHOGONAL = 1e-4  # rounding error of R R^T for a float32 rotation
 _DENSE = 0.4  # spacing of the ground's vertices at its center, relative to that of a uniform grid
 
 
@@ -38,9 +37,9 @@ class Mesh(eqx.Module):
         texture: Texture coordinates (u, v) of each vertex, with (0, 0) at the lower left corner of the image; None if
             there are none.
         origin: Where position (0, 0, 0) is in the coordinates of the mesh's file. It is zero unless the mesh is farther
-            from zero than 64 times its size, as at map coordinates, which float32 would round. A `Scene`, cameras, eyes
-            and lamps that are given to it keep the coordinates of the file. Functions on meshes and systems take eyes
-            and points relative to the origin.
+            from zero than 64 times its size, as at map coordinates, which float32 would round. Scenes, cameras, lamps,
+            pictures and `reference.radiance` keep the coordinates of the file. Systems that were precomputed for a mesh
+            take eyes relative to the origin.
     """
 
     position: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
@@ -226,7 +225,7 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
-@require.arguments(mesh=mesh_arrays.check_mesh, rotation=partial(require.real, "rotation"))
+@require.arguments(mesh=mesh_arrays.check_mesh, rotation=partial(require.rotation, "rotation"))
 def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """Rotates a mesh about the origin: positions, normals and tangents.
 
@@ -234,9 +233,6 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
         ValueError: The matrix is not a proper rotation: it mirrors, scales or shears.
     """
     matrix = np.asarray(rotation, np.float64)
-    same = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL)
-    if not same or np.linalg.det(matrix) < 0:
-        raise ValueError(f"rotation must be a 3 x 3 rotation matrix, got {matrix.tolist()}")
     place, normal, tangent = (
         jnp.matmul(each, jnp.asarray(matrix.T, each.dtype), precision="highest")
         for each in (mesh.position, mesh.normal, mesh.tangent)

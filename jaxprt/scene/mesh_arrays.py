@@ -48,7 +48,8 @@ def check_shapes(mesh: Any) -> None:
         or len(origin) != 3
         or not all(type(x) is float and math.isfinite(x) for x in origin)
     ):
-        raise ValueError(f"origin of a mesh must be a tuple of three finite numbers, got {require.shown(origin)}")
+        got = require.shown(origin)
+        raise ValueError(f"origin of a mesh must be a tuple of three finite numbers of class float, got {got}")
     for name, (width, whole) in _FIELDS.items():
         value = getattr(mesh, name)
         if not isinstance(value, jax.Array | np.ndarray):

@@ -6,6 +6,8 @@ import fast_simplification
 import numpy as np
 import scipy
 
+from jaxprt import require
+from jaxprt.scene import mesh_arrays
 from jaxprt.scene.mesh import Mesh, bounds, centered, join, make_mesh
 
 _UNIT = 1000.0  # meshes are scaled to this diagonal, because thresholds are absolute: the first is 1.5e-6 of it
@@ -29,14 +31,15 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
         mesh does not have more faces than `faces`, it is returned unchanged.
 
     Raises:
+        TypeError: `mesh` is not a mesh, or `faces` is not a whole number.
         ValueError: `faces` is below 4, or all faces are degenerate.
 
     Reference: Garland, Heckbert 1997, implemented by fast-simplification, which collapses edges below a rising
     threshold in the order of their faces instead of the best edge first; Wang, Tran, Luebke 2004, section 4.2, for the
     use.
     """
-    if faces < 4:
-        raise ValueError(f"faces must be at least 4, got {faces}")
+    mesh_arrays.check_mesh(mesh)
+    require.count("faces", faces, least=4)
     if len(mesh.face) <= faces:
         return mesh
     position = np.asarray(mesh.position, np.float64)

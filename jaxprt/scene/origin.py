@@ -1,4 +1,4 @@
-"""The local origin of a mesh: what float32 loses far away from zero is taken off in float64 first.
+"""The local origin of a mesh: subtracted from positions in float64, because float32 loses digits far from zero.
 
 At map coordinates, such as (512345, 4987654), the spacing of float32 is up to half a meter. Meshes therefore store
 positions relative to an origin near them. Cameras, eyes, lamps and points are given in the coordinates of the file and
@@ -22,6 +22,7 @@ _FAR = 64  # distance from zero, in diagonals of the bounding box, from which on
 _OUTLIERS = 0.01  # share of the vertices at each end of an axis that do not count: stray ones are common in surveys
 _FINE = 64  # steps of float32 that the extent of a triangle should have: its normal then is right to about a degree
 _BLOCK = 1 << 18  # triangles
+_ROUNDED = 1e-3  # of the distance from the origin, by which an eye may be rounded
 _LARGE = 64.0  # coordinates above this are kept in float64 where float32 would round them
 
 
@@ -83,20 +84,29 @@ def local(name: str, position: Any, origin: Origin) -> Any:
         The same position if the origin is zero; otherwise a JAX array, in float32 unless float64 is enabled.
 
     Raises:
-        ValueError: The origin is not zero and the position is inside of `jax.jit`, `jax.vmap` or `jax.grad`, where it
-            has been rounded to float32.
+        ValueError: The origin is not zero, and the position is inside of `jax.jit`, `jax.vmap` or `jax.grad`, where
+            float32 has rounded it, or is in float32 or half precision and rounded by more than a thousandth of its
+            distance from the origin.
     """
     if origin == ZERO:
         return position
     if isinstance(position, Tracer):
-        if position.dtype == jnp.float64:
-            return position - jnp.asarray(origin, position.dtype)
         raise ValueError(
-            f"{name} must be relative to the scene inside of jax.jit, jax.vmap and jax.grad, because {position.dtype} "
-            f"rounds coordinates near the scene's origin {origin}: use relit.centered() with camera.local(mesh.origin)"
+            f"{name} must be relative to the scene inside of jax.jit, jax.vmap and jax.grad, because float32 rounds "
+            f"coordinates near the scene's origin {origin}: use relit.centered() with camera.local(mesh.origin)"
         )
     require.position(name, position)
-    return jnp.asarray(np.asarray(position, np.float64) - np.asarray(origin), jnp.result_type(float))
+    exact = np.asarray(position, np.float64)
+    local = exact - np.asarray(origin)
+    dtype = getattr(position, "dtype", np.dtype(np.float64))
+    if jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 8:
+        step = float(jnp.finfo(dtype).eps) * np.abs(exact).max()
+        if step > _ROUNDED * np.linalg.norm(local):
+            raise ValueError(
+                f"{name} must be in float64 of NumPy or a list of numbers, because the scene is near {origin}, got "
+                f"{dtype}, which rounds it there by {step / 2:.2g}"
+            )
+    return jnp.asarray(local, jnp.result_type(float))
 
 
 def coordinates(value: Any) -> Any:

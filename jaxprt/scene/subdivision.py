@@ -244,8 +244,7 @@ def divide(scene: Scene, *, edge: float) -> Scene:
         ValueError: The length is not positive and finite.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    if not 0 < edge < np.inf:
-        raise ValueError(f"edge must be positive and finite, got {edge}")
+    require.number("edge", edge, 0.0, above=True)
     mesh = scene.mesh
     position, face = np.asarray(mesh.position), np.asarray(mesh.face)
     divisions = []

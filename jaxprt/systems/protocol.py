@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
+from jaxprt.compile import promoted
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
@@ -193,10 +194,20 @@ class Total(System):
     part: tuple[System, ...]
 
     def __check_init__(self):
-        """Refuses systems of different vertices."""
-        counts = [each.vertices for each in self.part]
+        """Refuses systems of different vertices or origins."""
+        counts = [system.vertices for system in self.part]
         if len(set(counts)) != 1:
             raise ValueError(f"systems must be one or more with the same number of vertices, got {counts}")
+        _common_origin(self.part)
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the zero of all systems is in the coordinates of eyes."""
+        return _common_origin(self.part)
+
+    def centered(self) -> "Total":
+        """The same sum for eyes relative to `origin`."""
+        return Total(tuple(system.centered() for system in self.part))
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""
@@ -211,6 +222,7 @@ class Total(System):
         """The view of each system."""
         return tuple(each.view(eye, materials) for each in self.part)
 
+    @promoted
     def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
         """The sum of the radiance of all systems."""
         require.kind("the light", light, tuple, source="Total.light")
@@ -239,6 +251,19 @@ class Joined(System):
 
     part: tuple[System, ...]
 
+    def __check_init__(self):
+        """Refuses systems of different origins."""
+        _common_origin(self.part)
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the zero of all systems is in the coordinates of eyes."""
+        return _common_origin(self.part)
+
+    def centered(self) -> "Joined":
+        """The same systems for eyes relative to `origin`."""
+        return Joined(tuple(system.centered() for system in self.part))
+
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system. Systems with the same `shared_light` share one result."""
         made: dict[tuple, PyTree] = {}
@@ -261,6 +286,7 @@ class Joined(System):
         """The view of each system."""
         return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
 
+    @promoted
     def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
         """Radiance of all vertices. Gray radiance is repeated to the number of colors of the other systems."""
         require.kind("the light", light, tuple, source="Joined.light")
@@ -291,6 +317,14 @@ class Joined(System):
         """The keys of all systems; None if one of them has none."""
         keys = tuple(each.shared_light for each in self.part)
         return None if None in keys else (Joined, *keys)
+
+
+def _common_origin(systems: Sequence[System]) -> origins.Origin:
+    """The origin of all systems, by ValueError if they differ."""
+    origin = {system.origin for system in systems}
+    if len(origin) > 1:
+        raise ValueError(f"systems must have one origin, got {sorted(origin)}: precompute their parts as one scene")
+    return next(iter(origin), origins.ZERO)
 
 
 def check_list(points: Any, parts: int) -> None:
@@ -361,6 +395,7 @@ def total(*systems: System) -> Total:
     return Total(systems)
 
 
+@promoted
 def radiance(
     system: System, environment: Environment, *, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None
 ) -> Float[Array, "*l v c"]:

@@ -71,7 +71,7 @@ def radiance(
     if not isinstance(brdf, PerVertex):
         grid.check(brdf)
     require.function("between", between)
-    if error != np.inf:
+    if not (isinstance(error, float | np.floating) and error == np.inf):
         require.number("error", error, 0.0, above=True)
     brdf = grid.as_argument(brdf)
     for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
@@ -131,7 +131,7 @@ def integrate(
         frame: Shading frames; rows are tangent, bitangent, normal.
         brdf: BRDF (wi, wo) -> value [*b c] in 1/sr that is a callable pytree, as the models are, or `PerVertex`.
         light: The environment, or a batch of them along leading axes.
-        eye: Position of the viewer in world units, in the coordinates of the mesh's file.
+        eye: Position of the viewer in world units, in the coordinates of `position`.
         error: Largest relative error of the radiance of each vertex due to integration of BRDF x cosine.
 
     Returns:

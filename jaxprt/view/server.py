@@ -58,6 +58,7 @@ class Server:
 
     Attributes:
         url: The address to open.
+        port: The port of this machine, to which a tunnel or a proxy leads.
     """
 
     def __init__(self, session: Session, *, port: int = 0, address: str | None = None):
@@ -76,7 +77,8 @@ class Server:
         require.count("port", port, least=0, most=65535)
         token, coming = secrets.token_urlsafe(16), None if address is None else parse(address)
         self._server = _Listener(port, session, token, coming)
-        start = f"http://127.0.0.1:{self._server.server_port}" if coming is None else coming.url
+        self.port = self._server.server_port
+        start = f"http://127.0.0.1:{self.port}" if coming is None else coming.url
         self.url = f"{start}/{token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
         self._thread.start()
@@ -235,7 +237,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 if time.monotonic() > deadline:
                     raise TimeoutError
         except TimeoutError:
-            self._refuse(408, f"a message must arrive within {_BODY:g} seconds, got {len(data)} of {length} bytes")
+            self._refuse(408, f"a message must arrive faster, got {len(data)} of {length} bytes in time")
             return None
         self.connection.settimeout(self.timeout)
         return data

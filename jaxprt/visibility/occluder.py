@@ -50,11 +50,6 @@ class Occluder:
         self.offset = offsets(self.position, self.face)
         self._building = threading.Lock()
 
-    @property
-    def nudge(self) -> float:
-        """The largest offset of ray origins from a triangle, in world units."""
-        return float(self.offset.max())
-
     @cached_property
     def _single(self) -> EmbreeScene:
         """The Embree scene for single rays."""

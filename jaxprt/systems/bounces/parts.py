@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.compile import promoted
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import harmonic, protocol
@@ -91,10 +92,12 @@ class PartBounces(protocol.System):
         if np.any(np.asarray(self.tensor.region) != np.repeat(np.arange(len(counts)), counts)):
             raise ValueError("the tensor's regions must be the parts in the same order, got other regions")
 
+    @promoted
     def light(self, environment: Environment) -> LitTransfer:
         """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""
         return light_side(self.tensor, environment)
 
+    @promoted
     def shade(
         self, light: LitTransfer, materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
@@ -110,6 +113,7 @@ class PartBounces(protocol.System):
         each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
         return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))
 
+    @promoted
     def view(
         self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
     ) -> tuple[Float[Array, "lm _ _"], ...]:
@@ -118,6 +122,7 @@ class PartBounces(protocol.System):
         rows = zip(self.part, self._given(materials), self._points(), strict=True)
         return tuple(part.view(eye, own, points) for part, own, points in rows)
 
+    @promoted
     def combine(
         self, light: tuple[Float[Array, "lm _ _"], ...], view: tuple[Float[Array, "lm _ _"], ...]
     ) -> Float[Array, "_ e"]:

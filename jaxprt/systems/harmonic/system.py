@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.brdf.models import scalar
+from jaxprt.compile import promoted
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import harmonics
 from jaxprt.systems import protocol
@@ -148,6 +149,7 @@ class DiffuseSystem(protocol.VertexSystem):
         materials.check(self.vertices, 1)
         return materials.weight[:, 0]
 
+    @promoted
     def combine(self, light: Float[Array, "lm c"], view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
         """Radiance: the dot product of light and transfer vectors, times the albedo."""
         require.array("the light", light, "lm c", source="DiffuseSystem.light")

@@ -239,7 +239,7 @@ class _Job(visibility.rays.VisibilityJob):
     def _seen(self, start: np.ndarray, normal: np.ndarray, samples: _Samples) -> tuple[np.ndarray, int]:
         """The integrals at the given points, and the number of rays traced."""
         way = samples.place - start[:, None]
-        # A point light on a surface is as far from it as rays start.
+        # The distance to a point light is at least the offset of ray origins, so that lamps on a surface stay finite.
         square = np.maximum(np.sum(way**2, -1), offsets(start, np.arange(len(start))[:, None])[:, None] ** 2)
         unit = way / np.sqrt(square)[..., None]
         size = np.linalg.norm(samples.area, axis=1)
