@@ -5,15 +5,17 @@ import re
 
 import numpy as np
 
+from jaxprt import require
 from jaxprt.files import inputs
 from jaxprt.scene.formats import colors, polygons, text
 from jaxprt.scene.formats.geometry import MeshContent, first_appearance
-from jaxprt.scene.formats.ply_table import Columns, Lists, read_elements, read_header
+from jaxprt.scene.formats.ply_table import Columns, Lists, memory, read_elements, read_header
 from jaxprt.scene.formats.polygons import Polygons
 
 _UTF8_MARK = b"\xef\xbb\xbf"
 _CORNERS = ("vertex_indices", "vertex_index")
 _STRIPS = ("tristrips", "tristrip")
+_WEDGES = "texcoord"
 _TEXTURE = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _ALPHA = ("alpha", "diffuse_alpha", "a")
@@ -36,7 +38,9 @@ def read(path: pathlib.Path) -> MeshContent:
     content = inputs.content(path, "a mesh file").removeprefix(_UTF8_MARK)
     try:
         header = read_header(content)
-        table = read_elements(content, header, {"vertex", "face", *_STRIPS})
+        advice = "free some memory, or write the file in parts"
+        require.memory(f"the elements of {path}", memory(header, len(content)), advice)
+        table = read_elements(content, header, {"vertex", "face", *_STRIPS}, {*_CORNERS, _WEDGES})
         vertex, face = table.get("vertex", {}), table.get("face", {})
         if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
             raise ValueError("its vertices must have the properties x, y and z")
@@ -136,7 +140,7 @@ def _color(table: Columns) -> tuple[np.ndarray | None, set[str]]:
 
 def _wedges(face: Columns, faces: Polygons, corners: int) -> np.ndarray | None:
     """Texture coordinates of the corners of faces, as MeshLab writes them; 0 where a face has none."""
-    wedge = face.get("texcoord")
+    wedge = face.get(_WEDGES)
     if not isinstance(wedge, Lists) or not len(wedge.value):
         return None
     count = faces.size[: len(wedge.length)]

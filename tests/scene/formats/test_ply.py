@@ -2,14 +2,17 @@
 
 import os
 import struct
+import time
+import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
 
+from jaxprt import require
 from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
-from jaxprt.scene.formats import mesh_file
+from jaxprt.scene.formats import mesh_file, ply_table
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -76,6 +79,55 @@ def test_other_elements_and_lists_of_vertices_are_passed_over(tmp_path, form):
     geometry = mesh_file.read(write(tmp_path, [camera, material, vertex, edge, face], form), groups=False)
     np.testing.assert_array_equal(geometry.position, SQUARE)
     np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_lists_of_different_lengths_are_the_same_in_blocks_of_any_size(tmp_path, form, monkeypatch):
+    properties = f"property list uchar short junk\n{FACES}property float weight\nproperty list uchar float texcoord\n"
+    lengths = [3, 0, 4, 1, 3, 5, 0, 0, 3]
+    faces = [([7] * (row % 4), [row] * count, row / 2, [row / 4] * (2 * count)) for row, count in enumerate(lengths)]
+    path = write(tmp_path, [("vertex", XYZ, [[0, 0, 0]] * 9), ("face", properties, faces)], form)
+    content = path.read_bytes()
+    header = ply_table.read_header(content)
+    monkeypatch.setattr(ply_table, "_BLOCK", 4)
+    for most in (1, 40, 10_000):
+        monkeypatch.setattr(ply_table, "_BYTES", most)
+        face = ply_table.read_elements(content, header, {"face"}, {"vertex_indices", "texcoord"})["face"]
+        np.testing.assert_array_equal(face["weight"], np.arange(9) / 2)
+        np.testing.assert_array_equal(face["junk"].length, np.arange(9) % 4)
+        assert not len(face["junk"].value)
+        for name, values in (
+            ("vertex_indices", [face[1] for face in faces]),
+            ("texcoord", [face[3] for face in faces]),
+        ):
+            np.testing.assert_array_equal(face[name].length, [len(value) for value in values])
+            np.testing.assert_array_equal(face[name].value, np.concatenate(values))
+
+
+def test_long_lists_that_nothing_uses_take_no_memory_and_others_count_before_they_are_read(tmp_path, monkeypatch):
+    faces = [([1] * 1_000_000, [0, 1, 2]), ([], [0, 2, 3])]
+    properties = "property list uint uchar junk\n" + FACES
+    path = write(tmp_path, [("vertex", XYZ, SQUARE.tolist()), ("face", properties, faces)], "binary_little_endian")
+    tracemalloc.start()
+    try:
+        geometry = mesh_file.read(path, groups=False)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+    assert peak < 4 * path.stat().st_size  # the bytes of the file, and a mask over a block of them
+    monkeypatch.setattr(require, "available_memory", lambda: 3_000_000)
+    with pytest.raises(MemoryError, match=r"the elements of .*mesh\.ply take 0\.0 GB"):
+        load_mesh(path)
+
+
+def test_the_work_for_a_header_is_in_proportion_to_its_elements():
+    header = "ply\nformat ascii 1.0\n" + "".join(f"element kind{number} 0\n" for number in range(20_000))
+    start = time.process_time()
+    assert len(ply_table.read_header(f"{header}end_header\n".encode()).elements) == 20_000
+    assert time.process_time() - start < 2  # 8 s if each name is compared with all others
+    with pytest.raises(ValueError, match="its header must have one element 'kind7' with 0 or more rows"):
+        ply_table.read_header(f"{header}element kind7 0\nend_header\n".encode())
 
 
 @pytest.mark.parametrize("form", FORMATS)
