@@ -45,14 +45,16 @@ def read(path: pathlib.Path) -> MeshContent:
         if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
             raise ValueError("its vertices must have the properties x, y and z")
         faces, corners = _faces(face, table)
+        position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
+        if not faces.size.size or faces.size.max() < 3:
+            raise ValueError(f"{path} must hold vertices and faces, got no faces")
+        polygons.check(faces, len(position), str(path))
+        images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
+        return _content(position, vertex, face, faces, corners, images)
     except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
         raise text.unreadable(path, "PLY", error) from error
-    position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
-    if not faces.size.size or faces.size.max() < 3:
-        raise ValueError(f"{path} must hold vertices and faces, got no faces")
-    polygons.check(faces, len(position), str(path))
-    images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
-    return _content(position, vertex, face, faces, corners, images)
 
 
 def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
@@ -60,7 +62,7 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
     parts = []
     lists = [column for name in _CORNERS if isinstance(column := face.get(name), Lists)]
     if lists:
-        parts.append(Polygons(text.whole(lists[0].value), lists[0].length))
+        parts.append(Polygons(text.whole_lists(*lists[0], "face"), lists[0].length))
     elif any(len(column.length if isinstance(column, Lists) else column) for column in face.values()):
         raise ValueError(f"its faces must have a list of the name {' or '.join(_CORNERS)}")
     corners = sum(len(part.corner) for part in parts)
@@ -68,15 +70,21 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
         for name in _CORNERS:
             strips = table.get(element, {}).get(name)
             if isinstance(strips, Lists):
-                parts.append(polygons.of_rows(_strip_triangles(strips)))
+                vertex = text.whole_lists(*strips, element)
+                parts.append(polygons.of_rows(_strip_triangles(vertex, strips.length)))
     if not parts:
         return Polygons(np.zeros(0, np.int64), np.zeros(0, np.int64)), 0
     return Polygons(*map(np.concatenate, zip(*parts, strict=True))), corners
 
 
-def _strip_triangles(strips: Lists) -> np.ndarray:
-    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed."""
-    vertex = np.insert(text.whole(strips.value), np.cumsum(strips.length)[:-1], -1)
+def _strip_triangles(vertex: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed.
+
+    Args:
+        vertex: Vertex indices of all strips, one strip after the other.
+        length: Number of indices of each strip.
+    """
+    vertex = np.insert(vertex, np.cumsum(length)[:-1], -1)
     place = np.arange(len(vertex))
     start = np.maximum.accumulate(np.where(vertex < 0, place + 1, 0))
     window = np.lib.stride_tricks.sliding_window_view(vertex, 3) if len(vertex) >= 3 else np.zeros((0, 3), np.int64)
@@ -112,9 +120,11 @@ def _content(
     regions: list[str | None] = [None]
     if images and not textured:
         ignored |= {f"TextureFile {image} (there are no texture coordinates)" for image in images}
-    elif images and isinstance(number, np.ndarray):
-        number, of_face["region"] = first_appearance(number)
-        regions = [images[int(index)] if 0 <= index < len(images) else None for index in number]
+    elif images and isinstance(number, np.ndarray) and (drawn := faces.size[: len(number)] > 2).any():
+        labels, region = first_appearance(number[drawn])
+        of_face["region"] = np.zeros(len(number), int)
+        of_face["region"][drawn] = region
+        regions = [images[int(label)] if 0 <= label < len(images) else None for label in labels]
     elif images:
         regions = [images[0]]
         ignored |= {f"TextureFile {image} (no face has its texnumber)" for image in images[1:]}

@@ -158,7 +158,14 @@ class Table:
 
     def lists(self, rest: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The next list of each row: all items, and the length of each list."""
-        start, count = self._at, whole(self.column(rest))
+        start, number = self._at, self.column(rest)
+        wrong = np.flatnonzero(has_fraction(number))
+        if wrong.size:
+            raise ValueError(
+                f"row {self._first + wrong[0] + 1} of the {self._what} rows must have a list of 0 or more numbers, "
+                f"got {number[wrong[0]]}"
+            )
+        count = whole(number)
         wrong = np.flatnonzero(count < 0)
         if wrong.size:
             raise ValueError(
@@ -211,12 +218,35 @@ def rows(content: bytes) -> Iterator[bytes]:
     return filter(bytes.strip, io.BytesIO(content))
 
 
+def has_fraction(value: np.ndarray) -> np.ndarray:
+    """Where numbers are finite, but not whole."""
+    return np.isfinite(value) & (value != np.floor(value)) if value.dtype.kind == "f" else np.zeros(len(value), bool)
+
+
 def whole(value: np.ndarray) -> np.ndarray:
     """Integers in 64 bits. Numbers that are too large or not finite become -1."""
     if value.dtype.kind in "iu":
         return value.astype(np.int64)
     limit = 1 << 62
     return np.where(np.abs(value) < limit, value, -1).astype(np.int64)
+
+
+def whole_lists(value: np.ndarray, length: np.ndarray, what: str) -> np.ndarray:
+    """Integers in 64 bits, as `whole` gives them, from the items of lists.
+
+    Args:
+        value: All items, one list after the other.
+        length: The length of each list.
+        what: Name of the rows for messages, such as "face".
+
+    Raises:
+        ValueError: An item has a fraction. The message states its row.
+    """
+    wrong = np.flatnonzero(has_fraction(value))
+    if wrong.size:
+        row = np.searchsorted(np.cumsum(length), wrong[0], side="right")
+        raise ValueError(f"row {row + 1} of the {what} rows must have whole numbers in its list, got {value[wrong[0]]}")
+    return whole(value)
 
 
 def ragged(start: np.ndarray, count: np.ndarray) -> np.ndarray:

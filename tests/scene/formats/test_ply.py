@@ -266,6 +266,42 @@ def test_each_image_of_several_is_a_part(tmp_path):
         assert len(part.mesh.face) == 1
 
 
+def textured(folder, elements, form):
+    """A file of a square with two images and texture coordinates of the vertices."""
+    write_png(folder / "a.png", IMAGE)
+    write_png(folder / "b.png", IMAGE[::-1])
+    vertex = ("vertex", XYZ + "property float u\nproperty float v\n", [[*row, *row[:2]] for row in SQUARE.tolist()])
+    return write(folder, [vertex, *elements], form, ["TextureFile a.png", "TextureFile b.png"])
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_faces_without_triangles_have_no_image_of_their_own(tmp_path, form):
+    properties = FACES + "property int texnumber\n"
+    faces = [([0, 1], 1), ([0, 1, 2], 0), ([], 7), ([0, 2, 3], 0)]
+    (part,) = load_scene(textured(tmp_path, [("face", properties, faces)], form)).parts
+    assert len(part.mesh.face) == 2
+    np.testing.assert_allclose(part.material.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("faces", [[], [([0, 1], 1)]])
+@pytest.mark.filterwarnings(r"ignore:.*TextureFile b\.png")
+def test_strips_alone_have_the_first_image(tmp_path, form, faces):
+    strips = ("tristrips", "property list int int vertex_indices\n", [([0, 1, 3, 2],)])
+    elements = [("face", FACES + "property int texnumber\n", faces), strips]
+    (part,) = load_scene(textured(tmp_path, elements, form)).parts
+    assert len(part.mesh.face) == 2
+    np.testing.assert_allclose(part.material.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_indices_with_fractions_are_refused_with_their_row(tmp_path, form):
+    faces = ("face", "property list uchar float vertex_indices\n", [([0, 1, 2],), ([0, 1.75, 2, 3],)])
+    path = write(tmp_path, [("vertex", XYZ, SQUARE.tolist()), faces], form)
+    with pytest.raises(ValueError, match=r"mesh\.ply must .* row 2 of the face rows must have whole .*, got 1\.75"):
+        load_mesh(path)
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 @pytest.mark.parametrize("end", [b"\r\n", b"\r"])
@@ -307,6 +343,8 @@ def test_counts_that_the_file_cannot_hold_are_refused(tmp_path, form, vertices, 
         (("vertex_indices", "corners"), "must have a list of the name vertex_indices or vertex_index"),
         (("0 1.0", "0 hello"), "row 1 of the vertex rows must be numbers, got '0.0 0 hello"),
         (("4 0 1 2 3", "-4 0 1 2 3"), "must have a list of 0 or more numbers"),
+        (("4 0 1 2 3", "4.5 0 1 2 3"), "must have a list of 0 or more numbers, got 4.5"),
+        (("4 0 1 2 3", "4 0 1.5 2 3"), "row 1 of the face rows must have whole numbers in its list, got 1.5"),
         (("4 0 1 2 3", "9999999999 0 1"), "row 1 of the face rows must have .* numbers, but has 3"),
         (("4 0 1 2 3", ""), "its header counts 1 face rows, but it has 0"),
     ],
