@@ -102,9 +102,8 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
     primitives = {mesh: _primitives(document, mesh, mesh in skinned, ignored) for mesh in dict.fromkeys(mesh_of)}
     # Meshes without triangles have no instances: these would take memory that `_check_memory` does not count.
-    drawn, mesh_of = (
-        [item for item, mesh in zip(items, mesh_of, strict=True) if primitives[mesh]] for items in (drawn, mesh_of)
-    )
+    drawn = [node for node, mesh in zip(drawn, mesh_of, strict=True) if primitives[mesh]]
+    mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
     _check_memory(document, drawn, mesh_of, primitives)
     parts, labels = [], []
     for node, primitive, geometry in _placements(document, scene, drawn, mesh_of, primitives):
