@@ -261,7 +261,7 @@ def _geometry(rows: list[_Rows], faces: _Faces, source: _Source) -> Geometry:
     """The triangles. Vertices are split where corners differ in region, texture coordinates or normal."""
     vertex, place, direction = (row.value for row in rows)
     index = faces.corner
-    triangle = polygons.triangulate(vertex[:, :3], polygons.Polygons(index[:, 0], faces.size))
+    triangle = polygons.triangulate(vertex[:, :3], polygons.Polygons(index[:, 0], faces.size), str(source.path))
     region = np.repeat(faces.region, faces.size)
     columns = [column for column in (region, *index.T) if column.any()]
     first, corner = split_corners(columns or [index[:, 0]])

@@ -59,7 +59,7 @@ def _content(content: bytes, path: pathlib.Path) -> MeshContent:
     if of_vertex.get("color") is None and (rest_count == 1).any():
         ignored.add("indices of colors of faces")
     of_face = {} if "color" in of_vertex else {"color": _color(rest, rest_count, 3)}
-    return MeshContent(polygons.geometry(position, shape, of_vertex, {}, of_face), [None], ignored)
+    return MeshContent(polygons.geometry(position, shape, of_vertex, {}, of_face, str(path)), [None], ignored)
 
 
 def _vertices(

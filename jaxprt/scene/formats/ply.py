@@ -50,7 +50,7 @@ def read(path: pathlib.Path) -> MeshContent:
             raise ValueError(f"{path} must hold vertices and faces, got no faces")
         polygons.check(faces, len(position), str(path))
         images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
-        return _content(position, vertex, face, faces, corners, images)
+        return _content(position, vertex, face, faces, corners, images, str(path))
     except ValueError as error:
         if str(error).startswith(str(path)):
             raise
@@ -95,7 +95,7 @@ def _strip_triangles(vertex: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 
 def _content(
-    position: np.ndarray, vertex: Columns, face: Columns, faces: Polygons, corners: int, images: list[str]
+    position: np.ndarray, vertex: Columns, face: Columns, faces: Polygons, corners: int, images: list[str], name: str
 ) -> MeshContent:
     """The geometry, images and what is ignored.
 
@@ -106,6 +106,7 @@ def _content(
         faces: All faces, those of strips last.
         corners: Number of corners of faces that are not of strips.
         images: Names of the image files.
+        name: Name of the file.
     """
     of_vertex = {"normal": _columns(vertex, ("nx", "ny", "nz"))}
     of_vertex["texture"] = next((value for names in _TEXTURE if (value := _columns(vertex, names)) is not None), None)
@@ -128,8 +129,8 @@ def _content(
     elif images:
         regions = [images[0]]
         ignored |= {f"TextureFile {image} (no face has its texnumber)" for image in images[1:]}
-    rows = {name: _padded(value, len(faces.size)) for name, value in of_face.items()}
-    return MeshContent(polygons.geometry(position, faces, of_vertex, of_corner, rows), regions, ignored)
+    rows = {key: _padded(value, len(faces.size)) for key, value in of_face.items()}
+    return MeshContent(polygons.geometry(position, faces, of_vertex, of_corner, rows, name), regions, ignored)
 
 
 def _columns(table: Columns, names: tuple[str, ...]) -> np.ndarray | None:
