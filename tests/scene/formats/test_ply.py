@@ -264,6 +264,8 @@ def test_each_image_of_several_is_a_part(tmp_path):
     for part, image in zip(parts, (IMAGE, IMAGE[::-1]), strict=True):
         np.testing.assert_allclose(part.material.base_color_texture.image, image, atol=1e-6)
         assert len(part.mesh.face) == 1
+    first, second = load_scene(wedges(tmp_path, image="a.png|a.png", extra="property int texnumber\n")).parts
+    assert first.material.base_color_texture.image is second.material.base_color_texture.image
 
 
 def textured(folder, elements, form):
