@@ -1,10 +1,11 @@
-"""Images of textures in files of their own."""
+"""Images of textures: channels of decoded files, and files that textures share."""
 
 import pathlib
 
 import jax
 import numpy as np
 
+from jaxprt import require
 from jaxprt.files import images, inputs
 
 
@@ -35,9 +36,35 @@ class TextureImages:
             except ValueError as error:
                 self._image[key] = error
             else:
-                present = channels if pixels.shape[-1] > 2 else (0,) * len(channels)
-                self._image[key] = jax.device_put(np.take(pixels, present, -1))
+                self._image[key] = stored(pixels, channels, str(path))
         image = self._image[key]
         if isinstance(image, ValueError):
             raise ValueError(str(image)) from image
         return image
+
+
+def stored(image: np.ndarray, channels: tuple[int, ...], name: str) -> jax.Array:
+    """Some channels of a decoded image, on the device. They are copied only where the image has others too.
+
+    Args:
+        image: Pixels with 1 (gray), 2 (gray, alpha), 3 or 4 channels.
+        channels: Numbers of the channels: 0 to 2 for colors, which are equal in gray images, or 3 alone for alpha,
+            which is 1 in images without it.
+        name: Name of the image in error messages.
+
+    Raises:
+        MemoryError: The channels do not fit into memory.
+    """
+    height, width, count = image.shape
+    whole = channels == tuple(range(count))
+    require.memory(
+        f"{name}: {len(channels)} channels of {width} x {height} pixels (width x height)",
+        (2 if whole else 3) * 4 * height * width * len(channels),  # one of these is for the check of the texture
+        "free some memory, or reduce the size of the image in another program first",
+    )
+    if whole:
+        return jax.device_put(image)
+    if channels == (3,) and count % 2:
+        return jax.device_put(np.ones((height, width, 1), image.dtype))
+    place = (0, 0, 0, 1) if count < 3 else (0, 1, 2, 3)
+    return jax.device_put(np.take(image, [place[channel] for channel in channels], -1))
