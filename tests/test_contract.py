@@ -211,7 +211,7 @@ HOST = {
     "scene.formats.gltf_file": "reads files",
     "scene.formats.gltf_geometry": "reads files",
     "scene.formats.gltf_header": "reads files",
-    "scene.formats.gltf_material": "reads files",
+    "scene.formats.texture_images": "stores decoded images",
     "scene.formats.gltf_nodes": "reads files",
     "scene.formats.gltf_skin": "reads files",
     "scene.formats.gltf": "reads files",

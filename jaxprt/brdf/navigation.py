@@ -145,8 +145,6 @@ def _grid() -> np.ndarray:
 
 def _read(path: pathlib.Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names, kd and ks [2, m, 3], and F0 and m [m, 2] of the materials in a CSV file."""
-    if not path.exists():
-        raise FileNotFoundError(f"there is no table of materials {path}")
     inputs.check(path, "a table of materials")
     table: dict[str, list[float]] = {}
     try:

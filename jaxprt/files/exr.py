@@ -155,13 +155,19 @@ def _tile(part: _Part) -> tuple[int, int]:
 
 
 def _check_memory(part: _Part, name: str) -> None:
-    """The pixels, and blocks of the decoder: it unpacks all channels, also those that are not read."""
+    """The pixels, and blocks of rows and of the decoder: it unpacks all channels, also those that are not read."""
     rows, columns = part.window("displayWindow")
     data_rows, data_columns = part.window("dataWindow")
     height, width = _tile(part)
-    block = min(_LINES, len(data_rows)) * len(data_columns) + height * width
-    count = len(part.header["channels"]) + len(part.channels)
-    pixels.check_memory(name, len(rows), len(columns), len(part.channels), decoder=4 * block * count)
+    lines = min(_LINES, len(data_rows)) * len(data_columns)
+    block = min(_step(height), len(data_rows)) * len(data_columns)
+    decoder = 4 * (len(part.header["channels"]) * (lines + 2 * height * width) + len(part.channels) * block)
+    pixels.check_memory(name, len(rows), len(columns), len(part.channels), decoder=decoder)
+
+
+def _step(tile_height: int) -> int:
+    """Rows that are read at once: whole rows of tiles."""
+    return -(-_LINES // tile_height) * tile_height
 
 
 def _matrix(part: _Part, name: str) -> np.ndarray | None:
@@ -198,7 +204,7 @@ def _read_part(path: pathlib.Path, part: _Part, rows: range, image: np.ndarray) 
         # OpenImageIO would divide whole numbers by the largest one.
         form = "uint32" if kinds == {"uint"} else "float"
         left = _overlap(data_columns, part.window("displayWindow")[1])
-        step = -(-_LINES // max(1, spec.tile_height)) * max(1, spec.tile_height)
+        step = _step(max(1, spec.tile_height))
         for first in range(data_rows.start, data_rows.stop, step):
             block = range(first, min(first + step, data_rows.stop))
             wanted = _overlap(block, rows)

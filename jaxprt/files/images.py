@@ -126,12 +126,14 @@ def _read_other(
                 f"{name} must be an undamaged {form} file, got one that only a {reader.format_name()} reader takes"
             )
         spec = reader.spec()
-        pixels.check_size(name, spec.height, spec.width)
+        for height, width in ((spec.height, spec.width), pixels.tile_size(spec)):
+            pixels.check_size(name, height, width)
         if not 1 <= spec.nchannels <= 4 or spec.depth > 1:
             raise ValueError(f"{name} must have 1 to 4 channels and be flat, got {spec.nchannels}, depth {spec.depth}")
         # Decoders of interlaced and progressive files, and of strips, hold all values in the file's type.
         native = spec.height * spec.width * spec.nchannels * spec.format.size()
-        pixels.check_memory(name, spec.height, spec.width, spec.nchannels, decoder=2 * native)
+        decoder = 2 * native + pixels.block_bytes(spec)
+        pixels.check_memory(name, spec.height, spec.width, spec.nchannels, decoder=decoder)
         image = np.empty((spec.height, spec.width, spec.nchannels), np.float32)
         try:
             pixels.read_rows(reader, image)

@@ -7,6 +7,7 @@ regular files in the folder are read. Whatever differs from what `jaxprt.files.o
 import dataclasses
 import importlib
 import json
+import os
 import re
 import sys
 import zlib
@@ -36,7 +37,7 @@ _FUNCTIONS = {
 
 def load(path: Path) -> Any:
     """The object in a folder; `jaxprt.files.objects.load` explains it."""
-    if not path.exists():
+    if not os.path.exists(path):  # unlike Path.exists, False for names that no file can have
         raise FileNotFoundError(f"{path}: there is no such folder")
     try:
         header = _header(path)

@@ -97,6 +97,28 @@ def read_block(reader: Any, rows: range, *, part: int = 0, channels: range, form
     return np.asarray(block).reshape(len(rows), spec.width, len(channels))
 
 
+def tile_size(spec: Any) -> tuple[int, int]:
+    """Height and width of the tiles of a file that OpenImageIO reads; 1 x 1 for scan lines."""
+    return (spec.tile_height, spec.tile_width) if spec.tile_width else (1, 1)
+
+
+def block_rows(spec: Any) -> int:
+    """Rows that `read_rows` reads at once: whole rows of tiles."""
+    height, _ = tile_size(spec)
+    step = max(1, _VALUES // (spec.width * spec.nchannels))
+    return -(-step // height) * height
+
+
+def block_bytes(spec: Any) -> int:
+    """Most bytes that `read_rows` needs besides the image: a block of rows in float32, and a tile.
+
+    Tiles may be larger than the image. The decoder unpacks whole ones, with a copy, and converts them to float32.
+    """
+    height, width = tile_size(spec)
+    block = min(block_rows(spec), spec.height) * spec.width
+    return spec.nchannels * (4 * block + (2 * spec.format.size() + 4) * height * width)
+
+
 def read_rows(reader: Any, image: np.ndarray) -> None:
     """Reads all rows of the first image of a file, block by block, into an array.
 
@@ -108,8 +130,7 @@ def read_rows(reader: Any, image: np.ndarray) -> None:
         ValueError: The file is damaged. The message is the decoder's.
     """
     spec = reader.spec()
-    step = max(1, _VALUES // (spec.width * spec.nchannels))
-    step = -(-step // max(1, spec.tile_height)) * max(1, spec.tile_height)
+    step = block_rows(spec)
     for first in range(0, spec.height, step):
         rows = range(first, min(first + step, spec.height))
         image[rows.start : rows.stop] = read_block(

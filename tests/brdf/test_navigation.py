@@ -689,5 +689,9 @@ def test_bad_tables_of_materials_are_refused(tmp_path, text, message):
 
 
 def test_a_missing_table_is_said_to_be_missing(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"there is no table of materials .*nowhere\.csv"):
+    with pytest.raises(
+        FileNotFoundError, match=r"nowhere\.csv must be a table of materials, and there is no such file"
+    ):
         cook_torrance(path=tmp_path / "nowhere.csv")
+    with pytest.raises(ValueError, match="must be the path of a table of materials, got one with File name too long"):
+        cook_torrance(path=tmp_path / ("a" * 300))

@@ -259,3 +259,11 @@ def read_free(path):
         with pytest.raises(MemoryError):
             read_image(path)
     return needed[-1]
+
+
+def test_rows_of_tall_tiles_count_before_they_are_read(tmp_path):
+    image = np.zeros((2048, 32, 3), np.float32)
+    write_tiles(tmp_path / "flat.exr", image, (8, 8))
+    write_tiles(tmp_path / "tall.exr", image, (8, 2048))
+    rows = image[256:].nbytes
+    assert rows < read_free(tmp_path / "tall.exr") - read_free(tmp_path / "flat.exr") < 2 * rows

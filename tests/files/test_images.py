@@ -1,5 +1,6 @@
 import os
 import pathlib
+import re
 import struct
 import zlib
 
@@ -253,3 +254,36 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
     for path in (tmp_path / "pipe.png", pathlib.Path("/dev/zero")):
         with pytest.raises(ValueError, match=f"{path.name} must be an image file, got a special file"):
             read_image(path)
+
+
+def write_tiff_of_tiles(path, side):
+    """A TIFF file of 16 x 16 pixels in a single tile whose sides the header states as `side`."""
+    spec = OpenImageIO.ImageSpec(16, 16, 3, "uint8")
+    spec.tile_width = spec.tile_height = 16
+    output = OpenImageIO.ImageOutput.create("tiff")
+    assert output is not None
+    assert output.open(str(path), spec)
+    assert output.write_image(np.zeros((16, 16, 3), np.float32))
+    assert output.close()
+    content = path.read_bytes()
+    for tag in (322, 323):  # TileWidth, TileLength
+        content, count = re.subn(
+            re.escape(struct.pack("<H", tag)) + b"[\3\4]" + re.escape(struct.pack("<BII", 0, 1, 16)),
+            lambda _, tag=tag: struct.pack("<HHII", tag, 4, 1, side),
+            content,
+        )
+        assert count == 1
+    path.write_bytes(content)
+
+
+def test_large_tiles_of_a_small_tiff_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    path = tmp_path / "tile.tif"
+    write_tiff_of_tiles(path, 16)
+    assert read_image(path)[0].shape == (16, 16, 3)
+    write_tiff_of_tiles(path, 32768)
+    with pytest.raises(ValueError, match="32768 x 32768"):
+        read_image(path)
+    write_tiff_of_tiles(path, 8192)
+    monkeypatch.setattr(require, "available_memory", lambda: 10**9)
+    with pytest.raises(MemoryError, match=r"tile\.tif: 16 x 16 pixels .* take 1\.2 GB"):
+        read_image(path)

@@ -265,6 +265,8 @@ def test_damage_is_found_and_told(tmp_path, scene):
         prt.files.load(path)
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
         prt.files.load(tmp_path / "missing")
+    with pytest.raises(FileNotFoundError, match="there is no such folder"):
+        prt.files.load(tmp_path / ("a" * 300))
     (tmp_path / "other").mkdir()
     with pytest.raises(ValueError, match="got another kind of folder"):
         prt.files.load(tmp_path / "other")

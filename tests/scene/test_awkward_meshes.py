@@ -140,8 +140,11 @@ def test_damaged_and_mislabeled_files_are_refused_by_name(tmp_path, ball, suffix
 
 
 def test_a_missing_file_and_an_unknown_kind_are_told_apart(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"there is no mesh file .*absent\.ply"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.ply must be a mesh file, and there is no such file"):
         load_mesh(tmp_path / "absent.ply")
+    for suffix in (".ply", ".obj", ".glb"):
+        with pytest.raises(ValueError, match=r"a' must be the path of a .* file, got one with File name too long"):
+            load_mesh(tmp_path / ("a" * 300 + suffix))
     with pytest.raises(ValueError, match=r"hat\.blend must end in one of \.ply, \.obj, .*, got '\.blend'"):
         load_mesh(tmp_path / "hat.blend")
 

@@ -130,7 +130,7 @@ def test_files_without_materials_are_one_matte_gray_part(tmp_path, suffix):
     (part,) = load_scene(tmp_path / f"ball.{suffix}").parts
     assert part.name == "ball"
     assert (float(part.material.metallic), part.material.base_color.tolist()) == (0, [0.5] * 3)
-    with pytest.raises(FileNotFoundError, match="there is no mesh file"):
+    with pytest.raises(FileNotFoundError, match="must be a mesh file, and there is no such file"):
         load_scene(tmp_path / f"absent.{suffix}")
     with pytest.raises(ValueError, match=r"must end in one of .*, got '\.blend'"):
         load_scene(tmp_path / "hat.blend")

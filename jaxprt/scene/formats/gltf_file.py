@@ -140,9 +140,16 @@ class Document(Header):
 
     @functools.cached_property
     def _size(self) -> int:
-        """Bytes of the file and of the files of its buffers."""
-        separate = [number for number, item in enumerate(self.items("buffers")) if "uri" in item]
-        return self._length + sum(len(self._bytes(number)) for number in separate)
+        """Bytes of the file and of the files of its buffers, which are not read. Missing ones count as empty."""
+        sizes: dict[pathlib.Path, int] = {}
+        for number, item in enumerate(self.items("buffers")):
+            uri = item.get("uri")
+            if isinstance(uri, str) and uri and not _is_embedded(uri):
+                with contextlib.suppress(OSError, ValueError):  # raised where the buffer is used
+                    path = self._file(uri, f"buffer {number}")
+                    inputs.check(path, "a buffer")
+                    sizes[path] = path.stat().st_size
+        return self._length + sum(sizes.values())
 
     def _chunks(self, content: bytes) -> tuple[bytes, bytes | None]:
         """The header and the binary chunk of a GLB (section 4)."""
@@ -194,19 +201,22 @@ class Document(Header):
         """The data of a URI: embedded in it, or in a file relative to the glTF file."""
         if not isinstance(uri, str) or not uri:
             raise self.error(f"must name a file or hold data in {owner}", excerpt(uri))
-        if uri[:5].lower() == "data:":
+        if _is_embedded(uri):
             kind, _, data = uri.partition(",")
             plain = urllib.parse.unquote_to_bytes(data)
             try:
                 return base64.b64decode(plain, validate=True) if kind.lower().endswith(";base64") else plain
             except ValueError as error:
                 raise self.error(f"must have undamaged base64 data in {owner}", str(error)) from error
+        return inputs.content(self._file(uri, owner), f"the file that {self.path} needs for {owner}")
+
+    def _file(self, uri: str, owner: str) -> pathlib.Path:
+        """The path of the file that a URI names."""
         if _SCHEME.match(uri):
             raise self.error(f"must name a file beside it in {owner}", excerpt(uri))
         name, folder = urllib.parse.unquote(uri), self.path.parent
         owner_name = f"{self.path}, {owner}"
-        path = inputs.reference(name, folder, folder=folder, owner=owner_name, outside=self._outside)
-        return inputs.content(path, f"the file that {self.path} needs for {owner}")
+        return inputs.reference(name, folder, folder=folder, owner=owner_name, outside=self._outside)
 
     def _strided(self, item: dict[str, Any], name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
         """The elements of a buffer view, without a copy."""
@@ -233,6 +243,11 @@ class Document(Header):
             raise self.error(f"must replace elements 0 to {len(value) - 1} in {name}", f"element {place.max()}")
         order = np.argsort(place, kind="stable")
         return place[order], self._strided(values, name, value.dtype, (count, value.shape[1]))[order]
+
+
+def _is_embedded(uri: str) -> bool:
+    """Whether a URI holds the data itself."""
+    return uri[:5].lower() == "data:"
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from jaxprt.scene.formats import gltf_skin
 from jaxprt.scene.formats.geometry import Geometry, instances, joined
 from jaxprt.scene.formats.gltf_extensions import DRACO, check_required
 from jaxprt.scene.formats.gltf_file import Document, Elements
-from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joints, nodes
+from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -101,9 +101,12 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     mesh_of = [document.index("meshes", node.item["mesh"], f"node {node.number}") for node in drawn]
     skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
     primitives = {mesh: _primitives(document, mesh, mesh in skinned, ignored) for mesh in dict.fromkeys(mesh_of)}
+    # Meshes without triangles have no instances: these would take memory that `_check_memory` does not count.
+    drawn = [node for node, mesh in zip(drawn, mesh_of, strict=True) if primitives[mesh]]
+    mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
     _check_memory(document, drawn, mesh_of, primitives)
     parts, labels = [], []
-    for node, primitive, geometry in _placements(document, scene, mesh_of, primitives, ignored):
+    for node, primitive, geometry in _placements(document, scene, drawn, mesh_of, primitives):
         parts.append(geometry)
         labels.append(node.number if groups else primitive.material)
     if not parts:
@@ -218,22 +221,21 @@ def _check_memory(
 def _placements(
     document: Document,
     scene: Sequence[Node],
+    drawn: Sequence[Node],
     mesh_of: Sequence[int],
     primitives: dict[int, list[Primitive]],
-    ignored: set[str],
 ) -> Iterator[tuple[Node, Primitive, Geometry]]:
     """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once."""
-    drawn = [node for node in scene if "mesh" in node.item]
     matrices = [instance_matrices(document, node) for node in drawn]
     together: dict[int, list[np.ndarray]] = {}
     for mesh, matrix in zip(mesh_of, matrices, strict=True):
         together.setdefault(mesh, []).append(matrix)
     bound, placed = {}, {}
-    for mesh, listed in primitives.items():
-        pairs = [_geometry(document, primitive) for primitive in listed]
+    for mesh, transforms in together.items():
+        pairs = [_geometry(document, primitive) for primitive in primitives[mesh]]
         bound[mesh] = pairs
-        placed[mesh] = [iter(instances(geometry, np.concatenate(together[mesh]))) for geometry, _ in pairs]
-    skins = _joint_matrices(document, scene, mesh_of, primitives)
+        placed[mesh] = [iter(instances(geometry, np.concatenate(transforms))) for geometry, _ in pairs]
+    skins = _joint_matrices(document, scene, drawn, mesh_of, primitives)
     for node, mesh, matrix in zip(drawn, mesh_of, matrices, strict=True):
         skin = skins.get(node.number)
         for _ in matrix:
@@ -246,10 +248,13 @@ def _placements(
 
 
 def _joint_matrices(
-    document: Document, scene: Sequence[Node], mesh_of: Sequence[int], primitives: dict[int, list[Primitive]]
+    document: Document,
+    scene: Sequence[Node],
+    drawn: Sequence[Node],
+    mesh_of: Sequence[int],
+    primitives: dict[int, list[Primitive]],
 ) -> dict[int, np.ndarray]:
     """Transforms of the joints of all nodes that draw a mesh with a skin, by the index of the node."""
-    drawn = (node for node in scene if "mesh" in node.item)
     skin = {
         node.number: document.index("skins", node.item["skin"], f"node {node.number}")
         for node, mesh in zip(drawn, mesh_of, strict=True)
@@ -257,7 +262,8 @@ def _joint_matrices(
     }
     if not skin:
         return {}
-    world = joints(document, scene)
+    named = [joint for number in set(skin.values()) for joint in gltf_skin.joints(document, number)]
+    world = joint_transforms(document, scene, named)
     matrices = {number: gltf_skin.joint_matrices(document, number, world) for number in set(skin.values())}
     return {node: matrices[number] for node, number in skin.items()}
 

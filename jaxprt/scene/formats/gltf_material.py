@@ -11,6 +11,7 @@ import numpy as np
 from jaxprt.files import images
 from jaxprt.scene.formats.gltf_file import Document
 from jaxprt.scene.formats.gltf_header import excerpt
+from jaxprt.scene.formats.texture_images import stored
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
@@ -19,7 +20,7 @@ _SHOWN = 80  # characters of a URI in warnings
 
 
 class MaterialReader:
-    """Reads the materials of a file. Shared textures are decoded and stored only once.
+    """Reads the materials of a file. Shared textures are stored only once.
 
     Attributes:
         ignored: Names of unsupported features of the materials that have been read, and of images that cannot be read.
@@ -28,7 +29,8 @@ class MaterialReader:
     def __init__(self, document: Document):
         self.ignored: set[str] = set()
         self._document = document
-        self._image: dict[tuple[int, bool], np.ndarray | None] = {}
+        self._decoded: tuple[tuple[int, bool], np.ndarray] | None = None  # the last image, for its other channels
+        self._damaged: set[tuple[int, bool]] = set()
         self._channels: dict[tuple[int, bool, tuple[int, ...]], jax.Array] = {}
 
     def material(self, index: int | None) -> TexturedMaterial:
@@ -126,24 +128,31 @@ class MaterialReader:
         index = self._document.index("images", source, owner)
         key = (index, decoded, channels)
         if key not in self._channels:
-            if key[:2] not in self._image:
-                self._image[key[:2]] = self._decode(index, owner, decoded)
-            image = self._image[key[:2]]
+            image = self._decode(index, owner, decoded)
             if image is None:
                 return None
-            self._channels[key] = jax.device_put(np.ascontiguousarray(image[..., channels]))
+            self._channels[key] = stored(image, channels, f"image {index}")
         return self._channels[key]
 
     def _decode(self, index: int, owner: str, decoded: bool) -> np.ndarray | None:
-        """The pixels of an image with four channels; None, with a record of the reason, if it cannot be decoded."""
+        """The pixels of an image; None, with a record of the reason, if it cannot be decoded."""
+        key = index, decoded
+        if self._decoded is not None and self._decoded[0] == key:
+            return self._decoded[1]
+        if key in self._damaged:
+            return None
+        self._decoded = None
         content = self._document.image(index, owner)
         item = self._document.items("images")[index]
         name = f"image {index}" if "bufferView" in item else f"image {index}, {item['uri'][:_SHOWN]}"
         try:
-            return colored(images.decode_image(content, name=name, decoded=decoded))
+            image = images.decode_image(content, name=name, decoded=decoded)
         except ValueError as error:
             self.ignored.add(f"textures that cannot be read ({error})")
+            self._damaged.add(key)
             return None
+        self._decoded = key, image
+        return image
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
         """The affine transform of KHR_texture_transform, for texture coordinates with v up.
@@ -161,11 +170,3 @@ class MaterialReader:
         flip = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
         with np.errstate(over="ignore"):  # textures refuse transforms that are not finite
             return (flip @ matrix @ flip)[:2].astype(np.float32)
-
-
-def colored(image: np.ndarray) -> np.ndarray:
-    """Converts an image with 1 (gray), 2 (gray, alpha), 3 or 4 channels to four channels."""
-    gray = image.shape[-1] < 3
-    colors = np.broadcast_to(image[..., :1], (*image.shape[:2], 3)) if gray else image[..., :3]
-    alpha = image[..., -1:] if image.shape[-1] % 2 == 0 else np.ones_like(image[..., :1])
-    return np.concatenate([colors, alpha], -1)

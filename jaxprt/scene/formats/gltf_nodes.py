@@ -3,7 +3,8 @@
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,10 +43,53 @@ def nodes(document: Document) -> list[Node]:
     return _tree_nodes(document, _roots(document), "the file")
 
 
-def joints(document: Document, scene: Sequence[Node]) -> dict[int, np.ndarray]:
-    """World transforms of all nodes that a skin may name: those of the scene, and else those of the whole file."""
-    matrices = {node.number: node.matrix for node in _tree_nodes(document, _roots(document), "the file")}
-    return matrices | {node.number: node.matrix for node in scene}
+def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable[int]) -> dict[int, np.ndarray]:
+    """World transforms of the nodes of the scene, and of joints outside of it. Joints in a circle of nodes have none.
+
+    Of the nodes outside of the scene, only the joints and their ancestors are read. The others may be damaged.
+
+    Args:
+        document: The file.
+        scene: The nodes of the default scene.
+        joints: Indices of the joints.
+
+    Raises:
+        ValueError: A joint or its ancestor has several parents, or a transform that is not finite.
+    """
+    matrices = {node.number: node.matrix for node in scene}
+    outside = [joint for joint in dict.fromkeys(joints) if joint not in matrices]
+    parents = _parents(document) if outside else {}
+    place: dict[int, int] = {}  # in the order of `above` and `level`
+    above: list[int] = []
+    level: list[int] = []
+    for joint in outside:
+        way: dict[int, None] = {}  # from the joint up
+        node: int | None = joint
+        while node is not None and node not in place and node not in way:
+            way[node] = None
+            owners = parents.get(node, [])
+            if len(owners) > 1:
+                got = f"node {node} twice, the second time in node {owners[1]}"
+                raise document.error("must have nodes that form trees", got)
+            node = owners[0] if owners else None
+        if node in way:
+            break  # a circle
+        for child in reversed(way):
+            above.append(-1 if node is None else place[node])
+            level.append(0 if node is None else level[place[node]] + 1)
+            place[child], node = len(place), child
+    return matrices | {node.number: node.matrix for node in _placed(document, list(place), above, level)}
+
+
+def _parents(document: Document) -> dict[int, list[int]]:
+    """The parents of all nodes. What is no index of a node is left out."""
+    parents: dict[int, list[int]] = {}
+    for number, item in enumerate(document.items("nodes")):
+        children = item.get("children")
+        for child in children if isinstance(children, list) else []:
+            with contextlib.suppress(ValueError):
+                parents.setdefault(document.index("nodes", child, f"node {number}"), []).append(number)
+    return parents
 
 
 def instance_count(document: Document, node: Node) -> int:
@@ -147,8 +191,21 @@ def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
         order.append(index)
         parent.append(above)
         level.append(level[above] + 1 if above >= 0 else 0)
+    return _placed(document, order, parent, level)
+
+
+def _placed(document: Document, order: list[int], parent: list[int], level: list[int]) -> list[Node]:
+    """Nodes with their transforms to world coordinates.
+
+    Args:
+        document: The file.
+        order: Indices of the nodes, parents before their children.
+        parent: Place of each node's parent in `order`; -1 for roots.
+        level: Number of ancestors of each node.
+    """
     if not order:
         return []
+    items = document.items("nodes")
     matrix = _transforms(document, order)
     above, by_level = np.array(parent), np.argsort(level, kind="stable")
     with np.errstate(over="ignore", invalid="ignore"):  # reported below

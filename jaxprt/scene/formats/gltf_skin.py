@@ -53,6 +53,19 @@ def binding(
     return Binding(joint, np.where(total > 0, weight / np.where(total > 0, total, 1), first))
 
 
+def joints(document: Document, skin: int) -> list[int]:
+    """Indices of the nodes that are the joints of a skin.
+
+    Raises:
+        ValueError: A joint is missing, or there are none.
+    """
+    item, owner = document.items("skins")[skin], f"skin {skin}"
+    named = [document.index("nodes", joint, owner) for joint in document.array(item, "joints", owner)]
+    if not named:
+        raise document.error(f"must have one or more joints in {owner}", "none")
+    return named
+
+
 def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
     """Transforms from the space of a mesh to world coordinates, one for each joint of a skin [j 4 4] (section 3.7.3).
 
@@ -64,21 +77,18 @@ def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) 
     Raises:
         ValueError: A joint is missing, or there are fewer inverse bind matrices than joints.
     """
-    item, owner = document.items("skins")[skin], f"skin {skin}"
-    joints = [document.index("nodes", joint, owner) for joint in document.array(item, "joints", owner)]
-    if not joints:
-        raise document.error(f"must have one or more joints in {owner}", "none")
-    for joint in joints:
+    item, owner, named = document.items("skins")[skin], f"skin {skin}", joints(document, skin)
+    for joint in named:
         if joint not in world:
             raise document.error(f"must have joints of {owner} that belong to trees of nodes", f"node {joint}")
-    matrix = np.array([world[joint] for joint in joints])
+    matrix = np.array([world[joint] for joint in named])
     if "inverseBindMatrices" not in item:
         return matrix
     inverse = document.accessor(item["inverseBindMatrices"], f"inverseBindMatrices of {owner}", 16)
-    if len(inverse.value) < len(joints):
-        must = f"must have an inverse bind matrix for each of the {len(joints)} joints of {owner}"
+    if len(inverse.value) < len(named):
+        must = f"must have an inverse bind matrix for each of the {len(named)} joints of {owner}"
         raise document.error(must, str(len(inverse.value)))
-    columns = inverse.numbers(slice(len(joints))).reshape(-1, 4, 4)
+    columns = inverse.numbers(slice(len(named))).reshape(-1, 4, 4)
     if not np.isfinite(columns).all():
         raise document.error(f"must have finite inverse bind matrices in {owner}", "others")
     with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite

@@ -3,11 +3,11 @@
 import pathlib
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.files import images, inputs
+from jaxprt.files import inputs
 from jaxprt.scene.formats.geometry import Geometry, MeshContent
+from jaxprt.scene.formats.texture_images import TextureImages
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _GRAY = 0.5  # base color of surfaces without material and color
@@ -33,16 +33,15 @@ def of_images(
     Raises:
         ValueError: An image is outside of the folder.
     """
-    materials, ignored = [], set(content.ignored)
+    materials, ignored, pictures = [], set(content.ignored), TextureImages()
     for name in content.images:
         material = plain
         if name is not None:
             owner = f"{path}, TextureFile"
             file = inputs.reference(name, path.parent, folder=path.parent, owner=owner, outside=outside)
             try:
-                image = images.decode_image(inputs.content(file, "an image file"), name=str(file))
-                image = image[..., (0, 1, 2) if image.shape[-1] >= 3 else (0, 0, 0)]
-                texture = Texture(jnp.asarray(image), np.eye(2, 3, dtype=np.float32))
+                image = pictures.read(file, (0, 1, 2), decoded=True)
+                texture = Texture(image, np.eye(2, 3, dtype=np.float32))
                 material = TexturedMaterial(base_color=1.0, metallic=0.0, specular=0.0, base_color_texture=texture)
             except FileNotFoundError:
                 ignored.add(f"TextureFile ({file}, which does not exist)")

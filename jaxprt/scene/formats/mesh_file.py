@@ -16,8 +16,6 @@ def check(path: pathlib.Path) -> None:
     """Refuses files of other formats and files that do not exist."""
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {path.suffix.lower()!r}")
-    if not path.exists():
-        raise FileNotFoundError(f"there is no mesh file {path}")
     inputs.check(path, "a mesh file")
 
 

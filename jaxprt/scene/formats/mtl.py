@@ -8,12 +8,12 @@ import warnings
 from collections.abc import Callable, Collection
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxprt.files import images, inputs
+from jaxprt.files import inputs
 from jaxprt.scene.formats import obj, text
 from jaxprt.scene.formats.obj import statement
+from jaxprt.scene.formats.texture_images import TextureImages
 from jaxprt.scene.material import Texture, TexturedMaterial
 
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
@@ -40,7 +40,7 @@ def of_regions(
     """Names and materials of the regions of an OBJ file, in the order of their first faces.
 
     A single warning names everything that is missing (MTL files, materials, images) or not supported. Missing materials
-    are replaced by `plain`.
+    are replaced by `plain`. Materials that no face has are not read. Textures of one image share it.
 
     Args:
         path: The OBJ file.
@@ -55,17 +55,21 @@ def of_regions(
     materials: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
     first = text.name(source.partition(b"\n")[0])
+    pictures = TextureImages()
+    read_already: set[pathlib.Path] = set()
     refer = functools.partial(inputs.reference, folder=path.parent, outside=outside)
     for file in files:
         named = refer(file, path.parent, owner=f"{path}, mtllib")
         words = file.split() if _absence(named) else []
         for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [named]:
             absence = _absence(library)
-            if not absence:
-                material, more = read(library, blender=_exponent(first), refer=refer)
-                materials, ignored = material | materials, ignored | more
-            else:
+            if absence:
                 ignored.add(f"mtllib ({library}, {absence})")
+            elif (target := library.resolve()) not in read_already:
+                read_already.add(target)
+                wanted = {label or "" for label in order} - materials.keys()
+                material, more = read(library, wanted, blender=_exponent(first), refer=refer, pictures=pictures)
+                materials, ignored = material | materials, ignored | more
     ignored |= {f"usemtl {label} (no such material)" for label in order if label is not None and label not in materials}
     if ignored:
         warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
@@ -84,9 +88,14 @@ def _exponent(line: str) -> float | None:
 
 
 def read(
-    path: pathlib.Path, *, blender: float | None = None, refer: Callable[..., pathlib.Path]
+    path: pathlib.Path,
+    wanted: Collection[str],
+    *,
+    blender: float | None = None,
+    refer: Callable[..., pathlib.Path],
+    pictures: TextureImages,
 ) -> tuple[dict[str, TexturedMaterial], set[str]]:
-    """Reads the materials of an MTL file.
+    """Reads some materials of an MTL file.
 
     Kd is the base color, multiplied by map_Kd. If there is Pr or Pm (roughness and metalness), these and Ni determine
     the rest. Otherwise the material is a Phong material, which is converted to a dielectric. Its reflectance at normal
@@ -100,9 +109,11 @@ def read(
 
     Args:
         path: The file.
+        wanted: Names of the materials that are read, if the file has them.
         blender: Exponent that Blender writes for a roughness of 0, if the first line of the OBJ file names Blender;
             None for files of other programs.
         refer: `inputs.reference` with the folder in which images must be.
+        pictures: Reads the images.
 
     Returns:
         Materials by name; and names of unsupported statements and of missing or damaged images.
@@ -110,21 +121,21 @@ def read(
     Raises:
         ValueError: A number is damaged or out of range, or an image is outside of the folder. The message states where.
     """
-    material: dict[str, TexturedMaterial] = {}
     ignored: set[str] = set()
+    named: dict[str, dict[str, list[str]]] = {}
     statements: dict[str, list[str]] = {}
-    name = None
     lines = [text.name(line) for line in text.read(path, "an MTL file").split(b"\n")]
     if not lines or not lines[0].startswith("# Blender"):
         blender = None
-    for line in [*lines, "newmtl"]:
+    for line in lines:
         key, *rest = statement(line).split() or [""]
         if key == "newmtl":
-            if name is not None:
-                material[name] = _material(statements, path, name, ignored, blender, refer)
-            name, statements = " ".join(rest), {}
+            named[" ".join(rest)] = statements = {}
         elif key:
             statements[key] = rest if key in _MAPS else " ".join(rest).partition("#")[0].split()
+    material = {
+        name: _material(named[name], path, name, ignored, blender, refer, pictures) for name in named if name in wanted
+    }
     return material, ignored
 
 
@@ -135,6 +146,7 @@ def _material(
     ignored: set[str],
     blender: float | None,
     refer: Callable[..., pathlib.Path],
+    pictures: TextureImages,
 ) -> TexturedMaterial:
     """The material from the statements after one newmtl."""
     if blender is not None:
@@ -151,7 +163,7 @@ def _material(
             options, words = _options(words)
             owner = f"{path}, {key} of material {name!r}"
             file = refer(" ".join(words), path.parent, owner=owner)
-            _add_map(field, key, options, file, ignored)
+            _add_map(field, key, options, file, owner, ignored, pictures)
         elif key in _OPAQUE and _number(statements, key, path, name) == _OPAQUE[key]:
             continue
         elif key not in value and key not in _SILENT:
@@ -194,7 +206,8 @@ def _principled(value: dict[str, Any], given: Collection[str], exponent: float) 
 def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
     """Makes the material. Errors name the file and the material."""
     try:
-        return TexturedMaterial(**field)
+        with np.errstate(over="ignore"):  # materials refuse what is not finite
+            return TexturedMaterial(**field)
     except ValueError as error:
         raise ValueError(f"{path}, material {name!r}: {error}") from error
 
@@ -202,6 +215,8 @@ def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMa
 def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name: str) -> Any:
     """The number or color of a statement. A single number stands for a gray."""
     words = statements[key]
+    if key == "d" and words[:1] == ["-halo"]:
+        words = words[1:]
     try:
         if not words or words[0] in ("spectral", "xyz"):
             raise ValueError
@@ -217,7 +232,13 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
 
 
 def _add_map(
-    field: dict[str, Any], key: str, options: dict[str, list[str]], file: pathlib.Path, ignored: set[str]
+    field: dict[str, Any],
+    key: str,
+    options: dict[str, list[str]],
+    file: pathlib.Path,
+    owner: str,
+    ignored: set[str],
+    pictures: TextureImages,
 ) -> None:
     """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`."""
     name, channels, decoded = _MAPS[key]
@@ -225,7 +246,7 @@ def _add_map(
         absence = _absence(file)
         if absence:
             raise ValueError(f"{file}, {absence}")
-        image = images.decode_image(inputs.content(file, "an image"), name=str(file), decoded=decoded)
+        image = pictures.read(file, channels, decoded=decoded)
     except ValueError as error:
         ignored.add(f"{key} ({error})")
         return
@@ -235,12 +256,14 @@ def _add_map(
         honored |= {"-bm"}
         field["normal_scale"] = float(strength[0])
     ignored |= {f"option {each} of maps" for each in options.keys() - honored}
-    if image.shape[-1] < 3:
-        channels = (0,) * len(channels)
     scale, offset = (_pair(options.get(each, []), plain) for each, plain in (("-s", 1.0), ("-o", 0.0)))
     wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
-    transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]], np.float32)
-    field[name] = Texture(jnp.asarray(image[..., channels]), transform, 0, (wrap, wrap))
+    with np.errstate(over="ignore"):  # textures refuse what is not finite
+        transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]]).astype(np.float32)
+    try:
+        field[name] = Texture(image, transform, 0, (wrap, wrap))
+    except ValueError as error:
+        raise ValueError(f"{owner}: {error}") from error
 
 
 def _absence(path: pathlib.Path) -> str:

@@ -17,6 +17,7 @@ _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Ble
 _NAMING = re.compile(rb"^[^\S\n]*(usemtl|mtllib)(?!\S)([^\n]*)", re.MULTILINE)
 _FACE = re.compile(rb"^[^\S\n]*f\s", re.MULTILINE)
 _COMMENT_PATH = re.compile(rb"^[^\S\n]*#[^\n]*\\$", re.MULTILINE)
+_WHOLE = re.compile(rb"[+-]?\d{1,40}")  # of words with more digits, Python would refuse some
 _CONTINUED = b" \v"  # replaces the line end after a backslash; \v is white space, and counts such lines for messages
 _BLOCK = 1 << 16  # lines whose words are in memory at once
 _LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # fewest numbers of a statement
@@ -161,12 +162,12 @@ def _numbers(tails: list[bytes], kind: bytes, places: list[int], source: _Source
     try:
         short = np.flatnonzero(words.per_row < _LEAST[kind])
         if short.size:
-            raise ValueError(short[0])
+            raise text.RowError(int(short[0]))
         number = text.numbers(words)
-    except ValueError as error:
+    except text.RowError as error:
         raise ValueError(
             f"{source.path} must be an undamaged OBJ file, in which {kind.decode()} has {_LEAST[kind]} or more "
-            f"numbers, got {source.place(places[int(error.args[0])])}"
+            f"numbers, got {source.place(places[error.row])}"
         ) from None
     width = min(words.per_row.max(), _MOST)
     value = np.full((len(tails), width), np.nan)
@@ -197,7 +198,7 @@ def _indices(tails: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
         if (separate.per_row == columns * words.per_row).all():
             try:
                 index[:, :columns] = text.numbers(separate, kind=int).reshape(-1, columns)
-            except ValueError:
+            except text.RowError:
                 pass
             else:
                 return index, words.per_row
@@ -205,16 +206,18 @@ def _indices(tails: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _corner(word: bytes) -> list[int]:
-    """The indices of a corner."""
-    return [_whole(number) if number else _NONE for number in [*word.split(b"/"), b"", b""][:3]]
+    """The indices of a corner; `_WRONG` if there are more than three."""
+    numbers = word.split(b"/")
+    if len(numbers) > 3:
+        return [_WRONG] * 3
+    return [_whole(number) if number else _NONE for number in [*numbers, b"", b""][:3]]
 
 
 def _whole(word: bytes) -> int:
     """An index; `_WRONG` if it is not a whole number that a file could count."""
-    try:
-        return number if abs(number := int(word)) < -_WRONG else _WRONG
-    except ValueError:
+    if not _WHOLE.fullmatch(word):  # Python would take "1_0" too
         return _WRONG
+    return number if abs(number := int(word)) < -_WRONG else _WRONG
 
 
 def _sound(faces: _Faces, rows: list[_Rows], source: _Source) -> _Faces:
@@ -261,7 +264,7 @@ def _geometry(rows: list[_Rows], faces: _Faces, source: _Source) -> Geometry:
     """The triangles. Vertices are split where corners differ in region, texture coordinates or normal."""
     vertex, place, direction = (row.value for row in rows)
     index = faces.corner
-    triangle = polygons.triangulate(vertex[:, :3], polygons.Polygons(index[:, 0], faces.size))
+    triangle = polygons.triangulate(vertex[:, :3], polygons.Polygons(index[:, 0], faces.size), str(source.path))
     region = np.repeat(faces.region, faces.size)
     columns = [column for column in (region, *index.T) if column.any()]
     first, corner = split_corners(columns or [index[:, 0]])

@@ -54,12 +54,12 @@ def _content(content: bytes, path: pathlib.Path) -> MeshContent:
     if not parts or max(part[1].max() for part in parts) < 3:
         raise ValueError(f"{path} must hold vertices and faces, got no faces")
     corner, count, rest, rest_count = map(np.concatenate, zip(*parts, strict=True))
-    shape = Polygons(text.whole(corner), count)
+    shape = Polygons(text.whole_lists(corner, count, "face"), count)
     polygons.check(shape, vertices, str(path))
     if of_vertex.get("color") is None and (rest_count == 1).any():
         ignored.add("indices of colors of faces")
     of_face = {} if "color" in of_vertex else {"color": _color(rest, rest_count, 3)}
-    return MeshContent(polygons.geometry(position, shape, of_vertex, {}, of_face), [None], ignored)
+    return MeshContent(polygons.geometry(position, shape, of_vertex, {}, of_face, str(path)), [None], ignored)
 
 
 def _vertices(

@@ -5,15 +5,17 @@ import re
 
 import numpy as np
 
+from jaxprt import require
 from jaxprt.files import inputs
 from jaxprt.scene.formats import colors, polygons, text
 from jaxprt.scene.formats.geometry import MeshContent, first_appearance
-from jaxprt.scene.formats.ply_table import Columns, Lists, read_elements, read_header
+from jaxprt.scene.formats.ply_table import Columns, Lists, memory, read_elements, read_header
 from jaxprt.scene.formats.polygons import Polygons
 
 _UTF8_MARK = b"\xef\xbb\xbf"
 _CORNERS = ("vertex_indices", "vertex_index")
 _STRIPS = ("tristrips", "tristrip")
+_WEDGES = "texcoord"
 _TEXTURE = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _ALPHA = ("alpha", "diffuse_alpha", "a")
@@ -36,19 +38,23 @@ def read(path: pathlib.Path) -> MeshContent:
     content = inputs.content(path, "a mesh file").removeprefix(_UTF8_MARK)
     try:
         header = read_header(content)
-        table = read_elements(content, header, {"vertex", "face", *_STRIPS})
+        advice = "free some memory, or write the file in parts"
+        require.memory(f"the elements of {path}", memory(header, len(content)), advice)
+        table = read_elements(content, header, {"vertex", "face", *_STRIPS}, {*_CORNERS, _WEDGES})
         vertex, face = table.get("vertex", {}), table.get("face", {})
         if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
             raise ValueError("its vertices must have the properties x, y and z")
         faces, corners = _faces(face, table)
+        position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
+        if not faces.size.size or faces.size.max() < 3:
+            raise ValueError(f"{path} must hold vertices and faces, got no faces")
+        polygons.check(faces, len(position), str(path))
+        images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
+        return _content(position, vertex, face, faces, corners, images, str(path))
     except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
         raise text.unreadable(path, "PLY", error) from error
-    position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
-    if not faces.size.size or faces.size.max() < 3:
-        raise ValueError(f"{path} must hold vertices and faces, got no faces")
-    polygons.check(faces, len(position), str(path))
-    images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
-    return _content(position, vertex, face, faces, corners, images)
 
 
 def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
@@ -56,7 +62,7 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
     parts = []
     lists = [column for name in _CORNERS if isinstance(column := face.get(name), Lists)]
     if lists:
-        parts.append(Polygons(text.whole(lists[0].value), lists[0].length))
+        parts.append(Polygons(text.whole_lists(*lists[0], "face"), lists[0].length))
     elif any(len(column.length if isinstance(column, Lists) else column) for column in face.values()):
         raise ValueError(f"its faces must have a list of the name {' or '.join(_CORNERS)}")
     corners = sum(len(part.corner) for part in parts)
@@ -64,15 +70,21 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
         for name in _CORNERS:
             strips = table.get(element, {}).get(name)
             if isinstance(strips, Lists):
-                parts.append(polygons.of_rows(_strip_triangles(strips)))
+                vertex = text.whole_lists(*strips, element)
+                parts.append(polygons.of_rows(_strip_triangles(vertex, strips.length)))
     if not parts:
         return Polygons(np.zeros(0, np.int64), np.zeros(0, np.int64)), 0
     return Polygons(*map(np.concatenate, zip(*parts, strict=True))), corners
 
 
-def _strip_triangles(strips: Lists) -> np.ndarray:
-    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed."""
-    vertex = np.insert(text.whole(strips.value), np.cumsum(strips.length)[:-1], -1)
+def _strip_triangles(vertex: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed.
+
+    Args:
+        vertex: Vertex indices of all strips, one strip after the other.
+        length: Number of indices of each strip.
+    """
+    vertex = np.insert(vertex, np.cumsum(length)[:-1], -1)
     place = np.arange(len(vertex))
     start = np.maximum.accumulate(np.where(vertex < 0, place + 1, 0))
     window = np.lib.stride_tricks.sliding_window_view(vertex, 3) if len(vertex) >= 3 else np.zeros((0, 3), np.int64)
@@ -83,7 +95,7 @@ def _strip_triangles(strips: Lists) -> np.ndarray:
 
 
 def _content(
-    position: np.ndarray, vertex: Columns, face: Columns, faces: Polygons, corners: int, images: list[str]
+    position: np.ndarray, vertex: Columns, face: Columns, faces: Polygons, corners: int, images: list[str], name: str
 ) -> MeshContent:
     """The geometry, images and what is ignored.
 
@@ -94,6 +106,7 @@ def _content(
         faces: All faces, those of strips last.
         corners: Number of corners of faces that are not of strips.
         images: Names of the image files.
+        name: Name of the file.
     """
     of_vertex = {"normal": _columns(vertex, ("nx", "ny", "nz"))}
     of_vertex["texture"] = next((value for names in _TEXTURE if (value := _columns(vertex, names)) is not None), None)
@@ -108,14 +121,16 @@ def _content(
     regions: list[str | None] = [None]
     if images and not textured:
         ignored |= {f"TextureFile {image} (there are no texture coordinates)" for image in images}
-    elif images and isinstance(number, np.ndarray):
-        number, of_face["region"] = first_appearance(number)
-        regions = [images[int(index)] if 0 <= index < len(images) else None for index in number]
+    elif images and isinstance(number, np.ndarray) and (drawn := faces.size[: len(number)] > 2).any():
+        labels, region = first_appearance(number[drawn])
+        of_face["region"] = np.zeros(len(number), int)
+        of_face["region"][drawn] = region
+        regions = [images[int(label)] if 0 <= label < len(images) else None for label in labels]
     elif images:
         regions = [images[0]]
         ignored |= {f"TextureFile {image} (no face has its texnumber)" for image in images[1:]}
-    rows = {name: _padded(value, len(faces.size)) for name, value in of_face.items()}
-    return MeshContent(polygons.geometry(position, faces, of_vertex, of_corner, rows), regions, ignored)
+    rows = {key: _padded(value, len(faces.size)) for key, value in of_face.items()}
+    return MeshContent(polygons.geometry(position, faces, of_vertex, of_corner, rows, name), regions, ignored)
 
 
 def _columns(table: Columns, names: tuple[str, ...]) -> np.ndarray | None:
@@ -136,7 +151,7 @@ def _color(table: Columns) -> tuple[np.ndarray | None, set[str]]:
 
 def _wedges(face: Columns, faces: Polygons, corners: int) -> np.ndarray | None:
     """Texture coordinates of the corners of faces, as MeshLab writes them; 0 where a face has none."""
-    wedge = face.get("texcoord")
+    wedge = face.get(_WEDGES)
     if not isinstance(wedge, Lists) or not len(wedge.value):
         return None
     count = faces.size[: len(wedge.length)]

@@ -1,5 +1,6 @@
 """Elements of PLY files: the header, and tables in text or in bytes."""
 
+import collections
 import re
 import struct
 from collections.abc import Iterator
@@ -31,7 +32,7 @@ _TYPES = {
 }
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # of struct
-_BLOCK = 1 << 16  # rows with lists that are read at once
+_BLOCK, _BYTES = 1 << 16, 1 << 24  # most rows with lists, and bytes of them, that are read at once
 
 
 class Lists(NamedTuple):
@@ -126,9 +127,11 @@ def _property(words: list[str], order: str) -> Property:
 
 def _check_counts(header: Header, size: int) -> None:
     """Refuses headers that count more rows than the file can hold, before memory is allocated for them."""
-    for index, element in enumerate(header.elements):
-        if element.rows < 0 or any(element.name == other.name for other in header.elements[:index]):
+    names: set[str] = set()
+    for element in header.elements:
+        if element.rows < 0 or element.name in names:
             raise ValueError(f"its header must have one element {element.name!r} with 0 or more rows")
+        names.add(element.name)
     # In text a number takes a digit and a space or line end, and the last line end may be missing.
     needed = sum(e.rows * (e.row_size if header.order else 2 * len(e.properties)) for e in header.elements)
     needed -= 0 if header.order else 1
@@ -139,10 +142,22 @@ def _check_counts(header: Header, size: int) -> None:
         )
 
 
-def read_elements(content: bytes, header: Header, names: set[str]) -> dict[str, Columns]:
+def memory(header: Header, size: int) -> int:
+    """Most bytes that `read_elements` needs, as measured, for a file of `size` bytes."""
+    rows = sum(element.rows for element in header.elements if any(item.length for item in element.properties))
+    return 3 * size + 20 * rows + 4 * min(_BYTES, size) if header.order else 16 * size
+
+
+def read_elements(content: bytes, header: Header, names: set[str], lists: set[str]) -> dict[str, Columns]:
     """Reads the tables of the named elements: the columns by the names of their properties.
 
     Numbers of text files are float64, and others have the type of the header.
+
+    Args:
+        content: The file.
+        header: Its header.
+        names: Names of the elements.
+        lists: Names of the properties whose lists are read. Other lists have their lengths, but no items.
 
     Raises:
         ValueError: A row is damaged or missing.
@@ -153,25 +168,29 @@ def read_elements(content: bytes, header: Header, names: set[str]) -> dict[str, 
     for element in header.elements:
         if not element.properties:
             continue
+        read = element.name in names
         if rows is not None:
-            blocks = [_columns(table, element) for table in text.tables(rows, element.rows, element.name)]
+            columns = (_columns(table, element, lists) for table in text.tables(rows, element.rows, element.name))
+            blocks = [block for block in columns if read]  # other rows are read too, because the next ones follow
         elif all(item.length is None for item in element.properties):
             blocks, at = [_fixed(content, at, element)], at + element.rows * element.row_size
         else:
-            blocks, at = _variable(content, at, element)
-        if element.name in names:
+            blocks, at = _variable(content, at, element, lists if read else None)
+        if read:
             tables[element.name] = _joined(blocks, element)
     return tables
 
 
-def _columns(table: text.Table, element: Element) -> Columns:
+def _columns(table: text.Table, element: Element, lists: set[str]) -> Columns:
     """The columns of a block of rows of text."""
     columns: Columns = {}
     for index, item in enumerate(element.properties, 1):
         rest = len(element.properties) - index
-        columns[item.name] = (
-            _typed(table.column(rest), item.dtype) if item.length is None else Lists(*table.lists(rest))
-        )
+        if item.length is None:
+            columns[item.name] = _typed(table.column(rest), item.dtype)
+        else:
+            value, length = table.lists(rest)
+            columns[item.name] = Lists(value if item.name in lists else value[:0].copy(), length)
     return columns
 
 
@@ -190,40 +209,60 @@ def _fixed(content: bytes, at: int, element: Element) -> Columns:
     return {item.name: row[f"{index}"] for index, item in enumerate(element.properties)}
 
 
-def _variable(content: bytes, at: int, element: Element) -> tuple[list[Columns], int]:
-    """The columns of rows with lists, in blocks, and the position after the last row."""
+def _variable(content: bytes, at: int, element: Element, lists: set[str] | None) -> tuple[list[Columns], int]:
+    """The columns of rows with lists, in blocks, and the position after the last row. Without `lists`, no columns."""
     if not element.rows:
         return [], at
-    equal = _equal(content, at, element)
+    equal = _equal_rows(content, at, element)
     if equal is not None:
-        return equal
-    start = np.fromiter(_row_starts(content, at, element), np.int64, element.rows + 1)
+        return [] if lists is None else [_equal_columns(equal, element, lists)], at + equal.nbytes
+    starts = _row_starts(content, at, element)
+    if lists is None:
+        (end,) = collections.deque(starts, maxlen=1)
+        return [], end
+    start = np.fromiter(starts, np.int64, element.rows + 1)
     byte = np.frombuffer(content, np.uint8)
-
-    def gather(place: np.ndarray, dtype: np.dtype) -> np.ndarray:
-        return byte[place[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
-
-    blocks = []
-    for first in range(0, element.rows, _BLOCK):
-        place = start[first : min(first + _BLOCK, element.rows)]
-        columns: Columns = {}
-        for item in element.properties:
-            if item.length is None:
-                columns[item.name] = gather(place, item.dtype)
-                place = place + item.dtype.itemsize
-                continue
-            count = gather(place, item.length).astype(np.int64)
-            place = place + item.length.itemsize
-            step = item.dtype.itemsize
-            number = text.ragged(np.zeros_like(count), count)
-            columns[item.name] = Lists(gather(np.repeat(place, count) + step * number, item.dtype), count)
-            place = place + step * count
-        blocks.append(columns)
+    blocks, first = [], 0
+    while first < element.rows:
+        end = int(np.searchsorted(start, start[first] + _BYTES, side="right")) - 1
+        end = max(first + 1, min(end, first + _BLOCK))
+        part = byte[start[first] : start[end]]
+        blocks.append(_block_columns(part, start[first:end] - start[first], element, lists))
+        first = end
     return blocks, int(start[-1])
 
 
-def _equal(content: bytes, at: int, element: Element) -> tuple[list[Columns], int] | None:
-    """The columns and the end of rows whose lists are all as long as those of the first row; None if they are not."""
+def _block_columns(byte: np.ndarray, start: np.ndarray, element: Element, lists: set[str]) -> Columns:
+    """The columns of the bytes of some rows, which start at the positions `start` in them."""
+
+    def gather(dtype: np.dtype) -> np.ndarray:
+        return byte[start[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
+
+    columns: Columns = {}
+    for item in element.properties:
+        if item.length is None:
+            columns[item.name] = gather(item.dtype)
+            start = start + item.dtype.itemsize
+            continue
+        count = gather(item.length).astype(np.int64)
+        start = start + item.length.itemsize
+        end = start + item.dtype.itemsize * count
+        items = byte[_within(start, end, len(byte))] if item.name in lists else byte[:0]
+        columns[item.name] = Lists(items.view(item.dtype), count)
+        start = end
+    return columns
+
+
+def _within(start: np.ndarray, end: np.ndarray, size: int) -> np.ndarray:
+    """Whether each of `size` places is in one of several spans, which do not overlap."""
+    step = np.zeros(size + 1, np.int8)
+    np.add.at(step, start, 1)  # empty spans start and end at one place
+    np.add.at(step, end, -1)
+    return np.cumsum(step[:-1], dtype=np.int8).view(bool)
+
+
+def _equal_rows(content: bytes, at: int, element: Element) -> np.ndarray | None:
+    """A view of rows whose lists are all as long as those of the first row; None if they are not."""
     fields, offset = [], at
     for index, item in enumerate(element.properties):
         size = 1
@@ -236,21 +275,24 @@ def _equal(content: bytes, at: int, element: Element) -> tuple[list[Columns], in
         fields.append((f"{index}", item.dtype, (size,)))
         offset += size * item.dtype.itemsize
     dtype = np.dtype(fields)
-    end = at + element.rows * dtype.itemsize
-    if end > len(content):
+    if at + element.rows * dtype.itemsize > len(content):
         return None
     row = np.frombuffer(content, dtype, element.rows, at)
+    counts = (row[f"length {index}"] for index, item in enumerate(element.properties) if item.length is not None)
+    return None if any((count != count[0]).any() for count in counts) else row
+
+
+def _equal_columns(row: np.ndarray, element: Element, lists: set[str]) -> Columns:
+    """The columns of the rows of `_equal_rows`."""
     columns: Columns = {}
     for index, item in enumerate(element.properties):
         value = row[f"{index}"]
         if item.length is None:
             columns[item.name] = value[:, 0]
             continue
-        count = row[f"length {index}"]
-        if (count != count[0]).any():
-            return None
-        columns[item.name] = Lists(value.reshape(-1), count.astype(np.int64))
-    return [columns], end
+        items = value.reshape(-1) if item.name in lists else np.zeros(0, item.dtype)
+        columns[item.name] = Lists(items, row[f"length {index}"].astype(np.int64))
+    return columns
 
 
 def _row_starts(content: bytes, at: int, element: Element) -> Iterator[int]:

@@ -93,6 +93,18 @@ def words(rows: Sequence[bytes]) -> Words:
     return Words(joined, start, np.diff(np.searchsorted(start, end), prepend=0))
 
 
+class RowError(ValueError):
+    """A row of words that are not all numbers, or too few.
+
+    Attributes:
+        row: Index of the row.
+    """
+
+    def __init__(self, row: int):
+        super().__init__(f"row {row} has words that are not numbers, or too few")
+        self.row = row
+
+
 def numbers(words: Words, *, kind: type = float) -> np.ndarray:
     """Numbers from words, in 64 bits.
 
@@ -101,29 +113,29 @@ def numbers(words: Words, *, kind: type = float) -> np.ndarray:
         kind: float or int. Integers beyond 64 bits become the nearest one.
 
     Raises:
-        ValueError: A word is not a number. The first argument of the error is the index of its row.
+        RowError: A word is not a number.
     """
-    if not len(words.start):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
+        number = _parsed(words.text, len(words.start), kind)
+        if number is not None:
+            return number
+        # The rows are parsed in the same way: other parsers take other words, such as Python's "1_000".
+        for index, (row, count) in enumerate(zip(words.text.split(b"\n"), words.per_row.tolist(), strict=True)):
+            if _parsed(row, count, kind) is None:
+                raise RowError(index)
+    raise RowError(0)
+
+
+def _parsed(words: bytes, count: int, kind: type) -> np.ndarray | None:
+    """The numbers of `count` words; None if they are not all numbers."""
+    if not count:
         return np.zeros(0, kind)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
-            number = np.fromstring(words.text, kind, sep=" ")
-        if len(number) == len(words.start):  # "1-2" would be two numbers
-            return number
+        number = np.fromstring(words, kind, sep=" ")
     except (DeprecationWarning, ValueError):
-        pass
-    rows = words.text.split(b"\n")
-    raise ValueError(next((index for index, row in enumerate(rows) if not _are_numbers(row, kind)), 0))
-
-
-def _are_numbers(row: bytes, kind: type) -> bool:
-    try:
-        for word in row.split():
-            kind(word)
-    except ValueError:
-        return False
-    return True
+        return None
+    return number if len(number) == count else None  # "1-2" would be two numbers
 
 
 class Table:
@@ -141,10 +153,10 @@ class Table:
         row_words = words(rows)
         try:
             self._number = numbers(row_words)
-        except ValueError as error:
-            row = error.args[0]
+        except RowError as error:
+            row = rows[error.row].strip()
             raise ValueError(
-                f"row {first + row + 1} of the {what} rows must be numbers, got {name(rows[row].strip())[:80]!r}"
+                f"row {first + error.row + 1} of the {what} rows must be numbers, got {name(row)[:80]!r}"
             ) from None
         self._end = np.cumsum(row_words.per_row)
         self._at = self._end - row_words.per_row
@@ -158,7 +170,14 @@ class Table:
 
     def lists(self, rest: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The next list of each row: all items, and the length of each list."""
-        start, count = self._at, whole(self.column(rest))
+        start, number = self._at, self.column(rest)
+        wrong = np.flatnonzero(has_fraction(number))
+        if wrong.size:
+            raise ValueError(
+                f"row {self._first + wrong[0] + 1} of the {self._what} rows must have a list of 0 or more numbers, "
+                f"got {number[wrong[0]]}"
+            )
+        count = whole(number)
         wrong = np.flatnonzero(count < 0)
         if wrong.size:
             raise ValueError(
@@ -211,12 +230,35 @@ def rows(content: bytes) -> Iterator[bytes]:
     return filter(bytes.strip, io.BytesIO(content))
 
 
+def has_fraction(value: np.ndarray) -> np.ndarray:
+    """Where numbers are finite, but not whole."""
+    return np.isfinite(value) & (value != np.floor(value)) if value.dtype.kind == "f" else np.zeros(len(value), bool)
+
+
 def whole(value: np.ndarray) -> np.ndarray:
     """Integers in 64 bits. Numbers that are too large or not finite become -1."""
     if value.dtype.kind in "iu":
         return value.astype(np.int64)
     limit = 1 << 62
     return np.where(np.abs(value) < limit, value, -1).astype(np.int64)
+
+
+def whole_lists(value: np.ndarray, length: np.ndarray, what: str) -> np.ndarray:
+    """Integers in 64 bits, as `whole` gives them, from the items of lists.
+
+    Args:
+        value: All items, one list after the other.
+        length: The length of each list.
+        what: Name of the rows for messages, such as "face".
+
+    Raises:
+        ValueError: An item has a fraction. The message states its row.
+    """
+    wrong = np.flatnonzero(has_fraction(value))
+    if wrong.size:
+        row = np.searchsorted(np.cumsum(length), wrong[0], side="right")
+        raise ValueError(f"row {row + 1} of the {what} rows must have whole numbers in its list, got {value[wrong[0]]}")
+    return whole(value)
 
 
 def ragged(start: np.ndarray, count: np.ndarray) -> np.ndarray:

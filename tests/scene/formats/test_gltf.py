@@ -11,8 +11,12 @@ import pytest
 import scipy.spatial
 import trimesh
 
-from jaxprt.files import write_png
+from jaxprt import require
+from jaxprt.files import images, write_png
 from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.formats.gltf_file import Document
+from jaxprt.scene.formats.gltf_material import MaterialReader
+from jaxprt.scene.formats.texture_images import stored
 from jaxprt.scene.mesh import split
 from tests.scene.formats.gltf_writer import FACE, KIND, PLACE, SQUARE, Writer, one
 
@@ -262,6 +266,40 @@ def test_all_factors_textures_and_extensions_of_a_material_are_honored(tmp_path,
     slope = (2 * TEXEL[:, :3] - 1) * [0.4, 0.4, 1]
     slope[:, 1] *= side
     close(found.normal, slope / np.linalg.norm(slope, axis=1, keepdims=True))
+
+
+def test_channels_of_an_image_are_decoded_once_and_images_of_other_materials_are_not_kept(tmp_path, monkeypatch):
+    image = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
+    writer = Writer()
+    first, second = writer.texture(tmp_path, image), writer.texture(tmp_path, image[::-1])
+    broken = {"index": writer.add("textures", {"source": writer.add("images", {"uri": "data:,broken"})})}
+    for texture in (first, second, first, broken, broken):
+        writer.add("materials", {"pbrMetallicRoughness": {"metallicRoughnessTexture": texture}})
+    decoded, decode = [], images.decode_image
+    monkeypatch.setattr(
+        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
+    )
+    needed = []
+    monkeypatch.setattr(require, "memory", lambda what, size, _: needed.append((what, size)))
+    reader = MaterialReader(Document(writer.write(tmp_path / "a.gltf")))
+    materials = [reader.material(number) for number in range(5)]
+    assert decoded == ["image 0", "image 1", "image 2, data:,broken"]
+    assert ("image 1: 1 channels of 5 x 4 pixels (width x height)", 3 * 4 * 4 * 5) in needed
+    assert materials[0].metallic_texture.image is materials[2].metallic_texture.image
+    assert materials[3].metallic_texture is materials[4].roughness_texture is None
+    np.testing.assert_allclose(materials[0].metallic_texture.image[..., 0], image[..., 2], atol=0.01)
+    np.testing.assert_allclose(materials[1].roughness_texture.image[..., 0], image[::-1, :, 1], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("count", "colors", "alpha"),
+    [(1, [0.1] * 3, 1), (2, [0.1] * 3, 0.2), (3, [0.1, 0.2, 0.3], 1), (4, [0.1, 0.2, 0.3], 0.4)],
+)
+def test_channels_of_gray_images_are_equal_and_missing_alpha_is_one(count, colors, alpha):
+    image = np.tile(np.arange(1, count + 1, dtype=np.float32) / 10, (2, 3, 1))
+    np.testing.assert_allclose(stored(image, (0, 1, 2), "image"), np.tile(colors, (2, 3, 1)), rtol=1e-6)
+    np.testing.assert_allclose(stored(image, (1,), "image"), np.full((2, 3, 1), colors[1]), rtol=1e-6)
+    np.testing.assert_allclose(stored(image, (3,), "image"), np.full((2, 3, 1), alpha), rtol=1e-6)
 
 
 def test_texture_transforms_move_either_set_of_coordinates_as_blender_does(tmp_path, close):

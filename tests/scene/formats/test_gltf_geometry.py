@@ -11,6 +11,7 @@ import trimesh
 from jaxprt import require
 from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.formats import gltf_geometry
 from jaxprt.scene.formats.gltf_file import Elements
 from jaxprt.scene.scene import numbered
 from tests.scene.formats.gltf_writer import FACE, PLACE, SQUARE, Writer, one
@@ -302,6 +303,33 @@ def test_nodes_without_a_skin_show_the_same_mesh_where_they_are(tmp_path):
     np.testing.assert_allclose(mesh.position[4], [0, 0, 4], atol=1e-6)
 
 
+def test_of_the_nodes_outside_of_the_scene_only_joints_and_their_ancestors_are_read(tmp_path):
+    writer = skinned(Writer(), JOINT, WEIGHT, SHIFTED)
+    writer.header["scenes"] = [{"nodes": [0]}]
+    path = writer.write(tmp_path / "a.glb")
+    expected = load_mesh(path).position
+    half = np.sqrt(0.5)
+    writer.header["nodes"][1]["children"] = [2, 99]
+    writer.header["nodes"] += [
+        {"children": 5, "rotation": [0, 0, 0, 0]},
+        {"children": [-1, 99, "a"]},
+        {"translation": [0, 0, 3], "children": [6]},
+        {"translation": [0, 0, 1], "children": [7]},
+        {"translation": [1, 0, 0], "rotation": [0, 0, half, half]},
+    ]
+    np.testing.assert_array_equal(load_mesh(writer.write(path)).position, expected)
+    writer.header["skins"][0]["joints"] = [6, 7]  # they stand where nodes 1 and 2 do
+    np.testing.assert_allclose(load_mesh(writer.write(path)).position, expected, atol=1e-6)
+    writer.header["nodes"][7]["children"] = [5]
+    with pytest.raises(
+        ValueError, match=r"a\.glb must have joints of skin 0 that belong to trees of nodes, got node 6"
+    ):
+        load_mesh(writer.write(path))
+    writer.header["nodes"][7]["children"] = [6]
+    with pytest.raises(ValueError, match=r"nodes that form trees, got node 6 twice, the second time in node 7"):
+        load_mesh(writer.write(path))
+
+
 @pytest.mark.parametrize(
     ("joint", "weight", "inverse", "message"),
     [
@@ -412,6 +440,30 @@ def test_zeros_without_a_buffer_view_are_bounded_by_the_size_of_the_file(tmp_pat
     size = writer.write(path).stat().st_size + 9000
     with pytest.raises(ValueError, match=f"at most {size} elements"):
         load_scene(path)
+
+
+def test_a_missing_buffer_that_nothing_uses_does_no_harm_and_is_not_read_for_zeros(tmp_path):
+    writer = one((writer := Writer()).square(), writer=writer)
+    zero = writer.add("accessors", {"componentType": 5126, "count": 4, "type": "VEC3"})
+    writer.header["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = zero
+    uris = ("missing.bin", "../outside.bin", "http://a/b", "a" * 300, "a\0b", "", 3)
+    writer.header["buffers"] = [{"byteLength": 9000, "uri": uri} for uri in uris]
+    part = load_scene(writer.write(tmp_path / "a.glb")).parts[0]
+    np.testing.assert_array_equal(part.color, np.zeros((4, 3)))
+
+
+def test_instances_of_a_mesh_without_triangles_take_no_memory(tmp_path, monkeypatch):
+    writer = one((writer := Writer()).square(), writer=writer)
+    writer.header["meshes"].append({"primitives": [writer.square(mode=0)]})
+    instanced(writer, {"SCALE": writer.add("accessors", {"componentType": 5121, "count": 2000, "type": "VEC3"})})
+    writer.data += bytes(2000)
+    writer.header["nodes"][0]["mesh"] = 1
+    writer.header["nodes"].append({"mesh": 0})
+    writer.header["scenes"] = [{"nodes": [0, len(writer.header["nodes"]) - 1]}]
+    made = []
+    monkeypatch.setattr(gltf_geometry, "instance_matrices", lambda _, node: made.append(node) or node.matrix[None])
+    assert len(load_mesh(writer.write(tmp_path / "a.glb")).position) == 4
+    assert len(made) == 1
 
 
 def repeated_by_nodes(writer):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.files import write_png
+from jaxprt.files import images, write_png
 from jaxprt.scene import load_mesh, load_scene
 from jaxprt.scene.mesh import split
 
@@ -121,6 +121,57 @@ def test_maps_lie_as_the_file_has_them_and_options_move_and_clamp_them(tmp_path)
     upper_right = part.material.at(jnp.array([[0.75, 0.75]]))
     np.testing.assert_allclose(upper_right.base_color, [[0, 1, 0]], atol=1e-6)
     np.testing.assert_allclose(upper_right.metallic, [0], atol=1e-6)  # Beyond the edge: green.
+
+
+def test_libraries_and_images_are_read_once_and_only_those_of_used_materials(tmp_path, monkeypatch):
+    write_png(tmp_path / "a.png", IMAGE)
+    decoded, decode = [], images.decode_image
+    monkeypatch.setattr(
+        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
+    )
+    materials = "".join(f"newmtl m{number}\nmap_Kd a.png\nmap_Ke -s 2 a.png\nmap_Pr a.png\n" for number in range(9))
+    materials += "newmtl unused\nKd x\nhair\nmap_Kd absent.png\nmap_Ke ../outside.png\n"
+    path = write(tmp_path, materials, f"usemtl m1\n{FACE}usemtl m7\n{FACE}")
+    path.write_text("mtllib scene.mtl\nmtllib ./scene.mtl\n" + path.read_text())
+    first, second = (part.material for part in load_scene(path).parts)  # without a warning
+    assert decoded == [str(tmp_path / "a.png")] * 2  # as colors, and as roughness
+    assert first.base_color_texture.image is second.base_color_texture.image is second.emissive_texture.image
+    assert first.roughness_texture.image is second.roughness_texture.image
+    np.testing.assert_array_equal(first.emissive_texture.transform, [[2, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(first.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
+    (tmp_path / "text.png").write_text("no picture")
+    decoded, decode = [], images.decode_image
+    monkeypatch.setattr(
+        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
+    )
+    materials = "newmtl a\nmap_Kd text.png\nnewmtl b\nmap_Kd text.png\n"
+    path = write(tmp_path, materials, f"usemtl a\n{FACE}usemtl b\n{FACE}")
+    with pytest.warns(UserWarning, match=r"ignored are map_Kd \(.*text\.png must be an EXR[^(]*\)$"):
+        assert len(load_scene(path).parts) == 2
+    assert len(decoded) == 1
+
+
+@pytest.mark.parametrize(
+    ("statement", "ignored"), [("d -halo 0.5", True), ("d -halo 1.0", False), ("d 1 # -halo", False)]
+)
+def test_halos_are_opacities(tmp_path, statement, ignored):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert one(tmp_path, f"{statement}\n").name == "a"
+    assert [str(warning.message).endswith("ignored are d") for warning in caught] == [True] * ignored
+
+
+def test_maps_that_move_without_end_are_refused_by_name(tmp_path):
+    write_png(tmp_path / "a.png", IMAGE)
+    for options in ("-s 1e300 1 1", "-o 0 -1e300"):
+        message = "scene.mtl, map_Kd of material 'a': the texture's transform must be finite"
+        with pytest.raises(ValueError, match=message):
+            one(tmp_path, f"map_Kd {options} a.png\n")
+    with pytest.raises(ValueError, match=r"scene\.mtl, material 'a': normal_scale"):
+        one(tmp_path, "norm -bm 1e300 a.png\n")
 
 
 def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):

@@ -97,6 +97,8 @@ def test_points_and_segments_of_an_off_file_are_left_out(tmp_path):
         ({"rows": ["0 0 0", "1 0", "1 1 0", "0 1 0"]}, "row 2 of the vertex rows must have 3 numbers, but has 2"),
         ({"rows": ["0 0 0", "1 0 x", "1 1 0", "0 1 0"]}, "row 2 of the vertex rows must be numbers, got '1 0 x'"),
         ({"faces": ["99999999999 0 1 2"]}, "row 1 of the face rows must have .* numbers, but has 4"),
+        ({"faces": ["3 0 1 2", "3.7 0 1 2 3"]}, "row 2 of the face rows must have a list of 0 or more .*, got 3.7"),
+        ({"faces": ["3 0 1 2", "3 0 1.9 2"]}, "row 2 of the face rows must have whole numbers in its list, got 1.9"),
         ({"faces": ["-3 0 1 2"]}, "row 1 of the face rows must have a list of 0 or more numbers, got -3"),
     ],
 )

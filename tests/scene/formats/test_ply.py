@@ -2,14 +2,17 @@
 
 import os
 import struct
+import time
+import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
 
+from jaxprt import require
 from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
-from jaxprt.scene.formats import mesh_file
+from jaxprt.scene.formats import mesh_file, ply_table
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -76,6 +79,55 @@ def test_other_elements_and_lists_of_vertices_are_passed_over(tmp_path, form):
     geometry = mesh_file.read(write(tmp_path, [camera, material, vertex, edge, face], form), groups=False)
     np.testing.assert_array_equal(geometry.position, SQUARE)
     np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_lists_of_different_lengths_are_the_same_in_blocks_of_any_size(tmp_path, form, monkeypatch):
+    properties = f"property list uchar short junk\n{FACES}property float weight\nproperty list uchar float texcoord\n"
+    lengths = [3, 0, 4, 1, 3, 5, 0, 0, 3]
+    faces = [([7] * (row % 4), [row] * count, row / 2, [row / 4] * (2 * count)) for row, count in enumerate(lengths)]
+    path = write(tmp_path, [("vertex", XYZ, [[0, 0, 0]] * 9), ("face", properties, faces)], form)
+    content = path.read_bytes()
+    header = ply_table.read_header(content)
+    monkeypatch.setattr(ply_table, "_BLOCK", 4)
+    for most in (1, 40, 10_000):
+        monkeypatch.setattr(ply_table, "_BYTES", most)
+        face = ply_table.read_elements(content, header, {"face"}, {"vertex_indices", "texcoord"})["face"]
+        np.testing.assert_array_equal(face["weight"], np.arange(9) / 2)
+        np.testing.assert_array_equal(face["junk"].length, np.arange(9) % 4)
+        assert not len(face["junk"].value)
+        for name, values in (
+            ("vertex_indices", [face[1] for face in faces]),
+            ("texcoord", [face[3] for face in faces]),
+        ):
+            np.testing.assert_array_equal(face[name].length, [len(value) for value in values])
+            np.testing.assert_array_equal(face[name].value, np.concatenate(values))
+
+
+def test_long_lists_that_nothing_uses_take_no_memory_and_others_count_before_they_are_read(tmp_path, monkeypatch):
+    faces = [([1] * 1_000_000, [0, 1, 2]), ([], [0, 2, 3])]
+    properties = "property list uint uchar junk\n" + FACES
+    path = write(tmp_path, [("vertex", XYZ, SQUARE.tolist()), ("face", properties, faces)], "binary_little_endian")
+    tracemalloc.start()
+    try:
+        geometry = mesh_file.read(path, groups=False)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 2, 3]])
+    assert peak < 4 * path.stat().st_size  # the bytes of the file, and a mask over a block of them
+    monkeypatch.setattr(require, "available_memory", lambda: 3_000_000)
+    with pytest.raises(MemoryError, match=r"the elements of .*mesh\.ply take 0\.0 GB"):
+        load_mesh(path)
+
+
+def test_the_work_for_a_header_is_in_proportion_to_its_elements():
+    header = "ply\nformat ascii 1.0\n" + "".join(f"element kind{number} 0\n" for number in range(20_000))
+    start = time.process_time()
+    assert len(ply_table.read_header(f"{header}end_header\n".encode()).elements) == 20_000
+    assert time.process_time() - start < 2  # 8 s if each name is compared with all others
+    with pytest.raises(ValueError, match="its header must have one element 'kind7' with 0 or more rows"):
+        ply_table.read_header(f"{header}element kind7 0\nend_header\n".encode())
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -212,6 +264,44 @@ def test_each_image_of_several_is_a_part(tmp_path):
     for part, image in zip(parts, (IMAGE, IMAGE[::-1]), strict=True):
         np.testing.assert_allclose(part.material.base_color_texture.image, image, atol=1e-6)
         assert len(part.mesh.face) == 1
+    first, second = load_scene(wedges(tmp_path, image="a.png|a.png", extra="property int texnumber\n")).parts
+    assert first.material.base_color_texture.image is second.material.base_color_texture.image
+
+
+def textured(folder, elements, form):
+    """A file of a square with two images and texture coordinates of the vertices."""
+    write_png(folder / "a.png", IMAGE)
+    write_png(folder / "b.png", IMAGE[::-1])
+    vertex = ("vertex", XYZ + "property float u\nproperty float v\n", [[*row, *row[:2]] for row in SQUARE.tolist()])
+    return write(folder, [vertex, *elements], form, ["TextureFile a.png", "TextureFile b.png"])
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_faces_without_triangles_have_no_image_of_their_own(tmp_path, form):
+    properties = FACES + "property int texnumber\n"
+    faces = [([0, 1], 1), ([0, 1, 2], 0), ([], 7), ([0, 2, 3], 0)]
+    (part,) = load_scene(textured(tmp_path, [("face", properties, faces)], form)).parts
+    assert len(part.mesh.face) == 2
+    np.testing.assert_allclose(part.material.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("faces", [[], [([0, 1], 1)]])
+@pytest.mark.filterwarnings(r"ignore:.*TextureFile b\.png")
+def test_strips_alone_have_the_first_image(tmp_path, form, faces):
+    strips = ("tristrips", "property list int int vertex_indices\n", [([0, 1, 3, 2],)])
+    elements = [("face", FACES + "property int texnumber\n", faces), strips]
+    (part,) = load_scene(textured(tmp_path, elements, form)).parts
+    assert len(part.mesh.face) == 2
+    np.testing.assert_allclose(part.material.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_indices_with_fractions_are_refused_with_their_row(tmp_path, form):
+    faces = ("face", "property list uchar float vertex_indices\n", [([0, 1, 2],), ([0, 1.75, 2, 3],)])
+    path = write(tmp_path, [("vertex", XYZ, SQUARE.tolist()), faces], form)
+    with pytest.raises(ValueError, match=r"mesh\.ply must .* row 2 of the face rows must have whole .*, got 1\.75"):
+        load_mesh(path)
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -254,7 +344,10 @@ def test_counts_that_the_file_cannot_hold_are_refused(tmp_path, form, vertices, 
         (("property float x", "property float a"), "must have the properties x, y and z"),
         (("vertex_indices", "corners"), "must have a list of the name vertex_indices or vertex_index"),
         (("0 1.0", "0 hello"), "row 1 of the vertex rows must be numbers, got '0.0 0 hello"),
+        (("1 1 0\n", "1_0 1 0\n"), "row 3 of the vertex rows must be numbers, got '1_0 1 0'"),
         (("4 0 1 2 3", "-4 0 1 2 3"), "must have a list of 0 or more numbers"),
+        (("4 0 1 2 3", "4.5 0 1 2 3"), "must have a list of 0 or more numbers, got 4.5"),
+        (("4 0 1 2 3", "4 0 1.5 2 3"), "row 1 of the face rows must have whole numbers in its list, got 1.5"),
         (("4 0 1 2 3", "9999999999 0 1"), "row 1 of the face rows must have .* numbers, but has 3"),
         (("4 0 1 2 3", ""), "its header counts 1 face rows, but it has 0"),
     ],

@@ -24,7 +24,7 @@ def vector_area(polygon):
 
 
 def divided(polygon):
-    return polygons.triangulate(polygon, polygons.of_rows(np.arange(len(polygon))[None])).corner
+    return polygons.triangulate(polygon, polygons.of_rows(np.arange(len(polygon))[None]), "file").corner
 
 
 def star(rng, corners):
@@ -103,12 +103,55 @@ def test_polygons_without_area_or_with_crossing_edges_have_triangles_of_existing
         assert triangle.max() < len(polygon)
 
 
+def large_polygons(corners):
+    """Simple polygons: a comb, a spiral, an annulus with a bridge, and a square with corners on its sides."""
+    place = np.arange(corners)
+    comb = np.stack([place, np.where(place % 2, 1, 100)], 1)
+    yield np.concatenate([comb, [[corners, 0], [0, 0]]])[::-1]
+    angle, radius = np.linspace(0, 60 * np.pi, corners // 2), np.linspace(1, 100, corners // 2)[:, None]
+    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+    yield np.concatenate([radius * circle, ((radius + 0.5) * circle)[::-1]])
+    angle = np.linspace(0, 2 * np.pi, corners // 2)
+    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+    yield np.concatenate([circle, 0.5 * circle[::-1]])
+    side = np.arange(corners // 4) * 4 / corners
+    along = np.concatenate([side, 0 * side + 1, 1 - side, 0 * side])
+    square = np.stack([along, np.roll(along, corners // 4)], 1)
+    square[corners // 8, 1] += 0.3
+    yield square
+
+
+@pytest.mark.parametrize("corners", [4000, 16_000])
+def test_large_simple_polygons_keep_their_area(corners):
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    for flat in large_polygons(corners):
+        polygon = np.pad(flat, ((0, 0), (0, 1))) @ turn
+        assert_covers(polygon, divided(polygon), 1e-6)
+
+
+@pytest.mark.parametrize("knot", [1, 4, 16])
+def test_large_polygons_that_cross_themselves_stay_fans_at_once_with_a_warning(monkeypatch, knot):
+    monkeypatch.setattr(polygons.mapbox_earcut, "triangulate_float64", lambda *_: pytest.fail("hangs"))
+    corners = 48_000
+    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    polygon = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * np.where(np.arange(corners) % 2, 1, 0.9)[:, None]
+    wound = angle[: corners // knot] * corners / 2.001
+    polygon[: corners // knot] = np.stack([np.cos(wound) - 0.1, np.sin(wound), 0 * wound], 1)
+    message = (
+        "file: faces should not cross themselves, got 1 of 1 large ones that do, the first is face 0 of 48000 corners"
+    )
+    with pytest.warns(UserWarning, match=message):
+        triangle = divided(polygon)
+    assert (triangle[:, 0] == 0).all()
+    np.testing.assert_allclose(triangle_areas(polygon, triangle).sum(0), vector_area(polygon), rtol=1e-9)
+
+
 def test_polygons_of_different_sizes_stay_in_order():
     rng = np.random.default_rng(1)
     shapes = [star(rng, size) for size in (3, 6, 4, 3, 9, 5, 6)]
     size = np.array([len(shape) for shape in shapes])
     position = np.concatenate(shapes)
-    triangle, polygon = polygons.triangulate(position, Polygons(np.arange(len(position)), size))
+    triangle, polygon = polygons.triangulate(position, Polygons(np.arange(len(position)), size), "file")
     np.testing.assert_array_equal(polygon, np.repeat(np.arange(7), size - 2))
     area = triangle_areas(position, triangle)
     for index, shape in enumerate(shapes):
