@@ -140,7 +140,7 @@ def integrate(
     Reference: Wang, Tran, Luebke 2004, equation 1.
     """
     batch, colors = light.radiance.shape[:-4], light.radiance.shape[-1]
-    table = light.radiance.reshape(-1, seen.shape[1], colors)
+    table = light.radiance.reshape(-1, seen.shape[1], colors).astype(jnp.result_type(float))
     wo = directions.view(frame, position, eye)
     whole = adaptive.Integrand(brdf, frame, wo, table)
     smooth, choice, chosen = _centers(whole, seen, jnp.asarray(error, wo.dtype))

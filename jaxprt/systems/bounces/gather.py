@@ -125,7 +125,7 @@ def arrive(
         wo = directions.normalize(wo.at[..., 2].max(_GRAZING))
         view = basis.view(wo) * weight[..., None, None]  # [h, 3, k, p]
         sent = jnp.einsum("hckp,hckl->hpl", view, response[corner])
-        return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent)), None
+        return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent).astype(total.dtype)), None
 
     shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[2])
     groups = (owner, corner, weight, direction, measure)
