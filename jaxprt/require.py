@@ -47,7 +47,7 @@ def unreal(value: Any) -> str:
     if jnp.issubdtype(known.dtype, jnp.integer) or jnp.issubdtype(known.dtype, jnp.floating):
         return ""
     if known.dtype == object:
-        return _described(value)
+        return "an integer of more than 64 bits" if isinstance(value, int) else _described(value)
     names = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text"}
     return names.get(getattr(known.dtype, "kind", ""), f"values of type {known.dtype}")
 
@@ -56,8 +56,6 @@ def _array_of(value: Any) -> Any:
     """A value as an array; None if it cannot be one. JAX arrays, and lists of values inside `jax.jit`, are JAX's."""
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 2**63:  # NumPy makes objects of these
-        return np.float64(value) if abs(value) < 1e300 else np.copysign(np.inf, np.sign(value))
     for convert in (np.asarray, jnp.asarray):  # NumPy cannot convert lists of values inside `jax.jit`.
         try:
             return convert(value)
@@ -192,7 +190,7 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
         raise TypeError(f"{name} must be one number, got {_described(value)}")
     if isinstance(value, Tracer):
         return
-    if not np.isfinite(value):
+    if not np.isfinite(_array_of(value)):
         raise ValueError(f"{name} must be finite, got {value}")
     if not low <= float(value) <= high or (above and float(value) == low):
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")

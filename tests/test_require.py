@@ -95,3 +95,32 @@ def test_whole_numbers_outside_a_range_are_counted():
     require.within("the texels", np.array([0, 383]), 0, 383)
     with pytest.raises(ValueError, match=r"the texels must be between 0 and 383, got 2 of 3 .* first at \(0,\): -1"):
         require.within("the texels", np.array([-1, 5, 384]), 0, 383)
+
+
+def test_lists_that_hold_traced_values_are_positions():
+    place = jax.jit(lambda x: require.position("the eye", [x, 1.0, 2.0]))(0.5)
+    np.testing.assert_array_equal(place, [0.5, 1.0, 2.0])
+    with pytest.raises(TypeError, match="error must be real numbers, got an integer of more than 64 bits"):
+        require.number("error", 2**70, 0.0)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.eye(2), 2 * np.eye(3), np.diag([1, 1, -1]), np.full((3, 3), np.nan), 5, np.eye(4)]
+)
+def test_only_proper_rotations_are_rotations(wrong):
+    turn = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    np.testing.assert_array_equal(require.rotation("rotation", turn), turn)
+    with pytest.raises(ValueError, match="rotation must be a 3 x 3 rotation matrix, got"):
+        require.rotation("rotation", wrong)
+
+
+def test_what_has_no_numbers_is_described():
+    with pytest.raises(TypeError, match="light must be real numbers, got values of type key<fry>"):
+        require.real("light", jax.random.key(0))
+
+    class Strange:
+        def __fspath__(self):
+            return b"x"
+
+    with pytest.raises(ValueError, match="path must be a path, got"):
+        require.path("path", Strange())

@@ -234,7 +234,7 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
 
 def _direction(value: Any) -> Array:
-    require.real("direction", value)
+    require.finite("direction", value)
     direction = require.floating(value)
     if direction.shape[-1:] != (3,):
         raise ValueError(f"direction must be [..., 3], got an array of shape {list(direction.shape)}")

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from jaxprt import require
 
@@ -22,7 +22,6 @@ _FAR = 64  # distance from zero, in diagonals of the bounding box, from which on
 _OUTLIERS = 0.01  # share of the vertices at each end of an axis that do not count: stray ones are common in surveys
 _FINE = 64  # steps of float32 that the extent of a triangle should have: its normal then is right to about a degree
 _BLOCK = 1 << 18  # triangles
-_ROUNDED = 1e-3  # of the distance from the origin, by which an eye may be rounded
 _LARGE = 64.0  # coordinates above this are kept in float64 where float32 would round them
 
 
@@ -46,7 +45,7 @@ def of(position: Float[np.ndarray, "v 3"]) -> Origin:
     return (x, y, z)
 
 
-def warn_of_rounding(position: Float[np.ndarray, "v 3"], face: Int[np.ndarray, "f 3"], name: str) -> None:
+def warn_of_rounding(position: Float[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"], name: str) -> None:
     """Warns if float32 cannot hold the triangles of a mesh, because it has parts that are too far apart.
 
     Args:
@@ -85,8 +84,7 @@ def local(name: str, position: Any, origin: Origin) -> Any:
 
     Raises:
         ValueError: The origin is not zero, and the position is inside of `jax.jit`, `jax.vmap` or `jax.grad`, where
-            float32 has rounded it, or is in float32 or half precision and rounded by more than a thousandth of its
-            distance from the origin.
+            float32 has rounded it. Outside, float32 is taken as it is: it may be exact.
     """
     if origin == ZERO:
         return position
@@ -96,17 +94,7 @@ def local(name: str, position: Any, origin: Origin) -> Any:
             f"coordinates near the scene's origin {origin}: use relit.centered() with camera.local(mesh.origin)"
         )
     require.position(name, position)
-    exact = np.asarray(position, np.float64)
-    local = exact - np.asarray(origin)
-    dtype = getattr(position, "dtype", np.dtype(np.float64))
-    if jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 8:
-        step = float(jnp.finfo(dtype).eps) * np.abs(exact).max()
-        if step > _ROUNDED * np.linalg.norm(local):
-            raise ValueError(
-                f"{name} must be in float64 of NumPy or a list of numbers, because the scene is near {origin}, got "
-                f"{dtype}, which rounds it there by {step / 2:.2g}"
-            )
-    return jnp.asarray(local, jnp.result_type(float))
+    return jnp.asarray(np.asarray(position, np.float64) - np.asarray(origin), jnp.result_type(float))
 
 
 def coordinates(value: Any) -> Any:

@@ -20,6 +20,7 @@ from jaxprt.scene.scene import Part, Scene
 
 # Steps of the additive recurrence R2, which fills a square evenly.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
+_FACE = 300  # bytes of a triangle and its share of vertices, in the scene and while it is divided
 _CANCELED = 1e-6  # two unit normals cancel if their mean is shorter than this
 
 # Triangles that replace a triangle, by which of its edges are cut, counted from the longest edge. Corners are 0 to 2,
@@ -242,12 +243,17 @@ def divide(scene: Scene, *, edge: float) -> Scene:
     Raises:
         TypeError: `scene` is not a `Scene`, or the material of a part has one BRDF for each vertex.
         ValueError: The length is not positive and finite.
+        MemoryError: The scene would not fit into memory.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     require.number("edge", edge, 0.0, above=True)
     mesh = scene.mesh
     position, face = np.asarray(mesh.position), np.asarray(mesh.face)
     divisions = []
+    corner = position[face].astype(np.float64)
+    longest = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2).max(1)
+    faces = float(np.sum(np.maximum(longest / float(edge), 1) ** 2)) / 2  # of slim triangles fewer are made
+    require.memory(f"some {faces:.2g} triangles", int(min(faces, 1e30)) * _FACE, "give a longer edge")
     while True:
         edges = Edges(position, face)
         marked = edges.length > edge

@@ -31,6 +31,7 @@ def scene():
     return prt.Scene(parts, [prt.scene.camera.orbit(ball, width=8, height=8)])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("strict", "coarse", "unchecked")
 def test_verbs_of_scenes_take_every_float_type_under_strict_promotion(close):
     relit = prt.precompute(scene(), system="harmonic", size=SIZE, bounces=1, progress=False)

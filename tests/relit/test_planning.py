@@ -1,5 +1,6 @@
 """Plans against the error that carrying them out has, under lights and from views that they did not see."""
 
+import dataclasses
 import importlib
 from collections.abc import Callable
 
@@ -155,12 +156,14 @@ def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky,
 
 
 def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monkeypatch):
-    part = prt.Scene([scene["ground"]])
+    far = (512345.0, 0.0, 4987654.0)
+    ground = dataclasses.replace(scene["ground"], mesh=dataclasses.replace(scene["ground"].mesh, origin=far))
+    part, eye = prt.Scene([ground]), np.add(VIEWS[0], far)
     options = {"environments": [sky], "path": tmp_path / "kept", "progress": False}
     first = prt.precompute(part, error=ASKED, **options)
     monkeypatch.setattr(planning, "_considered", None)  # Nothing is measured again.
     again = prt.precompute(part, error=ASKED, **options)
-    np.testing.assert_array_equal(first.radiance(sky, eye=VIEWS[0]), again.radiance(sky, eye=VIEWS[0]))
+    np.testing.assert_array_equal(first.radiance(sky, eye=eye), again.radiance(sky, eye=eye))
     with pytest.raises(ValueError, match=r"was made for an error of 0\.3 .*, got 0\.2 .*: name another path"):
         prt.precompute(part, error=0.2, **options)
     darker = Environment(0.5 * sky.radiance)

@@ -324,7 +324,7 @@ def test_sizes_may_be_numpys_whole_numbers():
     assert light.radiance.shape == (6, 4, 4, 3)
 
 
-@pytest.mark.parametrize("size", [100_000, 2**40])
+@pytest.mark.parametrize("size", [100_000, 2**30])
 def test_cubemaps_that_do_not_fit_into_memory_are_refused_before_anything_is_made(tmp_path, size):
     image = np.ones((2, 4, 3), np.float32)
     write_exr(tmp_path / "sky.exr", image)

@@ -172,6 +172,16 @@ def test_eyes_inside_of_jit_are_relative_to_the_origin(relit):
 
 
 @pytest.mark.usefixtures("unchecked")
+def test_sums_of_far_scenes_take_the_same_eyes(relit):
+    near, far = relit
+    eye = np.array([2.0, 5.0, 14.0]) + FAR
+    expected = far.radiance(SKY, eye=eye)
+    np.testing.assert_allclose(prt.radiance(prt.total(far, far), SKY, eye=eye), 2 * expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="systems must have one origin"):
+        prt.total(near, far)
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("eye", [5.0, [1.0], [1.0, 2.0], [[1.0], [2.0], [3.0]], "front"])
 def test_eyes_that_are_no_position_are_refused_far_from_zero_too(relit, eye):
     with pytest.raises((ValueError, TypeError), match=r"the eye must be (one position|real numbers)"):
@@ -181,7 +191,9 @@ def test_eyes_that_are_no_position_are_refused_far_from_zero_too(relit, eye):
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("wrong", ["x", (1.0, 2.0), [1.0, 2.0, 3.0], (np.nan, 0.0, 0.0)])
 def test_origins_that_are_no_place_are_refused(wrong):
-    with pytest.raises(ValueError, match="origin of a mesh must be a tuple of three finite numbers, got"):
+    with pytest.raises(
+        ValueError, match="origin of a mesh must be a tuple of three finite numbers of class float, got"
+    ):
         dataclasses.replace(builtin.sphere(), origin=wrong)
 
 

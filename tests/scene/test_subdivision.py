@@ -230,7 +230,7 @@ def test_no_edge_is_longer_than_asked(scene):
 
 @pytest.mark.parametrize("edge", [0.0, -1.0, np.nan, np.inf])
 def test_edges_without_a_length_are_refused(scene, edge):
-    with pytest.raises(ValueError, match="edge must be positive and finite, got"):
+    with pytest.raises(ValueError, match=r"edge must be (above 0|finite)"):
         subdivision.divide(scene, edge=edge)
 
 
