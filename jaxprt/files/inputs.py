@@ -114,7 +114,7 @@ def json_object(path: pathlib.Path, what: str) -> dict[str, Any]:
     """
     data = content(path, what)
     try:
-        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_without_duplicates)
+        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique_names)
     except RecursionError:
         raise ValueError(f"{path} must be {what} in JSON, got lists or objects that are nested too deeply") from None
     except ValueError as error:
@@ -124,12 +124,12 @@ def json_object(path: pathlib.Path, what: str) -> dict[str, Any]:
     return value
 
 
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object from its pairs, for `json.loads`. A name that stands twice in it raises ValueError."""
     result = dict(pairs)
     if len(result) < len(pairs):
-        counts = collections.Counter(name for name, _ in pairs)
-        twice = counts.most_common(1)[0][0]
-        raise ValueError(f"the name {twice[:80]!r} twice in one object")
+        name, count = collections.Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"an object has the name {name[:80]!r} {count} times")
     return result
 
 

@@ -164,4 +164,9 @@ def decode_srgb(image: np.ndarray) -> None:
         image: Encoded values [h, w, c] of 0 to 1.
     """
     for rows in row_blocks(image):
-        rows[...] = np.where(rows <= 0.04045, rows / 12.92, ((rows + 0.055) / 1.055) ** 2.4)
+        rows[...] = srgb_to_linear(rows)
+
+
+def srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Decodes display values of 0 to 1 (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

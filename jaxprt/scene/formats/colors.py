@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from jaxprt.files import pixels
+
 _DISPLAY_MOST = 255.0  # largest value in files that write the whole numbers of 8-bit colors as other types
 _PAINTED_MOST = 2.0  # largest float that counts as a color above white, such as 1 and rounding
 
@@ -27,4 +29,4 @@ def linear(value: np.ndarray) -> np.ndarray:
     elif value.dtype.kind in "iu" or (scaled[np.isfinite(scaled)] > _PAINTED_MOST).any():
         scaled /= _DISPLAY_MOST
     scaled = np.where(np.isfinite(scaled).all(1, keepdims=True), np.clip(scaled, 0, 1), np.nan)
-    return np.where(scaled <= 0.04045, scaled / 12.92, ((scaled + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    return pixels.srgb_to_linear(scaled)

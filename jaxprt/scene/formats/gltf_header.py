@@ -1,12 +1,13 @@
 """The JSON header of glTF 2.0 files: objects that refer to each other by index, and fields whose types are checked."""
 
-import collections
 import json
 import math
 import pathlib
 from typing import Any
 
 import numpy as np
+
+from jaxprt.files import inputs
 
 _SHOWN = 80  # characters of a wrong value in messages
 _LARGEST = 2**53  # JSON numbers are exact up to here
@@ -36,7 +37,7 @@ class Header:
         self.path = path
         self._items: dict[str, list[dict[str, Any]]] = {}
         try:
-            header = json.loads(text, object_pairs_hook=_object)
+            header = json.loads(text, object_pairs_hook=inputs.unique_names)  # section 2.6
         except (ValueError, RecursionError) as error:
             raise self.error("must be an undamaged glTF file", f"a header that is not JSON: {error}") from error
         if not isinstance(header, dict):
@@ -155,15 +156,6 @@ def excerpt(value: Any) -> str:
     """A value of a header for an error message, cut where it is long."""
     text = repr(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object. Names must be unique (section 2.6 of the specification), since readers differ in their choice."""
-    item = dict(pairs)
-    if len(item) < len(pairs):
-        name, count = collections.Counter(name for name, _ in pairs).most_common(1)[0]
-        raise ValueError(f"an object has the name {excerpt(name)} {count} times")
-    return item
 
 
 def _is_whole(value: Any) -> bool:
