@@ -196,10 +196,15 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
 
 
-def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
-    """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
+def whole(name: str, value: Any) -> None:
+    """Refuses anything but a whole number, by TypeError."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {shown(value)}")
+
+
+def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
+    """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
+    whole(name, value)
     if not least <= value <= most:
         bound = f"at most {most}" if value > least else f"at least {least}"
         bound = bound if most == _MOST else f"between {least} and {most}"

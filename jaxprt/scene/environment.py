@@ -292,11 +292,8 @@ def _check_layout(image: np.ndarray, layout: str, name: str) -> None:
 
 
 def _check_size(shape: tuple[int, ...], layout: str, size: int) -> None:
-    """Refuses sizes that are not whole numbers, and cubemaps that do not fit into memory, before anything is made."""
-    if isinstance(size, bool) or not isinstance(size, int | np.integer):
-        raise TypeError(f"size must be a whole number, got {size!r}")
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
+    """Refuses sizes below 1, and cubemaps that do not fit into memory, before anything is made."""
+    require.count("size", size, least=1)
     rows = _CUBES[layout][0][0] if layout in _CUBES else None
     needed = resampling.bytes_needed(shape, int(size), faces_down=rows, around=_AROUND)
     require.memory(f"a cubemap of 6 x {size} x {size} texels", needed, "choose a smaller size")

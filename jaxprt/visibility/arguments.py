@@ -34,7 +34,7 @@ def _path(value: Any) -> None:
 
 
 def _size(value: Any) -> None:
-    require.count("size", value, least=-(2**63))  # Systems say which smaller sizes they take.
+    require.whole("size", value)  # Systems say which smaller sizes they take.
     if value > _MOST:
         raise ValueError(f"size must be at most {_MOST}, got {value}")
 

@@ -326,7 +326,7 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
 
 def check(degree: int, size: int) -> None:
     """Refuses a degree or a size that is out of range."""
-    require.count("degree", degree, least=-(2**31))
-    require.count("size", size, least=-(2**31))
+    require.whole("degree", degree)
+    require.whole("size", size)
     if not 0 <= degree <= 25 or size < 1 or size & (size - 1):
         raise ValueError(f"degree must be 0 to 25 and size a power of two, got {degree} and {size}")

@@ -110,7 +110,7 @@ def precompute(
     if not lamps:
         raise ValueError("lamps must be at least one, got none")
     require.count("samples", samples, least=1)
-    require.count("pieces", pieces, least=-(2**63))
+    require.whole("pieces", pieces)
     if pieces < 1 or pieces & (pieces - 1) or pieces > samples:
         raise ValueError(f"pieces must be a power of two, and at most the {samples} samples, got {pieces}")
     for number, each in enumerate(lamps):
