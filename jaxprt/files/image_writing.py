@@ -34,7 +34,7 @@ def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
     values = np.asarray(image, np.float32)
     channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with outputs.beside(path) as new:
+    with outputs.replacing(path) as new:
         try:
             with OpenEXR.File(header, channels) as file:
                 file.write(str(new))
@@ -68,7 +68,7 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
     spec.attribute("oiio:UnassociatedAlpha", 1)
     output = OpenImageIO.ImageOutput.create("png")
     assert output is not None  # OpenImageIO's wheels include PNG.
-    with outputs.beside(path) as new:
+    with outputs.replacing(path) as new:
         # The encoder does not report a full disk, so its word alone does not count.
         if not (output.open(str(new), spec) and output.write_image(values) and output.close()):
             raise OSError(output.geterror().replace(str(new), os.fspath(path)) or "the encoder failed")

@@ -66,7 +66,7 @@ def content(path: pathlib.Path, what: str) -> bytes:
     return path.read_bytes()
 
 
-def inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outside: bool) -> pathlib.Path:
+def require_inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outside: bool) -> pathlib.Path:
     """Refuses a file that a scene refers to and that is not in the scene's folder.
 
     `..`, absolute paths and symbolic links are resolved first. A scene from a stranger could otherwise read any file of
@@ -134,7 +134,7 @@ def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str, outside: bool) -> pathlib.Path:
-    r"""The path of a file that a scene names, with the checks of `inside`.
+    r"""The path of a file that a scene names, with the checks of `require_inside`.
 
     A \ belongs to the name, or separates folders, as on Windows, if there is no file of that name. Both paths must be
     inside.
@@ -149,6 +149,6 @@ def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str
     Raises:
         ValueError: The file is outside of the folder. The message names the file.
     """
-    on_windows = inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
-    path = inside(base / name, folder, owner=owner, outside=outside)
+    on_windows = require_inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
+    path = require_inside(base / name, folder, owner=owner, outside=outside)
     return path if os.path.lexists(path) else on_windows

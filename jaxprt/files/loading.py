@@ -69,7 +69,7 @@ def load(path: Path) -> Any:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def filled(kind: type, field: dict[str, Any]) -> Any:
+def construct(kind: type, field: dict[str, Any]) -> Any:
     """An object with these fields. Nothing is converted, checked or called, as when JAX unflattens a pytree."""
     if not dataclasses.is_dataclass(kind):
         return tuple.__new__(kind, field.values())
@@ -145,7 +145,7 @@ class _Reader:
             )
         if kind.__module__ not in self._algorithm:
             raise ValueError(f"its description must state the algorithm of {kind.__module__}, got none")
-        result = filled(
+        result = construct(
             kind, {key: self._make(node, batched or fields.holds_models(kind, key)) for key, node in field.items()}
         )
         fields.check(result, batched=batched)

@@ -106,7 +106,7 @@ def reduced(object: Any) -> tuple:
 
 
 def _restored(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
-    return loading.filled(kind, field | {key: loading.function(path) for key, path in name.items()})
+    return loading.construct(kind, field | {key: loading.function(path) for key, path in name.items()})
 
 
 def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: bool = False) -> dict[str, Any]:

@@ -16,7 +16,7 @@ def target(path: str | os.PathLike, suffix: str) -> pathlib.Path:
     Raises:
         TypeError: The path is not a path.
         ValueError: The suffix is another one.
-        OSError: For the reasons of `beside`, as far as they are known before the file is written.
+        OSError: For the reasons of `replacing`, as far as they are known before the file is written.
     """
     require.path("path", path)
     if pathlib.Path(path).suffix.lower() != suffix:
@@ -27,10 +27,10 @@ def target(path: str | os.PathLike, suffix: str) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def beside(path: str | os.PathLike) -> Iterator[pathlib.Path]:
+def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     """A new, empty file in the same folder, which replaces `path` when the block ends without an error.
 
-        with outputs.beside("page.html") as file:
+        with outputs.replacing("page.html") as file:
             file.write_text(page)
 
     The bytes are on the disk before the file is renamed. After an error, or Ctrl-C, the old file is unchanged, and the
@@ -69,7 +69,7 @@ def beside(path: str | os.PathLike) -> Iterator[pathlib.Path]:
 
 
 def write(path: str | os.PathLike, content: bytes | str) -> None:
-    """Writes a file as `beside` does. Text is encoded as UTF-8, with the line ends that it has.
+    """Writes a file as `replacing` does. Text is encoded as UTF-8, with the line ends that it has.
 
     Args:
         path: The file. An old one is replaced.
@@ -78,7 +78,7 @@ def write(path: str | os.PathLike, content: bytes | str) -> None:
     Raises:
         OSError: The file cannot be written. The old file, if any, is unchanged.
     """
-    with beside(path) as file:
+    with replacing(path) as file:
         file.write_bytes(content.encode() if isinstance(content, str) else content)
 
 

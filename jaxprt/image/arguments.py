@@ -61,12 +61,12 @@ def color(value: Any) -> jax.Array:
     return require.floating(value)
 
 
-def behind(value: Any) -> jax.Array | None:
+def background(value: Any) -> jax.Array | None:
     """Refuses a background that is neither None nor of numbers without NaN."""
     return None if value is None else numbers("the background")(value)
 
 
-def check_behind(background: jax.Array | None, camera: Camera, colors: int) -> None:
+def check_background(background: jax.Array | None, camera: Camera, colors: int) -> None:
     """Refuses a background of another size than the picture."""
     if background is None:
         return

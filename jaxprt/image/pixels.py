@@ -166,7 +166,7 @@ def resolve(
     camera=arguments.a_camera,
     samples=arguments.samples,
     color=arguments.color,
-    background=arguments.behind,
+    background=arguments.background,
 )
 def render(
     mesh: Mesh,
@@ -194,7 +194,7 @@ def render(
     """
     if color.shape[:1] != mesh.position.shape[:1] or color.ndim != 2:
         raise ValueError(f"color must be [{mesh.position.shape[0]}, c], one per vertex, got {list(color.shape)}")
-    arguments.check_behind(background, camera, color.shape[1])
+    arguments.check_background(background, camera, color.shape[1])
     pixels = shading_points(raster.rasterize(mesh, camera, samples=samples), mesh, camera)
     return resolve(pixels, interpolate(pixels, mesh.face, color), background=background)
 

@@ -176,7 +176,7 @@ def aligned(meshes: Sequence[Mesh]) -> list[Mesh]:
     if len({mesh.origin for mesh in meshes}) < 2:
         return list(meshes)
     corner = [np.stack(bounds(mesh)) for mesh in meshes]
-    origin = origins.of(np.concatenate(corner))
+    origin = origins.mesh_origin(np.concatenate(corner))
     return [relative(mesh, origin) for mesh in meshes]
 
 
@@ -324,7 +324,7 @@ def _make(position, face, normal, tangent, region, texture, *, name: str, welded
     _check(position, face, region, name)
     used = np.zeros(count, bool)
     used[face.ravel()] = True
-    origin = origins.of(position[used])
+    origin = origins.mesh_origin(position[used])
     exact = position.astype(np.float64) - origin
     origins.warn_of_rounding(exact, face, name)
     position = exact.astype(np.float32)

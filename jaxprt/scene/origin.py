@@ -25,7 +25,7 @@ _BLOCK = 1 << 18  # triangles
 _LARGE = 64.0  # coordinates above this are kept in float64 where float32 would round them
 
 
-def of(position: Float[np.ndarray, "v 3"]) -> Origin:
+def mesh_origin(position: Float[np.ndarray, "v 3"]) -> Origin:
     """The origin of a mesh: zero unless the mesh is farther from it than 64 times its size.
 
     The origin is the middle of the bounding box, without the outermost hundredth of the vertices, rounded to a multiple

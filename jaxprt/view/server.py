@@ -75,10 +75,10 @@ class Server:
             OSError: The port is in use or not permitted.
         """
         require.count("port", port, least=0, most=65535)
-        token, coming = secrets.token_urlsafe(16), None if address is None else parse(address)
-        self._server = _Listener(port, session, token, coming)
+        token, parsed = secrets.token_urlsafe(16), None if address is None else parse(address)
+        self._server = _Listener(port, session, token, parsed)
         self.port = self._server.server_port
-        start = f"http://127.0.0.1:{self.port}" if coming is None else coming.url
+        start = f"http://127.0.0.1:{self.port}" if parsed is None else parsed.url
         self.url = f"{start}/{token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="jaxprt-view", daemon=True)
         self._thread.start()

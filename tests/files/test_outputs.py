@@ -9,7 +9,7 @@ from jaxprt.files import outputs
 def test_the_new_file_replaces_the_old_one_at_the_end(tmp_path):
     path = tmp_path / "page.html"
     path.write_text("old")
-    with outputs.beside(path) as new:
+    with outputs.replacing(path) as new:
         assert new.parent == tmp_path
         assert new.suffix == ".html"
         new.write_text("new")
@@ -19,7 +19,7 @@ def test_the_new_file_replaces_the_old_one_at_the_end(tmp_path):
 
 
 def half_write(path, error):
-    with outputs.beside(path) as new:
+    with outputs.replacing(path) as new:
         new.write_text("half a page")
         raise error
 

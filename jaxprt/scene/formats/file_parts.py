@@ -59,11 +59,13 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
     place = second if source is not None and source.set else mesh.texture
     if place is not None and (source is not None or material.anisotropy > 0):
         given = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[own] != 0).any(axis=1)
-        mesh, side = _laid(mesh, place, given, side)
+        mesh, side = _with_tangents(mesh, place, given, side)
     return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side))
 
 
-def _laid(mesh: Mesh, place: np.ndarray | Array, given: np.ndarray, side: np.ndarray | None) -> tuple[Mesh, np.ndarray]:
+def _with_tangents(
+    mesh: Mesh, place: np.ndarray | Array, given: np.ndarray, side: np.ndarray | None
+) -> tuple[Mesh, np.ndarray]:
     """The mesh with tangents along u where the file has none, and the handedness of all vertices."""
     image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, jnp.asarray(place, jnp.float32))
     along = np.where(given[:, None], mesh.tangent, texture.dpdu(image))

@@ -51,7 +51,7 @@ def of_images(
     return materials, ignored
 
 
-def filled(geometry: Geometry, materials: Sequence[TexturedMaterial], plain: TexturedMaterial) -> Geometry:
+def with_base_color(geometry: Geometry, materials: Sequence[TexturedMaterial], plain: TexturedMaterial) -> Geometry:
     """The geometry with a color for each vertex, if it has colors at all.
 
     Vertices without color are gray where their region has no material, and have the color of the material elsewhere.

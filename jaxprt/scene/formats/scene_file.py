@@ -84,4 +84,4 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
         names = [path.stem] * len(materials)
         if ignored:
             warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=2)
-    return Scene(split_parts(mesh_colors.filled(content.geometry, materials, plain), names, materials, path))
+    return Scene(split_parts(mesh_colors.with_base_color(content.geometry, materials, plain), names, materials, path))

@@ -80,7 +80,7 @@ def export_transfer(
     position = position @ convention.turn.T.astype(position.dtype)
     name = json.dumps(dataclasses.asdict(convention))
     if kind == ".npy":
-        with outputs.beside(path) as new, new.open("wb") as file:  # NumPy would add a suffix to some names.
+        with outputs.replacing(path) as new, new.open("wb") as file:  # NumPy would add a suffix to some names.
             np.save(file, value)
     elif kind == ".npz":
         arrays: dict[str, Any] = {"coefficient": value, "position": position, "face": np.asarray(mesh.face)}
@@ -88,7 +88,7 @@ def export_transfer(
         arrays["convention"] = name
         if isinstance(transport, TransferMatrix):
             arrays["frame"] = np.asarray(transport.frame) @ convention.turn.T.astype(np.float32)
-        with outputs.beside(path) as new, new.open("wb") as file:
+        with outputs.replacing(path) as new, new.open("wb") as file:
             np.savez(file, **arrays)
     else:
         _write_ply(path, position, np.asarray(mesh.face), value, name)
