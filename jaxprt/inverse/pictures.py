@@ -230,9 +230,9 @@ class Residual(eqx.Module):
 
 def smoothness(radiance: Float[Array, "6 n n c"]) -> Float[Array, ""]:
     """Mean squared difference between neighboring texels, across the edges of faces too: a prior of light."""
-    require.real("the radiance", radiance)
-    if np.ndim(radiance) != 4 or np.shape(radiance)[0] != 6:
-        got = list(radiance.shape) if hasattr(radiance, "shape") else type(radiance).__name__
+    wrong = require.unreal(radiance)
+    if wrong or np.ndim(radiance) != 4 or np.shape(radiance)[0] != 6:
+        got = list(np.shape(radiance)) if not wrong else type(radiance).__name__
         raise ValueError(
             f"the radiance must be that of texels, [6, n, n, c], got {got}: for an Environment, give its `.radiance`"
         )

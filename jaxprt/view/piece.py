@@ -100,7 +100,7 @@ def export(
         OSError: The file cannot be written, found before the page is computed where possible.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
-    require.number("most", most, 1)
+    require.number("most", most, 1.0)
     path = outputs.target(path, ".html")
     scene = scene.centered()
     session = Session(scene, environments=environments)

@@ -272,7 +272,7 @@ def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     refused(colored, "have gray transfer matrices to be exported, got 3 colors")
     skewed = eqx.tree_at(lambda each: each.brdf.table, ball, ball.brdf.table.at[1].add(ball.brdf.table[3]))
     refused(skewed, "have a BRDF that is symmetric about the plane of the view")
-    with pytest.raises(ValueError, match=r"path must end in \.html, .* got 'a\.htm'"):
+    with pytest.raises(ValueError, match=r"path must end in \.html, .* got '.*a\.htm'"):
         view.export(systems["lobes"], tmp_path / "a.htm")
 
 
