@@ -19,6 +19,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap
 
 _BENT = 0.25  # between corners' normals: about 14 degrees
+_ALIKE = 1e-4  # relative difference of bends that are equal but for rounding
 
 
 def _mask(value) -> Array | None:
@@ -173,7 +174,8 @@ def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.nda
             "not: mask them"
         )
     bent = _bent(mesh, seen[counts])
-    counts[counts] = bent <= np.maximum(_BENT, np.median(bent) if bent.size else 0)
+    # Triangles of regular meshes bend alike up to rounding, which must not decide which of their pixels count.
+    counts[counts] = bent <= np.maximum(_BENT, (1 + _ALIKE) * np.median(bent) if bent.size else 0)
     vertex = np.asarray(mesh.face)[seen[counts]] + number * len(mesh.position)
     return vertex, np.asarray(fragments.barycentric)[counts] * picture.exposure, image[counts]
 

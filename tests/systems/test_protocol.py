@@ -84,13 +84,13 @@ def hills(count: int) -> Mesh:
     side = int(np.sqrt(count))
     x, z = np.meshgrid(*[np.linspace(-2, 2, side)] * 2)
     height = 0.2 * np.sin(5 * x) * np.cos(4 * z)
-    ground = make_mesh(np.stack([x, height, z], -1).reshape(-1, 3), grid_face(rows=side, columns=side))
+    position, face = np.stack([x, height, z], -1).reshape(-1, 3), grid_face(rows=side, columns=side)
     rest = count - side**2
     if not rest:
-        return ground
+        return make_mesh(position, face)
     corner = np.random.default_rng(0).uniform(-1, 1, (rest, 3)) + [0, 2, 0]
-    face = np.minimum(np.arange(rest // 3 * 3 + 3 * (rest % 3 > 0)), rest - 1).reshape(-1, 3)
-    return join([ground, make_mesh(corner, face, region=np.zeros(rest, int))])
+    above = np.minimum(np.arange(rest // 3 * 3 + 3 * (rest % 3 > 0)), rest - 1).reshape(-1, 3)
+    return make_mesh(np.concatenate([position, corner]), np.concatenate([face, side**2 + above]))
 
 
 @functools.cache
