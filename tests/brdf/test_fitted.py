@@ -91,7 +91,7 @@ DEEP = "[" * 100_000
         (b'{"materials": []}', "got a file without materials"),
         (b'{"materials": {}}', "got a file without materials"),
         (b'{"materials": {"clay": 3}}', "got clay in another form"),
-        (b'{"materials": {"clay": {}, "clay": {}}}', "the name 'clay' twice"),
+        (b'{"materials": {"clay": {}, "clay": {}}}', "the name 'clay' 2 times"),
         (f'{{"materials": {DEEP}'.encode(), "nested too deeply"),
         (b'{"materials": ' + b"1" * 5000 + b"}", "got other content"),
     ],
