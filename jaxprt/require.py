@@ -53,7 +53,10 @@ def unreal(value: Any) -> str:
 
 
 def _array_of(value: Any) -> Any:
-    """A value as an array; None if it cannot be one. JAX arrays, and lists of values inside `jax.jit`, are JAX's."""
+    """Converts a value to an array of NumPy, or of JAX for lists of values inside `jax.jit`; None if it cannot.
+
+    Arrays stay as they are.
+    """
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
     for convert in (np.asarray, jnp.asarray):  # NumPy cannot convert lists of values inside `jax.jit`.
@@ -206,7 +209,7 @@ def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
     """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
     whole(name, value)
     if not least <= value <= most:
-        bound = f"at most {most}" if value > least else f"at least {least}"
+        bound = f"at least {least}" if value < least else f"at most {most}"
         bound = bound if most == _MOST else f"between {least} and {most}"
         raise ValueError(f"{name} must be {bound}, got {value}")
 

@@ -20,7 +20,7 @@ Origin = tuple[float, float, float]
 ZERO: Origin = (0.0, 0.0, 0.0)
 _FAR = 64  # distance from zero, in diagonals of the bounding box, from which on a mesh gets an origin of its own
 _OUTLIERS = 0.01  # share of the vertices at each end of an axis that do not count: stray ones are common in surveys
-_FINE = 64  # steps of float32 that the extent of a triangle should have: its normal then is right to about a degree
+_FINE = 64  # steps of float32 that the extent of a triangle should have: corners are then right to a hundredth of it
 _BLOCK = 1 << 18  # triangles
 _LARGE = 64.0  # coordinates above this are kept in float64 where float32 would round them
 
@@ -64,9 +64,9 @@ def warn_of_rounding(position: Float[np.ndarray, "v 3"], face: Integer[np.ndarra
     if first is not None and rounded > _OUTLIERS * len(face):
         step = float(np.spacing(np.float32(np.abs(first[1]).max())))
         warnings.warn(
-            f"{name}: float32 rounds {rounded} of {len(face)} triangles visibly, because the mesh is wide and they are "
-            f"small and far from its middle: triangle {first[0]} has steps of {step:.2g}. Remove stray vertices, or "
-            "load parts that are far apart as scenes of their own",
+            f"{name}: {rounded} of {len(face)} triangles lose their shape in float32, because parts of the mesh are "
+            f"too far apart: the corners of triangle {first[0]} are rounded to steps of {step:.2g} units. Remove stray "
+            "vertices, or load distant parts as separate scenes",
             stacklevel=5,
         )
 

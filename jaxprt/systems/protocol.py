@@ -184,30 +184,43 @@ def check_blend(value: Any) -> None:
         require.kind("the materials", value, Blend, source="jaxprt.systems.protocol.Blend")
 
 
-class Total(System):
+class _Composite(System):
+    """Several systems that share an origin.
+
+    Attributes:
+        part: The systems.
+    """
+
+    part: tuple[System, ...]
+
+    def __check_init__(self):
+        """Refuses systems of different origins."""
+        origin = {system.origin for system in self.part}
+        if len(origin) > 1:
+            raise ValueError(f"systems must have one origin, got {sorted(origin)}: precompute their parts as one scene")
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the zero of all systems is in the coordinates of eyes."""
+        return self.part[0].origin if self.part else origins.ZERO
+
+    def centered(self) -> System:
+        """The same systems for eyes relative to `origin`."""
+        return type(self)(tuple(system.centered() for system in self.part))
+
+
+class Total(_Composite):
     """The sum of several systems over the same vertices, such as direct and reflected light.
 
     Attributes:
         part: The systems. All receive the same materials.
     """
 
-    part: tuple[System, ...]
-
     def __check_init__(self):
-        """Refuses systems of different vertices or origins."""
+        """Refuses systems of different vertices."""
         counts = [system.vertices for system in self.part]
         if len(set(counts)) != 1:
             raise ValueError(f"systems must be one or more with the same number of vertices, got {counts}")
-        _common_origin(self.part)
-
-    @property
-    def origin(self) -> origins.Origin:
-        """Where the zero of all systems is in the coordinates of eyes."""
-        return _common_origin(self.part)
-
-    def centered(self) -> "Total":
-        """The same sum for eyes relative to `origin`."""
-        return Total(tuple(system.centered() for system in self.part))
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""
@@ -240,7 +253,7 @@ class Total(System):
         return self.part[0].vertices
 
 
-class Joined(System):
+class Joined(_Composite):
     """Systems of different meshes, with their vertices concatenated in the order of `scene.mesh.join`.
 
     Materials are a list with one entry for each system, or None.
@@ -248,21 +261,6 @@ class Joined(System):
     Attributes:
         part: The systems.
     """
-
-    part: tuple[System, ...]
-
-    def __check_init__(self):
-        """Refuses systems of different origins."""
-        _common_origin(self.part)
-
-    @property
-    def origin(self) -> origins.Origin:
-        """Where the zero of all systems is in the coordinates of eyes."""
-        return _common_origin(self.part)
-
-    def centered(self) -> "Joined":
-        """The same systems for eyes relative to `origin`."""
-        return Joined(tuple(system.centered() for system in self.part))
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system. Systems with the same `shared_light` share one result."""
@@ -317,14 +315,6 @@ class Joined(System):
         """The keys of all systems; None if one of them has none."""
         keys = tuple(each.shared_light for each in self.part)
         return None if None in keys else (Joined, *keys)
-
-
-def _common_origin(systems: Sequence[System]) -> origins.Origin:
-    """The origin of all systems, by ValueError if they differ."""
-    origin = {system.origin for system in systems}
-    if len(origin) > 1:
-        raise ValueError(f"systems must have one origin, got {sorted(origin)}: precompute their parts as one scene")
-    return next(iter(origin), origins.ZERO)
 
 
 def check_list(points: Any, parts: int) -> None:

@@ -225,7 +225,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 413, f"a message must have at most {most} bytes, as many as fit into memory, got {lengths[0][:40]}"
             )
             return None
-        data, deadline = bytearray(), time.monotonic() + _BODY + length / _SLOWEST
+        data, limit = bytearray(), _BODY + length / _SLOWEST
+        deadline = time.monotonic() + limit
         self.connection.settimeout(_BODY)
         try:
             while len(data) < length:
@@ -237,7 +238,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 if time.monotonic() > deadline:
                     raise TimeoutError
         except TimeoutError:
-            self._refuse(408, f"a message must arrive faster, got {len(data)} of {length} bytes in time")
+            self._refuse(408, f"a message must arrive within {limit:.3g} seconds, got {len(data)} of {length} bytes")
             return None
         self.connection.settimeout(self.timeout)
         return data

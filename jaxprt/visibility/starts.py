@@ -82,7 +82,7 @@ def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     of_vertex = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
     joint = _added(place, of_vertex, len(normal))[place]
-    # The normals of the two sides of a sheet cancel; each vertex then uses its of_vertex faces only.
+    # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     shared = np.sum(joint * of_vertex, 1) > 1e-6 * np.sum(of_vertex * of_vertex, 1)
     total = np.where(shared[:, None], joint, of_vertex)
     length = np.linalg.norm(total, axis=1, keepdims=True)

@@ -183,7 +183,7 @@ def test_a_message_that_stops_is_refused(echo, quick):
     status, text = exchange(echo, whole[:-3])
     assert (status, "bytes that it states" in text) == (400, True)
     status, text = exchange(echo, whole[:-3], end=False)
-    assert (status, "bytes in time" in text) == (408, True)
+    assert (status, "must arrive within 0.4 seconds" in text) == (408, True)
 
 
 def test_a_message_that_dribbles_is_refused_and_others_are_served_meanwhile(echo, quick):

@@ -46,7 +46,7 @@ def nodes(document: Document) -> list[Node]:
 def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable[int]) -> dict[int, np.ndarray]:
     """World transforms of the nodes of the scene, and of joints outside of it. Joints in a circle of nodes have none.
 
-    Of the nodes outside of the scene, only the joints and their ancestors are read. The others may be damaged.
+    The reader skips all other nodes outside of the scene, so damage in them does not matter.
 
     Args:
         document: The file.
@@ -73,7 +73,7 @@ def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable
                 raise document.error("must have nodes that form trees", got)
             node = owners[0] if owners else None
         if node in way:
-            break  # a circle
+            continue  # a circle
         for child in reversed(way):
             above.append(-1 if node is None else place[node])
             level.append(0 if node is None else level[place[node]] + 1)

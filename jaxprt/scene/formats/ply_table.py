@@ -155,7 +155,7 @@ def read_elements(content: bytes, header: Header, names: set[str], lists: set[st
 
     Args:
         content: The file.
-        header: Its header.
+        header: The header of the file.
         names: Names of the elements.
         lists: Names of the properties whose lists are read. Other lists have their lengths, but no items.
 
