@@ -39,7 +39,7 @@ MOST_ERROR = {
     "failures": 0.3,
     "gradients": 1e-7,
     "interreflection": 0.65,
-    "inverse": 0.2,  # of an exponent that pictures of 32 x 32 pixels determine to 6 %
+    "inverse": 0.16,  # of an exponent that pictures of 32 x 32 pixels determine to 6 %
     "lobes": 0.15,
     "low_frequency": 0.06,  # of nine coefficients of irradiance
     "million": 1e-5,

@@ -73,10 +73,9 @@ def test_deviations_are_those_of_many_noisy_pictures(mesh, cameras, glossy, sky)
     spread = np.std([np.asarray(each.value) for each in fits], axis=0, ddof=1)
     said = np.mean([np.asarray(each.deviation) for each in fits], axis=0)
     ratio = np.sqrt(np.mean((spread / said) ** 2))
-    # All numbers lean on the direction that the pictures determine least, so that 24 fits tell the ratio to .04: over
-    # 24 seeds it is .92 with a standard deviation of .039. Deviations are a little too large, because a direction in
-    # which blocks disagree by chance counts as if the model were wrong there.
-    assert 0.8 < ratio < 1.04
+    # All numbers lean on the direction that the pictures determine least, so that the ratio of 24 fits varies by .033
+    # with the seed, about .94: a direction in which blocks disagree by chance counts as if the model were wrong there.
+    assert 0.93 < ratio < 1.07
 
 
 def test_pictures_from_more_sides_tell_more(mesh, cameras, glossy, sky):
