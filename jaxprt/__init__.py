@@ -3,8 +3,8 @@
 Conventions, everywhere in this package:
 
 * Positions, eyes, cameras and lights are in world units and in the coordinates of the scene's file. Meshes far from
-  zero store positions relative to `Mesh.origin`, because float32 would round them; systems that were precomputed for a
-  mesh take eyes relative to it too. All else, scenes, pictures and `reference.radiance` included, speaks the file's.
+  zero store positions relative to `Mesh.origin`, because float32 would round them. Systems that were precomputed for
+  a mesh take eyes relative to it too; scenes, pictures and `reference.radiance` take those of the file.
 * The world is right-handed and +y is up. Latitude-longitude images have +y in the top row, +z in the
   center column and +x a quarter of the width from the left.
 * The local frame of a surface point is (tangent, bitangent, normal) = (x, y, z).
