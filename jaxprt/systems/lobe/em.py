@@ -1,5 +1,6 @@
 """Steps of the fit of lobes to a BRDF by expectation maximization (EM); `jaxprt.lobe.tabulate` calls them."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -132,19 +133,38 @@ def improve(
     return jax.lax.map(one, (sample, mass, extent, lobe, least, fixed, weight), batch_size=_BATCH)
 
 
-@partial(jit, static_argnames=("nodes",))
+@partial(jit, static_argnames=("nodes", "parameters"))
 def blend(
-    wo: Float[Array, "v 3"], lobe: mixture.Mixture, smoothing: Float[Array, ""], *, nodes: tuple[int, ...]
+    wo: Float[Array, "v 3"],
+    lobe: mixture.Mixture,
+    smoothing: Float[Array, ""],
+    *,
+    nodes: tuple[int, ...],
+    parameters: int = 0,
 ) -> mixture.Mixture:
     """Moves the lobes of each node towards those of its neighbors in the table.
 
     Slopes of half vectors, logarithms of concentrations and relative weights are averaged. The two neighbors along an
     axis together get the weight `smoothing`, and each of them counts in proportion to its lobe's weight, because a lobe
-    without weight has an arbitrary direction.
+    without weight has an arbitrary direction. Slopes and widths of neighbors along a BRDF parameter are compared
+    relative to the mean width of all lobes that have the same parameters.
+
+    Args:
+        wo: Unit directions to the viewer at the nodes.
+        lobe: The lobes at the nodes.
+        smoothing: Weight of the two neighbors along each axis.
+        nodes: Number of nodes along each axis.
+        parameters: Number of leading axes that are BRDF parameters; the others are axes of the view.
     """
     total = jnp.sum(lobe.weight, 1, keepdims=True)
     part = (lobe.weight / jnp.where(total > 0, total, 1))[..., None]
-    every = jnp.concatenate([_slope(lobe.mean + wo[:, None]), jnp.log(lobe.concentration)[..., None], part], -1)
+    slope, scale = _slope(lobe.mean + wo[:, None]), jnp.log(lobe.concentration)[..., None]
+    mean = 0
+    if parameters:
+        member = scale.reshape(math.prod(nodes[:parameters]), -1)
+        mean = jnp.repeat(jnp.mean(member, 1), len(wo) // len(member))[:, None, None]
+        slope, scale = slope * jnp.exp(mean / 2), scale - mean
+    every = jnp.concatenate([slope, scale, part], -1)
     sure = part + 1e-4
     count, every, sure = lobe.weight.shape[1], every.reshape(*nodes, -1, 4), sure.reshape(*nodes, -1, 1)
     for axis in range(len(nodes)):
@@ -154,8 +174,10 @@ def blend(
         top, sure = ((1 - smoothing) * b + smoothing / 2 * (a + c) for a, b, c in zip(low, own, high, strict=True))
         every = top / sure
     every = every.reshape(-1, count, 4)
-    mean = _reflected(wo, every[..., :2], 0.0)
-    return mixture.Mixture(every[..., 3] * total, mean, jnp.exp(every[..., 2]))
+    slope, scale, part = every[..., :2], every[..., 2], every[..., 3]
+    if parameters:
+        slope, scale = slope * jnp.exp(-mean / 2), jnp.minimum(scale + mean[..., 0], math.log(FINEST))
+    return mixture.Mixture(part * total, _reflected(wo, slope, 0.0), jnp.exp(scale))
 
 
 @jit

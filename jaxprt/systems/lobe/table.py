@@ -214,7 +214,8 @@ def tabulate(
 
     At each view node, EM fits lobes to samples on arcs around the mirror direction. All nodes start with the same
     arrangement of lobes in terms of half vectors. Between rounds of EM each node is averaged with its neighbors, so
-    that corresponding lobes of adjacent nodes can be interpolated. Three quarters of the lobes are at most about 0.7
+    that corresponding lobes of adjacent nodes can be interpolated; neighbors along a BRDF parameter are averaged too,
+    relative to the width of their lobes. Three quarters of the lobes are at most about 0.7
     times as wide as a single lobe would be, so that they resolve light and visibility that vary over the BRDF's lobe.
     The others may be wider, to fit the tails of sharp BRDFs. The reflected energy of each node is preserved. The last
     node of an isotropic table is half a degree above the horizon and used as if it were on it.
@@ -255,7 +256,7 @@ def tabulate(
     wo, samples = both[0][0], [each for _, each in both]
     reached = np.inf
     for count in _COUNTS if lobes is None else (lobes,):
-        tables = [_table(each, wo, lobes=count) for each in samples]
+        tables = _tables(samples, wo, tuple(map(len, knots)), lobes=count)
         result = _stacked(tables, knots, wo.shape[:-1])
         reached = max(
             float(_natural_error(b, _stacked([t], (), wo.shape[:-1]))) for b, t in zip(made, tables, strict=True)
@@ -307,17 +308,41 @@ def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
     return LobeBrdf(stack(0, 2), stack(1, 1), stack(2, 2), stack(3, 1), knot, jnp.asarray(jnp.nan, dtype))
 
 
-def _table(samples: tuple[Array, ...], wo: Array, *, lobes: int) -> tuple[Array, Array, Array, Array]:
-    """Means, logarithms of concentrations, weights and diffuse albedos of one BRDF at the view nodes `wo` [*q 3]."""
-    nodes = wo.shape[:-1]
-    view, (sample, mass, fixed, extent) = np.asarray(wo).reshape(-1, 3), samples
-    gray, lobe, least, weight = _begin(view, sample, mass, lobes=lobes)
+def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], *, lobes: int) -> list[tuple]:
+    """Means, logarithms of concentrations, weights and diffuse albedos of each BRDF at the view nodes `wo` [*q 3].
+
+    The BRDFs are those at the knots of the parameters, of which there are `size` along each axis. EM runs for one BRDF
+    at a time; smoothing between the rounds is along the parameters too.
+    """
+    nodes, view = wo.shape[:-1], np.asarray(wo).reshape(-1, 3)
+    state = [_begin(view, sample, mass, lobes=lobes) for sample, mass, _, _ in samples]
+    lobe, weight = [each[1] for each in state], [each[3] for each in state]
     for times, smoothing in _ROUNDS:
-        for _ in range(times):
-            lobe, weight = em.improve(sample, gray, extent, lobe, least, fixed, weight, steps=_STEPS)
+        for number, (sample, _, fixed, extent) in enumerate(samples):
+            gray, _, least, _ = state[number]
+            for _ in range(times):
+                lobe[number], weight[number] = em.improve(
+                    sample, gray, extent, lobe[number], least, fixed, weight[number], steps=_STEPS
+                )
         if smoothing:
-            lobe = em.blend(view, lobe, jnp.asarray(smoothing, wo.dtype), nodes=nodes)
-    return _end(lobe, em.weigh(sample, mass, extent, lobe, fixed, weight), nodes=nodes)
+            lobe = _blended(view, lobe, jnp.asarray(smoothing, wo.dtype), size, nodes)
+    return [
+        _end(one, em.weigh(sample, mass, extent, one, fixed, base), nodes=nodes)
+        for one, base, (sample, mass, fixed, extent) in zip(lobe, weight, samples, strict=True)
+    ]
+
+
+def _blended(
+    view: np.ndarray, lobe: list[mixture.Mixture], smoothing: Array, size: tuple[int, ...], nodes: tuple[int, ...]
+) -> list[mixture.Mixture]:
+    """The lobes of all BRDFs, each moved towards its neighbors along the parameters and the view."""
+    if not size:
+        return [em.blend(view, lobe[0], smoothing, nodes=nodes)]
+    every = jax.tree.map(lambda *each: np.concatenate([np.asarray(x) for x in each]), *lobe)
+    views = np.tile(view, (len(lobe), 1))
+    every = em.blend(views, every, smoothing, nodes=(*size, *nodes), parameters=len(size))
+    split = [np.split(np.asarray(each), len(lobe)) for each in jax.tree.leaves(every)]
+    return [jax.tree.unflatten(jax.tree.structure(every), leaves) for leaves in zip(*split, strict=True)]
 
 
 @partial(jit, static_argnames=("lobes",))

@@ -18,6 +18,7 @@ RESOLUTION = 8
 ENERGY = 2e-3  # The plane of the horizon cuts a wide lobe by a sum over its samples, in float32.
 BETWEEN = 0.03  # Eight nodes of the view: weights are linear between them.
 EM = 1e-2  # Rounding in another order, through seventy steps that do not converge.
+SMOOTHED = 0.05  # Rounds of EM also average with the lobes of the neighboring knots.
 DIFFERENCE = 2e-2  # Central differences in float32 of what varies over a tenth of a radian.
 
 GLOSSY = CookTorrance(diffuse=0.2, specular=0.5, roughness=0.2)
@@ -299,7 +300,7 @@ def test_values_come_in_any_batch(quick, close, shape):
     close(np.asarray(actual).reshape(-1, 3), np.array(each).reshape(-1, 3), tolerance=1e-4)
 
 
-def test_knots_have_the_tables_of_their_brdfs(quick, close):
+def test_knots_have_the_tables_of_their_brdfs_but_for_the_smoothing_between_knots(quick, close):
     varying = quick("varying", resolution=4)
     assert varying.mean.shape == (3, 2, 3, 4)
     assert varying.isotropic
@@ -308,11 +309,11 @@ def test_knots_have_the_tables_of_their_brdfs(quick, close):
         single = quick(f"rough {roughness}", resolution=4)
         found = chosen(varying, np.float32(roughness))
         assert found.knot == ()
-        close(np.asarray(varying.mean)[:, :, number], single.mean, tolerance=1e-4)
-        close(found.weight, single.weight, tolerance=1e-4)
-        close(found.scale, single.scale, tolerance=1e-4)
-        close(found.mean, single.mean, tolerance=1e-4)
-        close(found.diffuse, single.diffuse, tolerance=1e-4)
+        close(np.asarray(varying.mean)[:, :, number], single.mean, tolerance=SMOOTHED)
+        close(found.weight, single.weight, tolerance=SMOOTHED)
+        close(found.scale, single.scale, tolerance=SMOOTHED)
+        close(found.mean, single.mean, tolerance=SMOOTHED)
+        close(found.diffuse, single.diffuse, tolerance=SMOOTHED)
 
 
 def test_weights_are_linear_between_knots_and_places_means_by_weight_and_both_clamped_outside(quick, close):
