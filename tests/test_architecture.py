@@ -28,6 +28,7 @@ ROOMS += ["decompose", "sphere", "files", "compile", "require"]
 
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.
 LADDER = [
+    {"standard"},
     {"bounces", "ranges"},
     {"dynamic", "lamps"},
     {"separable", "lobe"},

@@ -18,13 +18,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness, grid
-from jaxprt.brdf.varying import Channels, PerVertex
+from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit
 from jaxprt.scene import Mesh, Part
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
+from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
 
 _SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
 _STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
@@ -32,39 +33,6 @@ _EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
 _RARE = 0.02  # smallest scale of a channel, relative to the largest
 _NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # names of the terms of MetallicRoughness
 _BARE = (3,)  # the only term of a Lambertian material
-
-
-class RoughnessFamily(eqx.Module):
-    """Maps a roughness to the BRDF whose channels are terms of `MetallicRoughness`.
-
-    Attributes:
-        term: Indices of the terms that are channels.
-        scale: Factor of each channel.
-        anisotropy: Strength of the anisotropy, along the tangent.
-    """
-
-    term: tuple[int, ...] = eqx.field(static=True)
-    scale: Float[Array, " k"]
-    anisotropy: Float[Array, ""]
-
-    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
-        """The BRDF for the natural logarithm of a roughness."""
-        each = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
-        return Channels(tuple(each[k] for k in self.term), self.scale)
-
-
-class ShininessFamily(eqx.Module):
-    """Maps a roughness to the BRDF whose channels are the diffuse base and the lobe of `BlinnPhong`.
-
-    Attributes:
-        scale: Factor of each channel.
-    """
-
-    scale: Float[Array, " k"]
-
-    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
-        """The BRDF for the natural logarithm of a roughness, the square root of 2 / (exponent + 2)."""
-        return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)
 
 
 class Shading(eqx.Module):

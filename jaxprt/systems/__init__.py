@@ -12,6 +12,7 @@ from jaxprt.systems import (
     ranges,
     reference,
     separable,
+    standard,
 )
 
 __all__ = [
@@ -26,4 +27,5 @@ __all__ = [
     "ranges",
     "reference",
     "separable",
+    "standard",
 ]

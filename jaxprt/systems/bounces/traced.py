@@ -16,6 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jaxprt import require
 from jaxprt.compile import jit
@@ -29,7 +30,7 @@ from jaxprt.systems.lobe.narrow import share
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 
-_FEW = 0.55  # smallest traced fraction of what a BRDF's lobes reflect for which rays are traced
+FEW = 0.55  # smallest traced fraction of what a BRDF's lobes reflect for which rays are traced
 _LITTLE = 0.01  # smallest traced fraction of all reflected light for which rays are traced
 _GOLDEN = (5**0.5 - 1) / 2  # fraction of a turn from one ray to the next
 _TINY = 1e-12
@@ -135,11 +136,10 @@ class SharpPart(ReflectingPart):
 
 
 @jit
-def _narrow(table: LobeBrdf) -> Float[Array, ""]:
-    """Fraction of the light reflected by a table's lobes that would be traced, averaged over views.
+def albedos(table: LobeBrdf) -> Float[Array, "3 c *k"]:
+    """Mean albedos of each channel of a table: of the traced lobes, of all lobes, and of the diffuse part.
 
-    Views are weighted by projected solid angle. The result is the largest fraction for any parameters of the table; 0
-    if nearly all light is reflected by the diffuse part.
+    They are in relative units. Views are weighted by projected solid angle. Axes of parameters remain.
     """
     views = table.scale.shape[len(table.knot) + 1 :]
     if table.isotropic:
@@ -151,17 +151,26 @@ def _narrow(table: LobeBrdf) -> Float[Array, ""]:
         area = jnp.ones_like(radius)
     # Projected solid angle in the parabolic map, whose radius is the tangent of half the angle.
     area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
-    axes = tuple(range(-len(views), 0))
-    lobe = jnp.sum(table.weight, 0)
-    traced = jnp.sum(jnp.sum(lobe * share(jnp.exp(table.scale)), 0) * area, axes)
-    glossy, diffuse = jnp.sum(jnp.sum(lobe, 0) * area, axes), jnp.sum(jnp.sum(table.diffuse, 0) * area, axes)
-    part = jnp.where(traced > _LITTLE * (glossy + diffuse), traced / jnp.maximum(glossy, _TINY), 0)
-    return jnp.max(part)
+    traced = jnp.sum(table.weight * share(jnp.exp(table.scale)), 1)
+    every = jnp.stack([traced, jnp.sum(table.weight, 1), table.diffuse])
+    return jnp.sum(every * area, tuple(range(-len(views), 0)))
+
+
+def fraction(traced: ArrayLike, glossy: ArrayLike, diffuse: ArrayLike) -> Float[np.ndarray, "*k"]:
+    """Fraction of the light reflected by lobes that would be traced; 0 if nearly all is reflected by the diffuse part.
+
+    Args:
+        traced: Albedo of the traced lobes.
+        glossy: Albedo of all lobes.
+        diffuse: Albedo of the diffuse part.
+    """
+    traced, glossy, diffuse = (np.asarray(each) for each in (traced, glossy, diffuse))
+    return np.where(traced > _LITTLE * (glossy + diffuse), traced / np.maximum(glossy, _TINY), 0)
 
 
 def is_sharp(table: LobeBrdf) -> bool:
-    """Whether the traced fraction of a table's reflection is large enough to trace rays."""
-    return bool(_narrow(table) > _FEW)
+    """Whether the traced fraction of a table's reflection is large enough, for any of its parameters, to trace rays."""
+    return bool(np.max(fraction(*np.asarray(jnp.sum(albedos(table), 1)))) > FEW)
 
 
 @jit

@@ -159,11 +159,11 @@ def blend(
     total = jnp.sum(lobe.weight, 1, keepdims=True)
     part = (lobe.weight / jnp.where(total > 0, total, 1))[..., None]
     slope, scale = _slope(lobe.mean + wo[:, None]), jnp.log(lobe.concentration)[..., None]
-    mean = 0
+    width = jnp.zeros((1, 1, 1), wo.dtype)  # logarithm of the squared width of lobes with the same parameters
     if parameters:
         member = scale.reshape(math.prod(nodes[:parameters]), -1)
-        mean = jnp.repeat(jnp.mean(member, 1), len(wo) // len(member))[:, None, None]
-        slope, scale = slope * jnp.exp(mean / 2), scale - mean
+        width = jnp.repeat(-jnp.mean(member, 1), len(wo) // len(member))[:, None, None]
+        slope, scale = slope * jnp.exp(-width / 2), scale + width
     every = jnp.concatenate([slope, scale, part], -1)
     sure = part + 1e-4
     count, every, sure = lobe.weight.shape[1], every.reshape(*nodes, -1, 4), sure.reshape(*nodes, -1, 1)
@@ -176,7 +176,7 @@ def blend(
     every = every.reshape(-1, count, 4)
     slope, scale, part = every[..., :2], every[..., 2], every[..., 3]
     if parameters:
-        slope, scale = slope * jnp.exp(-mean / 2), jnp.minimum(scale + mean[..., 0], math.log(FINEST))
+        slope, scale = slope * jnp.exp(width / 2), jnp.minimum(scale - width[..., 0], math.log(FINEST))
     return mixture.Mixture(part * total, _reflected(wo, slope, 0.0), jnp.exp(scale))
 
 

@@ -388,6 +388,11 @@ def _values(brdf: Callable, wi: Array, wo: Array) -> Array:
     return brdf(wi, wo)
 
 
+def measured_error(brdf: Callable, table: LobeBrdf) -> float:
+    """Relative L2 error of radiance under light of natural spectrum, for a table without parameters; see `LobeBrdf`."""
+    return float(_natural_error(grid.as_argument(brdf), table))
+
+
 @jit
 def _natural_error(brdf: Callable, table: LobeBrdf) -> Float[Array, ""]:
     """Relative L2 error of radiance under light of natural spectrum, for a table without parameters."""

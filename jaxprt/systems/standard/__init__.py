@@ -1,0 +1,16 @@
+"""Tables of the materials that most scenes have, fitted once and shipped: metallic-roughness and Blinn-Phong."""
+
+from jaxprt.systems.standard import families, tables
+from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+from jaxprt.systems.standard.tables import BLINN_PHONG, METALLIC_ROUGHNESS, StandardTable, forget
+
+__all__ = [
+    "BLINN_PHONG",
+    "METALLIC_ROUGHNESS",
+    "RoughnessFamily",
+    "ShininessFamily",
+    "StandardTable",
+    "families",
+    "forget",
+    "tables",
+]

@@ -1,0 +1,41 @@
+"""Families of BRDFs over the logarithm of roughness, whose channels are the terms of a material."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness
+from jaxprt.brdf.varying import Channels
+
+
+class RoughnessFamily(eqx.Module):
+    """Maps a roughness to the BRDF whose channels are terms of `MetallicRoughness`.
+
+    Attributes:
+        term: Indices of the terms that are channels.
+        scale: Factor of each channel.
+        anisotropy: Strength of the anisotropy, along the tangent.
+    """
+
+    term: tuple[int, ...] = eqx.field(static=True)
+    scale: Float[Array, " k"]
+    anisotropy: Float[Array, ""]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF for the natural logarithm of a roughness."""
+        each = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
+        return Channels(tuple(each[k] for k in self.term), self.scale)
+
+
+class ShininessFamily(eqx.Module):
+    """Maps a roughness to the BRDF whose channels are the diffuse base and the lobe of `BlinnPhong`.
+
+    Attributes:
+        scale: Factor of each channel.
+    """
+
+    scale: Float[Array, " k"]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF for the natural logarithm of a roughness, the square root of 2 / (exponent + 2)."""
+        return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)

@@ -1,0 +1,237 @@
+"""Fits the tables that are shipped, and writes their files.
+
+    python -m jaxprt.systems.standard.fit [--lobes 12 ...] [--only lobes|harmonics|columns|paths ...] [MATERIAL ...]
+
+What is not fitted anew stays in the file as it is. Lobes are fitted by EM jointly over roughness and view, and improved
+by descent at roughnesses whose lobes are wide enough for its quadrature. Errors are those of the rounded numbers.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt.brdf import MetallicRoughness
+from jaxprt.brdf.varying import Channels
+from jaxprt.sphere import hemisphere
+from jaxprt.systems import bounces, bright_texels, harmonic, lobe
+from jaxprt.systems.bounces import traced
+from jaxprt.systems.lobe import LobeBrdf, em
+from jaxprt.systems.standard import descent, tables
+from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+
+COUNTS = (2, 4, 8, 12, 16, 24)  # numbers of lobes that the planner asks for
+KNOTS = 20
+STEPS = 1000  # of the descent
+ANGLES = 48  # view nodes of the harmonics
+BANDS = 128  # degree of the zonal harmonics from which curvatures are computed
+FINER = 4  # roughnesses for which numbers of samples are stored, per knot
+_RINGS, _SECTORS = 96, 64  # quadrature of the zonal harmonics
+_VIEW = np.array([0.6, 0.0, 0.8], np.float32)
+_FUNCTIONS, _TERMS, _RESOLUTION = 2, 24, 32  # of light paths
+_WIDTH = 0.09  # smallest alpha of lobes along light paths
+_DIFFUSE = (0, 3)  # channels of metallic-roughness without lobes
+_DARK = 1e-6
+
+
+class Material(NamedTuple):
+    """What is tabulated.
+
+    Attributes:
+        family: Function from the logarithm of roughness to the BRDF.
+        scale: Factor of each channel. Diffuse channels have small ones, so that EM fits the lobes to the others.
+        smoothest: Smallest roughness.
+        weight: Weights of the channels in typical materials, relative to the scales.
+        first: Roughness from which on descent improves the lobes.
+        knot: Knots of the harmonics.
+    """
+
+    family: RoughnessFamily | ShininessFamily
+    scale: np.ndarray
+    smoothest: float
+    weight: np.ndarray
+    first: float
+    knot: np.ndarray
+
+    @property
+    def knots(self) -> np.ndarray:
+        """Knots of everything but the harmonics, evenly spaced in the logarithm of roughness."""
+        return np.linspace(np.log(self.smoothest), 0, KNOTS)
+
+
+def material(name: str) -> Material:
+    """The material of a file."""
+    random = np.random.default_rng(0)
+    base, other = random.uniform(0.05, 1, (2, 60, 1)).astype(np.float32)
+    if name == "blinn_phong":
+        scale = np.array([0.1, 1.0], np.float32)
+        # Every other one has no diffuse base.
+        weight = np.concatenate([base * (np.arange(60) % 2)[:, None], other], 1) / scale
+        return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1))
+    scale = np.array([0.1, 1.0, 1.0, 0.02], np.float32)
+    metallic, specular = (
+        np.resize(each, 60).astype(np.float32) for each in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
+    )
+    made = MetallicRoughness(base_color=base, metallic=metallic, specular=specular)
+    weight = np.asarray(made.coefficient())[..., 0] / scale
+    family = RoughnessFamily((0, 1, 2, 3), jnp.asarray(scale), jnp.zeros(()))
+    return Material(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 1))
+
+
+def _spread(least: float, power: float, count: int = 16) -> np.ndarray:
+    """Knots of harmonics: equal steps of a power of roughness, because small roughnesses differ little."""
+    return np.log(np.linspace(least**power, 1, count)) / power
+
+
+def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
+    """Arrays of a table of lobes: those of the jaxprt.lobe.LobeBrdf, rounded, and its error."""
+    table = lobe.tabulate(made.family, lobes=count, knot=(made.knots,))
+    least = np.stack([_least(made.family(jnp.asarray(each)), count) for each in made.knots], 1)
+    table = descent.improve(table, made.family, made.weight, least, first=float(np.log(made.first)), steps=STEPS)
+    mean = np.round(np.asarray(table.mean) * tables.UNIT).astype(np.int16)
+    scale, weight, diffuse = (
+        np.asarray(each).astype(np.float16) for each in (table.scale, table.weight, table.diffuse)
+    )
+    rounded = LobeBrdf(
+        jnp.asarray(mean / tables.UNIT, jnp.float32),
+        jnp.asarray(scale, jnp.float32),
+        jnp.asarray(weight, jnp.float32),
+        jnp.asarray(diffuse, jnp.float32),
+        table.knot,
+        table.error,
+    )
+    error = np.max(errors(rounded, made.family, between(made.knots)))
+    return {
+        **{"mean": mean, "scale": scale, "weight": weight, "diffuse": diffuse},
+        "error": np.asarray(error, np.float32),
+    }
+
+
+def _least(brdf: Channels, count: int) -> np.ndarray:
+    """Bounds of the concentrations of lobes in EM."""
+    wo, (sample, mass, _, _) = lobe.table.sampled(brdf, resolution=32)
+    return np.asarray(em.start(wo, sample, jnp.sum(mass, -1), lobes=count)[1]).T
+
+
+def between(knot: np.ndarray) -> np.ndarray:
+    """Knots and the points halfway between them."""
+    return np.interp(np.arange(2 * len(knot) - 1) / 2, np.arange(len(knot)), knot)
+
+
+def errors(table: LobeBrdf, family: RoughnessFamily | ShininessFamily, places: np.ndarray) -> np.ndarray:
+    """Error of a table at each of some roughnesses, under natural light, of the sum of all channels."""
+    each = (jnp.asarray(place, table.scale.dtype) for place in places)
+    return np.array([lobe.table.measured_error(family(place), table.at(place)) for place in each])
+
+
+def harmonics(made: Material) -> dict[str, np.ndarray]:
+    """Arrays of the table of harmonics, up to degree 4."""
+    table = harmonic.tabulate(made.family, degree=4, error=0.02, resolution=ANGLES, knot=(made.knot,))
+    return {
+        "harmonics": np.asarray(table.table).astype(np.float16),
+        "harmonics.knot": np.asarray(made.knot, np.float32),
+        "harmonics.error": np.asarray(table.error, np.float32),
+    }
+
+
+def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+    """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots."""
+    finer = np.interp(np.arange(FINER * (KNOTS - 1) + 1) / FINER, np.arange(KNOTS), made.knots)
+    samples = [bright_texels.samples_for(made.family(jnp.asarray(each)), size=tables.TEXELS) for each in finer]
+    return {
+        "zonal": np.stack([_zonal(made.family(jnp.asarray(each))) for each in made.knots]).astype(np.float16),
+        "samples": np.array(samples, np.uint8),
+        "samples.knot": finer.astype(np.float32),
+        "albedo": np.moveaxis(np.asarray(traced.albedos(table)), 1, 2).astype(np.float32),
+    }
+
+
+def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
+    """Zonal harmonics of BRDF x cosine about the mirror direction; see `jaxprt.relit.interpolation.curvature`."""
+    mirror = _VIEW * [-1, -1, 1]
+    wi, area = hemisphere.arcs(jnp.asarray(mirror), rings=_RINGS, sectors=_SECTORS)
+    value = np.asarray(brdf(wi, jnp.broadcast_to(jnp.asarray(_VIEW), wi.shape)), np.float64)
+    wi, area = np.asarray(wi, np.float64), np.asarray(area, np.float64)
+    mass = value * (area * np.maximum(wi[:, 2], 0))[:, None]
+    return np.polynomial.legendre.legvander(np.clip(wi @ mirror, -1, 1), BANDS).T @ mass
+
+
+def paths(made: Material) -> dict[str, np.ndarray]:
+    """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factored`."""
+    scale = np.asarray(made.scale, np.float64)
+    matte = np.isin(np.arange(len(scale)), _DIFFUSE)
+    place = np.maximum(made.knots, np.log(_WIDTH) / 2)
+    first = np.flatnonzero(np.append(np.diff(place) > 0, True))
+    wide = [made.family(jnp.asarray(each)) for each in place[first]]
+    wide = [Channels(tuple(np.array(each.model, object)[~matte]), jnp.ones(int((~matte).sum()))) for each in wide]
+    options = {"functions": _FUNCTIONS, "terms": _TERMS, "resolution": _RESOLUTION}
+    brdf, weight = bounces.functions.shared(wide, **options)
+    factor = np.zeros((KNOTS, len(scale), brdf.view_map.shape[-1]))
+    factor[:, ~matte] = np.asarray(weight)[np.searchsorted(first, np.arange(KNOTS))]
+    factor[:, matte, -1] = 1
+    kept = factor @ np.asarray(bounces.functions.albedo(brdf), np.float64)
+    true = np.stack([_albedo(made.family(jnp.asarray(each))) for each in made.knots])
+    factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
+    return {
+        "path.light": np.asarray(brdf.light_map).astype(np.float16),
+        "path.view": np.asarray(brdf.view_map).astype(np.float16),
+        "path.factor": factor.astype(np.float32),
+        "path.error": np.asarray(brdf.error, np.float32),
+    }
+
+
+def _albedo(brdf: Channels) -> np.ndarray:
+    """Mean albedo of each channel, over views from above."""
+    cosine = np.sqrt((np.arange(16) + 0.5) / 16)  # Uniform in projected solid angle.
+    wo = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1).astype(np.float32)
+    sent = harmonic.table.project(brdf, jnp.asarray(wo), degree=0, rings=48, sectors=320)
+    return np.sqrt(4 * np.pi) * np.mean(np.asarray(sent[0], np.float64), -1)
+
+
+def main(options: Sequence[str] | None = None) -> None:
+    """Writes the files."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    names = tables.METALLIC_ROUGHNESS.name, tables.BLINN_PHONG.name
+    kinds = "lobes", "harmonics", "columns", "paths"
+    parser.add_argument("material", nargs="*", help=", ".join(names))
+    parser.add_argument("--lobes", type=int, nargs="*", default=COUNTS)
+    parser.add_argument("--only", nargs="*", default=kinds, choices=kinds)
+    arguments = parser.parse_args(options)
+    for name in arguments.material or names:
+        made = material(name)
+        _add(name, {"channel": made.scale, "knot": made.knots.astype(np.float32)})
+        for count in arguments.lobes if "lobes" in arguments.only else ():
+            _add(name, {f"lobes{count}.{key}": value for key, value in _timed(lobes, made, count).items()})
+        if "harmonics" in arguments.only:
+            _add(name, _timed(harmonics, made))
+        if "columns" in arguments.only:
+            _add(name, _timed(columns, made, tables.StandardTable(name).lobes()))
+        if "paths" in arguments.only and name == names[0]:
+            _add(name, _timed(paths, made))
+
+
+def _timed(function, *argument):
+    """The arrays that a function returns; prints their bytes and the processor seconds."""
+    start = time.process_time()
+    result = function(*argument)
+    error = [f"{key} {float(value):.4f}" for key, value in result.items() if key.endswith("error")]
+    size = sum(np.asarray(value).nbytes for value in result.values())
+    what = f"{function.__name__} {argument[1] if isinstance(argument[-1], int) else ''}"
+    print(f"{what}: {time.process_time() - start:.0f} s, {size:,} bytes", *error, flush=True)
+    return result
+
+
+def _add(name: str, arrays: dict[str, np.ndarray]) -> None:
+    """Writes arrays to a file, besides those that it holds."""
+    file = tables.path(name)
+    old = dict(np.load(file, allow_pickle=False)) if file.exists() else {}
+    np.savez_compressed(file, allow_pickle=False, **{**old, **arrays})
+    tables.forget()
+
+
+if __name__ == "__main__":
+    main()

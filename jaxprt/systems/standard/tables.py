@@ -1,0 +1,214 @@
+"""Tables of metallic-roughness and Blinn-Phong materials over roughness, fitted once and shipped with the package.
+
+Each material has one file. `jaxprt.systems.standard.fit` writes it. Reading runs on the host: it compiles no program.
+Numbers are stored in half precision, directions in 16-bit fixed point.
+"""
+
+import functools
+import pathlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt import require
+from jaxprt.sphere import hemisphere
+from jaxprt.systems import lobe
+from jaxprt.systems.bounces import traced
+from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.harmonic import HarmonicBrdf
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+
+LOBES = 12  # default number of lobes
+UNIT = 32767  # a component of 1 of a direction, in fixed point
+TEXELS = 64  # edge of the cubemap faces for which numbers of samples are stored
+
+
+@dataclass(frozen=True)
+class StandardTable:
+    """The tables of one kind of material over the logarithm of its roughness.
+
+    The channels are the terms of the material, times `scale`. Weights of a `Blend` are divided by `scale`.
+
+    Attributes:
+        name: Name of the material, and of the file.
+    """
+
+    name: str
+
+    @property
+    def scale(self) -> Float[np.ndarray, " k"]:
+        """Factor of each channel."""
+        return np.array(self._stored["channel"], np.float64)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Logarithms of the smallest and the largest tabulated roughness; others are clamped to them."""
+        knot = self._stored["knot"]
+        return float(knot[0]), float(knot[-1])
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of lobes whose tables are shipped."""
+        return tuple(int(name[5:-5]) for name in self._stored if name.startswith("lobes") and name.endswith(".mean"))
+
+    @property
+    def family(self) -> RoughnessFamily | ShininessFamily:
+        """Function from the logarithm of a roughness to the BRDF with all channels."""
+        scale = _array(self._stored["channel"])
+        if self.name == "blinn_phong":
+            return ShininessFamily(scale)
+        return RoughnessFamily(tuple(range(len(scale))), scale, _array(np.zeros(())))
+
+    def lobes(self, count: int = LOBES) -> LobeBrdf:
+        """The BRDF as lobes.
+
+        The error is the largest of those at and halfway between the knots, of the sum of all channels.
+
+        Args:
+            count: Number of lobes. Tables of other numbers than `counts` are fitted when they are first asked for, by
+                `jaxprt.lobe.tabulate` without the descent of the shipped ones, and kept for this process.
+
+        Raises:
+            ValueError: The number of lobes is below 1.
+        """
+        require.count("count", count, least=1)
+        return _lobes(self, int(count), _dtype())
+
+    def harmonics(self, degree: int = 4) -> HarmonicBrdf:
+        """The BRDF in spherical harmonics up to a degree, with the error of the whole table, which bounds it.
+
+        Raises:
+            ValueError: The degree is negative or above that of the table, 4.
+        """
+        table = _harmonics(self, _dtype())
+        if not 0 <= degree <= table.degree:
+            raise ValueError(f"degree must be between 0 and the table's {table.degree}, got {degree}")
+        return HarmonicBrdf(_array(self._stored["harmonics"][: (degree + 1) ** 2]), table.knot, table.error)
+
+    def paths(self) -> tuple[SeparableBrdf, Sent]:
+        """The functions with which parts send light to others, and their weights over roughness.
+
+        Raises:
+            ValueError: The file holds none; only that of metallic-roughness does.
+        """
+        if "path.view" not in self._stored:
+            raise ValueError(f"functions of light paths are shipped for metallic_roughness, got {self.name}")
+        return _paths(self, _dtype())
+
+    def curvature(self, log_roughness: float, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
+        """RMS Laplacian of radiance over the mirror direction; see `jaxprt.relit.interpolation.curvature`.
+
+        Args:
+            log_roughness: Logarithm of the smallest roughness of a part. Between knots the logarithm of the curvature
+                is interpolated.
+            weight: Mean weights of the channels, relative to `scale`, averaged over colors.
+            degree: Degree of a part's harmonics; None if it has none.
+        """
+        zonal = np.einsum("nlk,k->nl", self._stored["zonal"], np.asarray(weight, np.float64))
+        zonal = zonal if degree is None else zonal[:, : degree + 1]
+        band = np.arange(zonal.shape[1])
+        power = (2 * band + 1) / (band + 0.5) ** 2 * zonal**2
+        total, square = power.sum(1), (power * (band * (band + 1.0)) ** 2).sum(1)
+        if not np.all((total > 0) & (square > 0)):
+            return 0.0
+        return float(np.exp(np.interp(log_roughness, self._stored["knot"], np.log(square / total) / 2)))
+
+    def samples(self, log_roughness: float, size: int = TEXELS) -> int:
+        """Samples along the edge of a texel; see `jaxprt.bright_texels.samples_for`.
+
+        Numbers are stored for faces of 64 texels and for the channels with equal weights. A diffuse part would need
+        fewer. What counts is the width of the lobe in texels, so those of other sizes are read at another roughness.
+
+        Args:
+            log_roughness: Logarithm of the smallest roughness of a part.
+            size: Edge of the cubemap faces in texels.
+        """
+        knot = self._stored["samples.knot"]
+        place = max(log_roughness, float(knot[0])) + np.log(size / TEXELS) / self._power
+        return int(self._stored["samples"][max(int(np.searchsorted(knot, place + 1e-6)) - 1, 0)])
+
+    def is_sharp(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> bool:
+        """Whether lobes are narrow enough to be traced; see `jaxprt.systems.bounces.traced.is_sharp`.
+
+        Args:
+            log_roughness: Logarithm of the smallest roughness of a part.
+            weight: Mean weights of the channels, relative to `scale`, averaged over colors; None for ones.
+        """
+        albedo = self._stored["albedo"].astype(np.float64)
+        albedo = albedo.sum(2) if weight is None else albedo @ np.asarray(weight, np.float64)
+        each = [np.interp(log_roughness, self._stored["knot"], row) for row in albedo]
+        return float(traced.fraction(*each)) > traced.FEW
+
+    @property
+    def _power(self) -> int:
+        """Power of the roughness to which the width of lobes is proportional."""
+        return 1 if self.name == "blinn_phong" else 2
+
+    @property
+    def _stored(self) -> Mapping[str, np.ndarray]:
+        return _read(self.name)
+
+
+METALLIC_ROUGHNESS = StandardTable("metallic_roughness")
+BLINN_PHONG = StandardTable("blinn_phong")
+
+
+def path(name: str) -> pathlib.Path:
+    """The file of a table."""
+    return pathlib.Path(__file__).with_name(f"{name}.npz")
+
+
+def forget() -> None:
+    """Forgets the tables of this process, so that the next use reads them again."""
+    for each in (_read, _lobes, _harmonics, _paths):
+        each.cache_clear()
+
+
+@functools.cache
+def _read(name: str) -> Mapping[str, np.ndarray]:
+    with np.load(path(name), allow_pickle=False) as file:
+        return {key: file[key] for key in file.files}
+
+
+@functools.cache
+def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
+    if count not in table.counts:
+        with jax.ensure_compile_time_eval():
+            return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
+    stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse", "error")}
+    mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
+    scale, weight, diffuse, error = (_array(each, dtype) for each in stored.values())
+    knot = _array(table._stored["knot"], dtype)
+    return LobeBrdf(_array(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
+
+
+@functools.cache
+def _harmonics(table: StandardTable, dtype: Any) -> HarmonicBrdf:
+    stored = table._stored
+    knot = (_array(stored["harmonics.knot"], dtype),)
+    return HarmonicBrdf(_array(stored["harmonics"], dtype), knot, _array(stored["harmonics.error"], dtype))
+
+
+@functools.cache
+def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+    names = "light", "view", "factor", "error"
+    light, view, factor, error = (_array(table._stored[f"path.{name}"], dtype) for name in names)
+    knot = (_array(table._stored["knot"], dtype),)
+    return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), Sent(knot, factor)
+
+
+def _dtype() -> Any:
+    return jnp.result_type(float)
+
+
+def _array(value: np.ndarray, dtype: Any = None) -> jax.Array:
+    """An array on the device, also while JAX traces a function. No program is compiled."""
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(np.asarray(value, _dtype() if dtype is None else dtype))
