@@ -7,6 +7,7 @@ by descent at roughnesses whose lobes are wide enough for its quadrature. Errors
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -192,7 +193,7 @@ def _albedo(brdf: Channels) -> np.ndarray:
     return np.sqrt(4 * np.pi) * np.mean(np.asarray(sent[0], np.float64), -1)
 
 
-def main(options: Sequence[str] | None = None) -> None:
+def main(options: Sequence[str]) -> None:
     """Writes the files."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     names = tables.METALLIC_ROUGHNESS.name, tables.BLINN_PHONG.name
@@ -234,4 +235,4 @@ def _add(name: str, arrays: dict[str, np.ndarray]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
