@@ -17,6 +17,7 @@ from jaxprt.sphere import hemisphere
 from jaxprt.systems import bounces, standard
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.harmonic import HarmonicSystem
+from jaxprt.systems.lobe import LobeSystem
 from jaxprt.systems.standard import BLINN_PHONG, METALLIC_ROUGHNESS, descent, fit
 
 BOTH = pytest.mark.parametrize("table", [METALLIC_ROUGHNESS, BLINN_PHONG], ids=lambda table: table.name)
@@ -27,6 +28,7 @@ FURNACE = 0.01  # of the albedo, in a white furnace; of the largest channel wher
 HARMONICS = 0.02
 CURVATURE = 0.03  # of the logarithm between knots
 MEASURED = 0.02  # The error was measured with other compiler options.
+DARK = 5e-4  # of the rim of a smooth surface, whose albedo is .004
 ALBEDO = 0.02  # of path functions between knots, and of half precision
 
 
@@ -112,17 +114,19 @@ def test_arrays_have_the_default_precision(table, x64):
 
 
 @BOTH
-def test_the_stated_error_is_the_largest_at_knots_and_between_them(table):
-    found = table.lobes()
-    (knot,) = found.knot
-    error = fit.errors(found, table.family, fit.between(np.asarray(knot, np.float64)))
-    np.testing.assert_allclose(error.max(), float(found.error), rtol=MEASURED)
+def test_the_stated_errors_are_the_measured_ones(table):
+    found, stated = table.lobes(), table.errors()
+    places = fit.between(np.asarray(found.knot[0], np.float64))
+    assert len(stated) == len(places)
+    assert float(found.error) == pytest.approx(stated.max())
+    some = np.array([14, int(np.argmax(stated))])
+    np.testing.assert_allclose(fit.errors(found, table.family, places[some]), stated[some], rtol=MEASURED)
 
 
 @BOTH
 def test_a_knot_is_as_exact_as_a_table_of_its_roughness_alone(table):
     found = table.lobes()
-    for place in found.knot[0][jnp.array([8, 16])]:
+    for place in found.knot[0][jnp.array([16])]:
         own = lobe.tabulate(table.family(place), lobes=found.lobes)
         shipped = lobe.table.measured_error(table.family(place), at(found, place))
         assert shipped <= OWN * float(own.error)
@@ -183,7 +187,7 @@ def test_curvatures_are_those_of_the_brdf_between_knots(name):
     weight = np.array(MIXTURES[name])
     for place in between(METALLIC_ROUGHNESS, 0.28, SHARE, 0.93):
         part = shading(METALLIC_ROUGHNESS, place, weight)
-        exact = interpolation.curvature(part, None)
+        exact = interpolation.curvature(part, object.__new__(LobeSystem))
         assert METALLIC_ROUGHNESS.curvature(place, weight) == pytest.approx(exact, rel=CURVATURE)
         low = interpolation.curvature(part, object.__new__(FourthDegree))
         assert METALLIC_ROUGHNESS.curvature(place, weight, 4) == pytest.approx(low, rel=CURVATURE)
@@ -224,7 +228,7 @@ def test_path_functions_have_the_albedo_of_each_channel():
     for place in between(METALLIC_ROUGHNESS, 0.2, SHARE, 0.97):
         found = sent.values(Blend(weight, (jnp.full(1, place, jnp.float32),)), jnp.asarray(value))[0]
         exact = paths.channels(METALLIC_ROUGHNESS.family(place))
-        np.testing.assert_allclose(found, exact, rtol=ALBEDO)
+        np.testing.assert_allclose(found, exact, rtol=ALBEDO, atol=DARK)
 
 
 def test_channels_are_the_terms_of_the_material():

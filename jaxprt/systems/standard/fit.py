@@ -30,7 +30,8 @@ KNOTS = 20
 STEPS = 1000  # of the descent
 ANGLES = 48  # view nodes of the harmonics
 BANDS = 128  # degree of the zonal harmonics from which curvatures are computed
-FINER = 4  # roughnesses for which numbers of samples are stored, per knot
+FINER = 4  # roughnesses for which numbers of samples are stored, per knot; and step of sizes
+SMALLEST = 16  # edge of the smallest cubemap faces with numbers of samples of their own
 _RINGS, _SECTORS = 96, 64  # quadrature of the zonal harmonics
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
 _FUNCTIONS, _TERMS, _RESOLUTION = 2, 24, 32  # of light paths
@@ -49,6 +50,7 @@ class Material(NamedTuple):
         weight: Weights of the channels in typical materials, relative to the scales.
         first: Roughness from which on descent improves the lobes.
         knot: Knots of the harmonics.
+        power: Power of the roughness to which the width of lobes is proportional.
     """
 
     family: RoughnessFamily | ShininessFamily
@@ -57,6 +59,7 @@ class Material(NamedTuple):
     weight: np.ndarray
     first: float
     knot: np.ndarray
+    power: int
 
     @property
     def knots(self) -> np.ndarray:
@@ -72,7 +75,7 @@ def material(name: str) -> Material:
         scale = np.array([0.1, 1.0], np.float32)
         # Every other one has no diffuse base.
         weight = np.concatenate([base * (np.arange(60) % 2)[:, None], other], 1) / scale
-        return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1))
+        return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1), 1)
     scale = np.array([0.1, 1.0, 1.0, 0.02], np.float32)
     metallic, specular = (
         np.resize(each, 60).astype(np.float32) for each in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
@@ -80,16 +83,16 @@ def material(name: str) -> Material:
     made = MetallicRoughness(base_color=base, metallic=metallic, specular=specular)
     weight = np.asarray(made.coefficient())[..., 0] / scale
     family = RoughnessFamily((0, 1, 2, 3), jnp.asarray(scale), jnp.zeros(()))
-    return Material(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 1))
+    return Material(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 2), 2)
 
 
-def _spread(least: float, power: float, count: int = 16) -> np.ndarray:
-    """Knots of harmonics: equal steps of a power of roughness, because small roughnesses differ little."""
-    return np.log(np.linspace(least**power, 1, count)) / power
+def _spread(smoothest: float, power: int, count: int = 16) -> np.ndarray:
+    """Knots of harmonics: equal steps of the root of the width of lobes, because narrow ones have equal harmonics."""
+    return np.log(np.linspace(smoothest ** (power / 2), 1, count)) * 2 / power
 
 
 def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
-    """Arrays of a table of lobes: those of the jaxprt.lobe.LobeBrdf, rounded, and its error."""
+    """Arrays of a table of lobes: those of the `LobeBrdf`, rounded, and its errors at and halfway between the knots."""
     table = lobe.tabulate(made.family, lobes=count, knot=(made.knots,))
     least = np.stack([_least(made.family(jnp.asarray(each)), count) for each in made.knots], 1)
     table = descent.improve(table, made.family, made.weight, least, first=float(np.log(made.first)), steps=STEPS)
@@ -105,11 +108,8 @@ def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
         table.knot,
         table.error,
     )
-    error = np.max(errors(rounded, made.family, between(made.knots)))
-    return {
-        **{"mean": mean, "scale": scale, "weight": weight, "diffuse": diffuse},
-        "error": np.asarray(error, np.float32),
-    }
+    error = errors(rounded, made.family, between(made.knots)).astype(np.float32)
+    return {"mean": mean, "scale": scale, "weight": weight, "diffuse": diffuse, "error": error}
 
 
 def _least(brdf: Channels, count: int) -> np.ndarray:
@@ -142,11 +142,18 @@ def harmonics(made: Material) -> dict[str, np.ndarray]:
 def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots."""
     finer = np.interp(np.arange(FINER * (KNOTS - 1) + 1) / FINER, np.arange(KNOTS), made.knots)
-    samples = [bright_texels.samples_for(made.family(jnp.asarray(each)), size=tables.TEXELS) for each in finer]
+    # A cubemap of fewer texels needs as many samples for the smoothest lobes as 64 x 64 texels for smoother ones.
+    coarse = np.arange(SMALLEST, tables.TEXELS, FINER)
+    place = np.append(finer[0] + np.log(coarse / tables.TEXELS) / made.power, finer)
+    size = np.append(coarse, np.full(len(finer), tables.TEXELS))
+    samples = [
+        bright_texels.samples_for(made.family(jnp.asarray(max(where, finer[0]))), size=int(edge))
+        for where, edge in zip(place, size, strict=True)
+    ]
     return {
         "zonal": np.stack([_zonal(made.family(jnp.asarray(each))) for each in made.knots]).astype(np.float16),
         "samples": np.array(samples, np.uint8),
-        "samples.knot": finer.astype(np.float32),
+        "samples.knot": place.astype(np.float32),
         "albedo": np.moveaxis(np.asarray(traced.albedos(table)), 1, 2).astype(np.float32),
     }
 
@@ -219,7 +226,7 @@ def _timed(function, *argument):
     """The arrays that a function returns; prints their bytes and the processor seconds."""
     start = time.process_time()
     result = function(*argument)
-    error = [f"{key} {float(value):.4f}" for key, value in result.items() if key.endswith("error")]
+    error = [f"{key} {np.max(value):.4f}" for key, value in result.items() if key.endswith("error")]
     size = sum(np.asarray(value).nbytes for value in result.values())
     what = f"{function.__name__} {argument[1] if isinstance(argument[-1], int) else ''}"
     print(f"{what}: {time.process_time() - start:.0f} s, {size:,} bytes", *error, flush=True)

@@ -81,6 +81,10 @@ class StandardTable:
         require.count("count", count, least=1)
         return _lobes(self, int(count), _dtype())
 
+    def errors(self, count: int = LOBES) -> Float[np.ndarray, " n"]:
+        """Errors of a shipped table of lobes at its knots and halfway between them; see `lobes`."""
+        return np.array(self._stored[f"lobes{count}.error"], np.float64)
+
     def harmonics(self, degree: int = 4) -> HarmonicBrdf:
         """The BRDF in spherical harmonics up to a degree, with the error of the whole table, which bounds it.
 
@@ -131,7 +135,7 @@ class StandardTable:
             size: Edge of the cubemap faces in texels.
         """
         knot = self._stored["samples.knot"]
-        place = max(log_roughness, float(knot[0])) + np.log(size / TEXELS) / self._power
+        place = max(log_roughness, self.range[0]) + np.log(size / TEXELS) / self._power
         return int(self._stored["samples"][max(int(np.searchsorted(knot, place + 1e-6)) - 1, 0)])
 
     def is_sharp(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> bool:
@@ -182,10 +186,10 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
     if count not in table.counts:
         with jax.ensure_compile_time_eval():
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
-    stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse", "error")}
+    stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse")}
     mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
-    scale, weight, diffuse, error = (_array(each, dtype) for each in stored.values())
-    knot = _array(table._stored["knot"], dtype)
+    scale, weight, diffuse = (_array(each, dtype) for each in stored.values())
+    knot, error = _array(table._stored["knot"], dtype), _array(np.max(table.errors(count)), dtype)
     return LobeBrdf(_array(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
 
 
