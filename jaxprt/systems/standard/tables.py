@@ -189,7 +189,7 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
     stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse")}
     mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
     scale, weight, diffuse = (_array(each, dtype) for each in stored.values())
-    knot, error = _array(table._stored["knot"], dtype), _array(np.max(table.errors(count)), dtype)
+    knot, error = _array(table._stored["knot"], dtype), _array(np.asarray(np.max(table.errors(count))), dtype)
     return LobeBrdf(_array(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
 
 
