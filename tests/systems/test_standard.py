@@ -22,7 +22,7 @@ from jaxprt.systems.standard import BLINN_PHONG, METALLIC_ROUGHNESS, descent, fi
 
 BOTH = pytest.mark.parametrize("table", [METALLIC_ROUGHNESS, BLINN_PHONG], ids=lambda table: table.name)
 SHARE = 0.6  # a roughness between the smallest and the largest, as a part of the way in the logarithm
-# Error at a knot over that of a table fitted to this roughness alone. Descent makes errors at knots and between them alike:
+# Error at a knot over that of a table of this roughness alone. Descent makes errors at knots and between them alike:
 # at the largest roughnesses of Blinn-Phong .014 at most, in place of .006 at knots and .020 between them.
 OWN = {"metallic_roughness": 1.1, "blinn_phong": 2.5}
 ROUNDING = 0.05  # change of the error by the last bit of every number, relative
@@ -132,6 +132,15 @@ def test_a_knot_is_about_as_exact_as_a_table_of_its_roughness_alone(table):
     own = lobe.tabulate(table.family(place), lobes=found.lobes)
     shipped = lobe.table.measured_error(table.family(place), at(found, place))
     assert shipped <= OWN[table.name] * float(own.error)
+
+
+@BOTH
+def test_more_lobes_are_more_exact(table):
+    assert standard.tables.LOBES in table.counts
+    mean = [table.errors(count).mean() for count in table.counts]
+    assert mean == sorted(mean, reverse=True)
+    for count in table.counts:
+        assert table.lobes(count).lobes == count
 
 
 @BOTH

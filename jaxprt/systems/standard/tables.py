@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxprt import require
-from jaxprt.sphere import hemisphere
+from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.varying import Sent
@@ -56,7 +56,8 @@ class StandardTable:
     @property
     def counts(self) -> tuple[int, ...]:
         """Numbers of lobes whose tables are shipped."""
-        return tuple(int(name[5:-5]) for name in self._stored if name.startswith("lobes") and name.endswith(".mean"))
+        names = (name for name in self._stored if name.startswith("lobes") and name.endswith(".mean"))
+        return tuple(sorted(int(name[5:-5]) for name in names))
 
     @property
     def family(self) -> RoughnessFamily | ShininessFamily:
@@ -86,15 +87,15 @@ class StandardTable:
         return np.array(self._stored[f"lobes{count}.error"], np.float64)
 
     def harmonics(self, degree: int = 4) -> HarmonicBrdf:
-        """The BRDF in spherical harmonics up to a degree, with the error of the whole table, which bounds it.
+        """The BRDF in spherical harmonics up to a degree, with the error of the whole table.
 
         Raises:
             ValueError: The degree is negative or above that of the table, 4.
         """
-        table = _harmonics(self, _dtype())
-        if not 0 <= degree <= table.degree:
-            raise ValueError(f"degree must be between 0 and the table's {table.degree}, got {degree}")
-        return HarmonicBrdf(_array(self._stored["harmonics"][: (degree + 1) ** 2]), table.knot, table.error)
+        most = harmonics.degree_of(len(self._stored["harmonics"]))
+        if not 0 <= degree <= most:
+            raise ValueError(f"degree must be between 0 and the table's {most}, got {degree}")
+        return _harmonics(self, degree, _dtype())
 
     def paths(self) -> tuple[SeparableBrdf, Sent]:
         """The functions with which parts send light to others, and their weights over roughness.
@@ -194,10 +195,10 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
 
 
 @functools.cache
-def _harmonics(table: StandardTable, dtype: Any) -> HarmonicBrdf:
+def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
     stored = table._stored
-    knot = (_array(stored["harmonics.knot"], dtype),)
-    return HarmonicBrdf(_array(stored["harmonics"], dtype), knot, _array(stored["harmonics.error"], dtype))
+    value = _array(stored["harmonics"][: (degree + 1) ** 2], dtype)
+    return HarmonicBrdf(value, (_array(stored["harmonics.knot"], dtype),), _array(stored["harmonics.error"], dtype))
 
 
 @functools.cache
