@@ -1,11 +1,11 @@
 """Control of compilation: precision, separately compiled steps, loops, and transposes of linear maps.
 
-`jit` requests full precision, because GPUs otherwise round the factors of float32 products to ten bits. `isolated`
-compiles a step separately, because XLA on CPUs may fuse a step into each of its uses and repeat it there, gathers and
-loops over vertices included. `linear` takes the transpose of a linear map explicitly, because JAX would otherwise
-derive gradients by transposing each operation, and the transpose of a gather is a scatter, which is slower. Both
-work under all JAX transformations. `total` and `mapped` are loops in the form that suits the device: CPUs prefer steps
-that stay in the cache, GPUs few large kernels.
+`jit` requests full precision, because GPUs otherwise round the factors of float32 products to ten bits. `kept` lets
+later processes load a large program without tracing it. `isolated` compiles a step separately, because XLA on CPUs may
+fuse a step into each of its uses and repeat it there, gathers and loops over vertices included. `linear` takes the
+transpose of a linear map explicitly, because JAX would otherwise derive gradients by transposing each operation, and
+the transpose of a gather is a scatter, which is slower. All of these work under all JAX transformations. `total` and
+`mapped` are loops in the form that suits the device: CPUs prefer steps that stay in the cache, GPUs few large kernels.
 """
 
 import functools
@@ -26,6 +26,8 @@ from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
+
+from jaxprt.programs import executables, jax_cache
 
 Between = Callable[[], None] | None  # called between the steps of a long computation
 Fixed = TypeVar("Fixed", bound=PyTree)
@@ -53,6 +55,7 @@ if importlib.metadata.version("jaxlib") == "0.10.2" and _FLAG not in _flags:
         )
     if not any(flag.startswith(_FLAG) for flag in _flags):
         os.environ["XLA_FLAGS"] = " ".join([*_flags, _FLAG])
+jax_cache.install()
 
 
 def jit(function: Callable, **options: Any) -> Any:
@@ -66,6 +69,20 @@ def jit(function: Callable, **options: Any) -> Any:
         options: Options of `jax.jit`.
     """
     return jax.jit(_exact(function), **options)
+
+
+def kept(function: Callable, *, static: tuple[str, ...] = ()) -> Any:
+    """Decorates a function like `jit`. Later processes load its executables and need not trace it either.
+
+    It is for the few programs that take long to trace or to compile; each call takes 30 us more than with `jit`. Calls
+    inside other programs, derivatives, and arguments of unknown classes are compiled as with `jit`.
+
+    Args:
+        function: A function at the top level of a module of this package, whose arguments are arrays and pytrees of
+            arrays. Static options are passed by name.
+        static: Names of the static options.
+    """
+    return executables.Kept(function, jit(function, static_argnames=static), static)
 
 
 def _exact(function: Callable) -> Callable:
@@ -118,6 +135,7 @@ def make_room() -> None:
     _traces = 0
     if _MAPPINGS.read_bytes().count(b"\n") > _FULL * int(_LIMIT.read_text()):
         jax.clear_caches()
+        executables.forget()
 
 
 def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:

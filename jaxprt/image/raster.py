@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import jit
+from jaxprt.compile import jit, kept
 from jaxprt.image import arguments, depths
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
@@ -51,7 +51,7 @@ class Fragments(eqx.Module):
 
 @require.arguments(mesh=arguments.a_mesh, camera=arguments.a_camera, samples=arguments.samples)
 @in_common_coordinates
-@functools.partial(jit, static_argnames="samples")
+@functools.partial(kept, static=("samples",))
 def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     """Finds the nearest triangle at the center of each pixel, or at four samples of each pixel.
 

@@ -26,7 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import isolated, jit, total
+from jaxprt.compile import isolated, jit, kept, total
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
@@ -275,7 +275,7 @@ def scales(size: int) -> Scales:
     return Scales(edge, spread, (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
 
 
-@jit
+@kept
 def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLight:
     _, size, _, colors = light.radiance.shape
     scale = scales(size)
