@@ -34,7 +34,6 @@ from jaxprt.view import messages
 _FIRST = """
 import sys, time
 from jaxprt.cli import play
-play.keep_programs()
 made, lights = play.ready(play.chosen(["--output", sys.argv[1]]))
 server = play.serve(made, environments=lights)
 print(server.url, flush=True)
@@ -123,7 +122,7 @@ def radiance(made: prt.RelitScene, light: prt.Environment, state: dict[str, Any]
 def first() -> dict[str, Any]:
     """A new process with kept precomputation and programs, until its first colors are there."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "XDG_CACHE_HOME": folder}
+        environment = {**os.environ, "XDG_CACHE_HOME": folder, "JAXPRT_KEEP_PROGRAMS": "1"}
         spent, color = 0.0, np.zeros(0)
         for _ in range(2):  # the first one computes and compiles
             began = time.perf_counter()

@@ -16,7 +16,9 @@ Conventions, everywhere in this package:
 * Images are ``[h, w, c]``, first row on top.
 * Axis letters: v vertices, f faces, d directions, b basis functions, k kept coefficients, r BRDF terms,
   c colors, h w image, n texels along an edge.
-* Arrays are float32, or float64 where the caller has enabled it; the package never touches ``jax.config``.
+* Arrays are float32, or float64 where the caller has enabled it. The package never touches ``jax.config``, with one
+  exception: where the caller has not configured JAX's cache of compiled programs, programs of any compile time are
+  kept, in the user's cache folder. The environment variable JAXPRT_KEEP_PROGRAMS=0 turns this off.
 * Lights, eyes and materials may have any float type. Half precision is converted to float32 where it enters, and
   integers and lists too. Results have the widest type of the system and these. Gradients have the type of the argument.
 * Numbers that enter are at most 1e32 in magnitude, so that products and sums over all directions fit into float32.

@@ -107,7 +107,6 @@ for _name, _command in {
 
 def run() -> None:
     """Runs the command line and ends the process."""
-    play.keep_programs()
     status = _INTERRUPTED
     try:
         program(prog_name="jaxprt")

@@ -1,7 +1,6 @@
 """The command `jaxprt view`: shows scenes in the interactive viewer in a browser."""
 
 import errno
-import os
 import socket
 import sys
 import threading
@@ -12,7 +11,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import click
-import jax
 
 from jaxprt.cli import inputs, options, relight, sizes
 from jaxprt.cli.options import option
@@ -137,17 +135,6 @@ def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: in
         return serve(made, environments=lights, port=port, address=address)
     except OSError as error:
         raise _no_port(port, error) from error
-
-
-def keep_programs() -> None:
-    """Enables JAX's cache of compiled programs for later runs, unless environment variables configure it."""
-    if any(name.startswith(("JAX_COMPILATION_CACHE", "JAX_ENABLE_COMPILATION_CACHE")) for name in os.environ):
-        return
-    kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxprt" / "programs"
-    jax.config.update("jax_compilation_cache_dir", str(kept))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    jax.config.update("jax_compilation_cache_max_size", 2**31)
 
 
 def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:

@@ -79,18 +79,21 @@ class Kept:
         try:
             parts = (names.surroundings(), *map(names.described, (self._function, tree, aval, option)))
             name = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        except (names.UnnamedError, OSError):
+        except Exception:  # no name, or none that can be found: classes of users may do anything
             return functools.partial(self._compiled, **option)
         content = jax_cache.kept().read(name)
         if content is not None:
             with contextlib.suppress(Exception):  # of any kind: what can go wrong is up to JAX and XLA
                 return _loaded(content, tree)
         lowered = self._compiled.lower(*argument, **named, **option)
-        executable = lowered.compile()
+        with jax_cache.paused():  # An executable that comes from JAX's cache cannot be written again.
+            executable = lowered.compile()
         # Custom calls are addresses in this process, or need libraries that JAX prepares when it traces.
         if not _calls_out(lowered) and jax_cache.loads_quietly():
             with contextlib.suppress(Exception):
-                jax_cache.kept().write(name, _packed(executable))
+                content = _packed(executable)
+                _loaded(content, tree)  # or an error
+                jax_cache.kept().write(name, content)
         return executable
 
 
@@ -102,7 +105,7 @@ def forget() -> None:
 
 def _concrete(leaf: Any) -> bool:
     """Whether a leaf is an array on the default device, with its values."""
-    if isinstance(leaf, np.ndarray):
+    if isinstance(leaf, np.ndarray | np.generic):
         return jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype
     return isinstance(leaf, jax.Array) and not isinstance(leaf, core.Tracer) and leaf.sharding == _place()
 

@@ -16,9 +16,9 @@ from typing import Any, BinaryIO
 
 import jax
 import jax.numpy as jnp
-import jaxlib.version
 from jax._src import compilation_cache
 from jax._src.compilation_cache_interface import CacheInterface
+from jax._src.lib import version_str
 from jax.experimental import serialize_executable
 
 from jaxprt.programs.store import Store, folder, log, processor, wanted
@@ -32,6 +32,7 @@ _DEFAULTS = {
     _THRESHOLD: 1.0,
 }
 _VARIABLES = ("JAX_COMPILATION_CACHE", "JAX_ENABLE_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
+_thread = threading.local()
 _MISMATCH = b"machine type for execution"  # in XLA's message about features of the processor
 
 
@@ -47,11 +48,11 @@ class Cache(CacheInterface):
         if _configured():
             _remove(self)
             return None
-        return self.store.read(_name(key))
+        return None if _is_paused() else self.store.read(_name(key))
 
     def put(self, key: str, value: bytes) -> None:
         """Keeps a program as JAX has packed it, where XLA will load it without complaint."""
-        if not (_configured() or getattr(_trying, "now", False)) and loads_quietly():
+        if not (_configured() or _is_paused()) and loads_quietly():
             self.store.write(_name(key), value)
 
 
@@ -76,6 +77,20 @@ def install() -> None:
 def active() -> bool:
     """Whether JAX uses this cache."""
     return isinstance(compilation_cache._cache, Cache) and not _configured()
+
+
+@contextlib.contextmanager
+def paused() -> Iterator[None]:
+    """Programs that this thread compiles meanwhile are neither loaded from the cache nor kept in it."""
+    before, _thread.paused = _is_paused(), True
+    try:
+        yield
+    finally:
+        _thread.paused = before
+
+
+def _is_paused() -> bool:
+    return getattr(_thread, "paused", False)
 
 
 def _configured() -> bool:
@@ -108,9 +123,6 @@ def _name(key: str) -> str:
     return hashlib.sha256(_processor() + key.encode()).hexdigest()
 
 
-_trying = threading.local()
-
-
 @functools.cache
 def loads_quietly() -> bool:
     """Whether XLA loads programs of this processor without complaint.
@@ -120,7 +132,7 @@ def loads_quietly() -> bool:
     """
     if jax.default_backend() != "cpu":
         return True
-    name = _name(f"quiet {jax.__version__} {jaxlib.version.__version__} {os.environ.get('XLA_FLAGS')}")
+    name = _name(f"quiet {jax.__version__} {version_str} {os.environ.get('XLA_FLAGS')}")
     answer = kept().read(name)
     if answer is None:
         answer = b"1" if _quiet() else b"0"
@@ -134,9 +146,9 @@ def loads_quietly() -> bool:
 
 
 def _quiet() -> bool:
-    _trying.now = True  # The cache must not ask for this answer again.
     try:
-        program = jax.jit(lambda x: x + 1).lower(jax.ShapeDtypeStruct((), jnp.float32)).compile()
+        with paused():
+            program = jax.jit(lambda x: x + 1).lower(jax.ShapeDtypeStruct((), jnp.float32)).compile()
         packed = serialize_executable.serialize(program)
         with _standard_error() as said:
             serialize_executable.deserialize_and_load(*packed, execution_devices=jax.devices()[:1])
@@ -144,8 +156,6 @@ def _quiet() -> bool:
             text = said.read()
     except Exception:  # of any kind: XLA may reject its own program
         return False
-    finally:
-        _trying.now = False
     if text and _MISMATCH not in text:  # written by another thread
         os.write(2, text)
     return _MISMATCH not in text

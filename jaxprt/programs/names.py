@@ -13,9 +13,9 @@ from typing import Any
 
 import equinox
 import jax
-import jaxlib.version
 import numpy as np
 from jax._src import config
+from jax._src.lib import version_str
 
 from jaxprt.programs.store import processor
 
@@ -53,18 +53,19 @@ def _fixed() -> str:
     """Versions, the code of the package, and the processor."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*")):
-        if path.is_file() and path.suffix != ".pyc":
+        if path.is_file() and "__pycache__" not in path.parts:  # where Numba writes too
             if path.stat().st_mtime > _STARTED:
                 raise UnnamedError(f"{path} has changed")
             digest.update(f"{path.relative_to(_PACKAGE)}\0{path.stat().st_size}\0".encode() + path.read_bytes())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     version = (
         platform.python_version(),
         np.__version__,
         jax.__version__,
-        jaxlib.version.__version__,
+        version_str,
         equinox.__version__,
     )
-    return "\n".join([digest.hexdigest(), str(version), processor()])
+    return "\n".join([digest.hexdigest(), str(version), processor(), str(cores)])
 
 
 def described(value: Any) -> str:

@@ -167,17 +167,3 @@ def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch
 def test_what_cannot_be_shown_is_an_error(argument, words, capsys):
     assert main(["view", *argument]) == 2
     assert words in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("set_by_hand", [False, True])
-def test_programs_are_kept_unless_the_environment_says_where(set_by_hand, monkeypatch, tmp_path):
-    for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_COMPILATION_CACHE_MAX_SIZE"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    if set_by_hand:
-        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
-    said = {}
-    monkeypatch.setattr(play.jax.config, "update", said.__setitem__)
-    play.keep_programs()
-    expected = {} if set_by_hand else {"jax_compilation_cache_dir": str(tmp_path / "jaxprt" / "programs")}
-    assert said.get("jax_compilation_cache_dir") == expected.get("jax_compilation_cache_dir")

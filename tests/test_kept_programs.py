@@ -1,0 +1,418 @@
+"""Programs survive the process: other processes load them, and whatever is wrong with a file means compiling."""
+
+import inspect
+import json
+import logging
+import os
+import pathlib
+import pickle
+import subprocess
+import sys
+import threading
+import types
+from typing import Any
+
+import equinox
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax._src import compilation_cache
+
+from jaxprt import Camera
+from jaxprt.compile import kept
+from jaxprt.image import raster
+from jaxprt.programs import executables, jax_cache, names, store
+from jaxprt.programs.store import Store
+
+ROOT = pathlib.Path(__file__).parents[1]
+axes = inspect.unwrap(raster.view_axes)  # a small function of a camera
+
+# A process that compiles two programs, one of them by `kept`, and says what JAX did.
+SCRIPT = """
+import inspect, json, sys
+import jax
+import numpy as np
+
+count = {}
+def note(event, *_, **__):
+    name = event.rpartition("/")[2]
+    count[name] = count.get(name, 0) + 1
+jax.monitoring.register_event_listener(note)
+jax.monitoring.register_event_duration_secs_listener(note)
+exec(sys.argv[1])
+import jaxprt
+from jaxprt.compile import jit, kept
+from jaxprt.image import raster
+exec(sys.argv[2])
+camera = jaxprt.Camera(np.float32([1, 2, 3]), np.zeros(3, np.float32), np.float32([0, 1, 0]), 0.5, 4, 3)
+camera = jax.tree.map(np.float32, camera)
+axes = kept(inspect.unwrap(raster.view_axes))(camera)
+sums = jit(lambda x: np.float32(7) * (x @ x.T).sum(1))(np.ones((3, 3), np.float32))
+print(json.dumps({
+    "result": np.concatenate([np.asarray(axes).ravel(), sums]).tobytes().hex(),
+    "compiled": count.get("backend_compile_duration", 0) - count.get("cache_hits", 0),
+    "traced": count.get("jaxpr_to_mlir_module_duration", 0),
+    "configuration": {name: getattr(jax.config, name) for name in jaxprt.programs.jax_cache._DEFAULTS},
+}))
+"""
+
+
+def start(cache: pathlib.Path, before: str = "", after: str = "", **environment: str) -> subprocess.Popen:
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(jax_cache._VARIABLES)}
+    command = [sys.executable, "-W", "error", "-c", SCRIPT, before, after]
+    environment = {**clean, "XDG_CACHE_HOME": str(cache), "HOME": str(cache), "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def said(process: subprocess.Popen) -> dict[str, Any]:
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 0, error
+    assert not error
+    return json.loads(out)
+
+
+def damage(folder: pathlib.Path) -> None:
+    for number, path in enumerate(sorted(folder.iterdir())):
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content[: len(content) // 3] if number % 2 else content)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """Two processes that began at once with an empty folder: the cache folder, and what they say."""
+    cache = tmp_path_factory.mktemp("cache")
+    both = [start(cache), start(cache)]
+    return cache, [said(each) for each in both]
+
+
+def test_a_second_process_compiles_nothing_and_a_damaged_file_is_compiled_anew(first):
+    cache, (one, other) = first
+    assert one["compiled"] + other["compiled"] >= 2
+    assert one["result"] == other["result"]
+    assert one["configuration"] == {**jax_cache._DEFAULTS, "jax_persistent_cache_min_compile_time_secs": 0}
+    folder = cache / "jaxprt" / "programs"
+    assert not [path for path in folder.iterdir() if path.stat().st_mode & 0o077 or path.name.startswith(".new")]
+    assert not folder.stat().st_mode & 0o077
+    second = said(start(cache))
+    assert (second["compiled"], second["result"]) == (0, one["result"])
+    assert second["traced"] < one["traced"]  # `kept` does not trace
+    count = len(list(folder.iterdir()))
+    damage(folder)
+    third, flagged = (
+        start(cache),
+        start(cache, XLA_FLAGS=os.environ["XLA_FLAGS"] + " --xla_cpu_enable_fast_min_max=true"),
+    )
+    third, flagged = said(third), said(flagged)
+    assert (third["compiled"], third["result"]) == (flagged["compiled"], one["result"])
+    assert flagged["compiled"] >= one["compiled"]  # the first two processes may have loaded each other's programs
+    assert len(list(folder.iterdir())) == 2 * count
+
+
+def test_the_cache_that_the_user_configures_later_takes_over(tmp_path):
+    place = str(tmp_path / "theirs")
+    told = said(start(tmp_path, after=f"jax.config.update('jax_compilation_cache_dir', {place!r})"))
+    assert told["configuration"] == {**jax_cache._DEFAULTS, "jax_compilation_cache_dir": place}
+    assert not (tmp_path / "jaxprt").exists()
+
+
+@pytest.fixture
+def untouched(monkeypatch):
+    """JAX as it is where nobody has configured its cache: its options, which tests may change."""
+    for name in os.environ:
+        if name.startswith(jax_cache._VARIABLES):
+            monkeypatch.delenv(name)
+    options = types.SimpleNamespace(**jax_cache._DEFAULTS)
+    options.update = options.__setattr__
+    monkeypatch.setattr(jax_cache, "jax", types.SimpleNamespace(config=options))
+    monkeypatch.setattr(compilation_cache, "_cache", None)
+    monkeypatch.setattr(compilation_cache, "_cache_initialized", False)
+    return options
+
+
+def test_jax_gets_the_cache_where_nobody_has_configured_another(untouched):
+    jax_cache.install()
+    assert jax_cache.active()
+    assert untouched.jax_persistent_cache_min_compile_time_secs == 0
+
+
+@pytest.mark.parametrize(
+    "set_by_user",
+    [
+        lambda patch, options: patch.setenv("JAXPRT_KEEP_PROGRAMS", "0"),
+        lambda patch, options: patch.setenv("JAX_COMPILATION_CACHE_DIR", "theirs"),
+        lambda patch, options: patch.setenv("JAX_ENABLE_COMPILATION_CACHE", "0"),
+        lambda patch, options: patch.setattr(options, "jax_compilation_cache_dir", "theirs"),
+        lambda patch, options: patch.setattr(options, "jax_enable_compilation_cache", False),
+        lambda patch, options: patch.setattr(options, "jax_persistent_cache_min_compile_time_secs", 5.0),
+        lambda patch, options: patch.setattr(compilation_cache, "_cache_initialized", True),
+    ],
+)
+def test_one_line_and_any_configuration_of_the_user_turn_it_off(set_by_user, untouched, monkeypatch):
+    set_by_user(monkeypatch, untouched)
+    before = vars(untouched).copy()
+    jax_cache.install()
+    assert vars(untouched) == before
+    assert not jax_cache.active()
+
+
+@pytest.fixture
+def files(tmp_path):
+    return Store(tmp_path / "cache" / "programs")
+
+
+def test_files_hold_what_was_written_under_their_own_name_only(files):
+    files.write("name", b"content")
+    assert files.read("name") == b"content"
+    assert files.read("other") is None
+    (files.folder / "name").rename(files.folder / "other")
+    assert files.read("other") is None
+
+
+@pytest.mark.parametrize("place", [0, 31, 32, -1])
+@pytest.mark.parametrize("change", ["flipped", "cut"])
+def test_a_damaged_file_counts_as_absent_and_is_replaced(place, change, files):
+    files.write("name", bytes(range(100)))
+    content = bytearray((files.folder / "name").read_bytes())
+    content[place] ^= 1
+    (files.folder / "name").write_bytes(content if change == "flipped" else content[:place])
+    assert files.read("name") is None
+    files.write("name", b"new")
+    assert files.read("name") == b"new"
+
+
+def test_the_files_that_were_used_least_recently_are_deleted(tmp_path):
+    files = Store(tmp_path, most=10_000)
+    tmp_path.chmod(0o700)
+    for number in range(100):
+        files.write(str(number), bytes(500))
+        os.utime(tmp_path / str(number), (number, number))
+        assert number < 3 or files.read("2") is not None  # used each time
+    sizes = [path.stat().st_size for path in tmp_path.iterdir()]
+    assert 5_000 < sum(sizes) <= 10_000 * 17 / 16 + 600
+    assert files.read("99") is not None
+    assert files.read("50") is None
+
+
+def test_unfinished_files_of_processes_that_ended_are_deleted(files):
+    files.write("name", b"content")
+    for name, age in ((".new-old", 10_000), (".new-young", 10)):
+        path = files.folder / name
+        path.write_bytes(b"")
+        os.utime(path, (path.stat().st_mtime - age,) * 2)
+    Store(files.folder).write("other", b"content")
+    assert sorted(path.name for path in files.folder.iterdir()) == [".new-young", "name", "other"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_folders_and_files_that_others_may_write_are_not_trusted(files, caplog):
+    files.write("name", b"content")
+    (files.folder / "name").chmod(0o622)
+    assert files.read("name") is None
+    (files.folder / "name").chmod(0o600)
+    files.folder.chmod(0o777)
+    assert files.read("name") is None
+    files.write("other", b"content")
+    assert files.read("name") is None
+    assert [record.getMessage() for record in caplog.records] == [
+        f"compiled programs are not kept: other users may write into {files.folder}; chmod 700 makes it private"
+    ]
+    assert [path.name for path in files.folder.iterdir()] == ["name"]
+
+
+def test_folders_and_homes_of_another_user_are_left_alone(files, monkeypatch):
+    files.write("name", b"content")
+    monkeypatch.setattr(os, "geteuid", lambda: files.folder.stat().st_uid + 1)
+    assert files.read("name") is None
+    other = Store(files.folder.parent / "other" / "programs")
+    other.write("name", b"content")
+    assert not other.folder.parent.exists()
+
+
+def test_a_folder_that_cannot_be_made_holds_nothing(tmp_path):
+    (tmp_path / "jaxprt").write_text("a file")
+    files = Store(tmp_path / "jaxprt" / "programs")
+    assert files.read("name") is None
+    files.write("name", b"content")
+    assert files.read("name") is None
+    assert (tmp_path / "jaxprt").read_text() == "a file"
+
+
+def test_after_a_full_disk_nothing_more_is_written(files, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    files.write("name", b"content")
+    monkeypatch.setattr(os, "replace", full)
+    files.write("other", b"content")
+    monkeypatch.undo()
+    files.write("third", b"content")
+    assert [path.name for path in files.folder.iterdir()] == ["name"]
+    assert files.read("name") == b"content"
+
+
+def test_relative_folders_are_no_place(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", "relative")
+    Store(store.folder()).write("name", b"content")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_processor_whose_programs_xla_complains_about_keeps_none(noisy, monkeypatch, files, caplog, capfd):
+    def load(*_, **__):
+        os.write(2, b"doesn't match the machine type for execution" if noisy else b"of another thread")
+
+    monkeypatch.setattr(jax_cache.serialize_executable, "deserialize_and_load", load)
+    monkeypatch.setattr(jax_cache, "kept", lambda: files)
+    asked = inspect.unwrap(jax_cache.loads_quietly)
+    assert asked() is asked() is not noisy  # the second time from a file
+    assert capfd.readouterr().err == ("" if noisy else "of another thread")
+    assert [record.levelno for record in caplog.records] == [logging.WARNING] * noisy
+
+
+@pytest.fixture
+def kept_files(monkeypatch, files):
+    """Executables are kept in a folder of the test."""
+    monkeypatch.setattr(compilation_cache, "_cache", None)  # XLA cannot write again what the tests' cache holds
+    monkeypatch.setattr(compilation_cache, "_cache_initialized", True)
+    monkeypatch.setattr(jax_cache, "active", lambda: True)
+    monkeypatch.setattr(jax_cache, "loads_quietly", lambda: True)
+    monkeypatch.setattr(jax_cache, "kept", lambda: files)
+    return files
+
+
+def camera(x: float = 1.0, width: int = 4) -> Camera:
+    eye, target, up = np.array([[x, 2, 3], [0, 0, 0], [0, 1, 0]], np.float32)
+    return jax.tree.map(jnp.asarray, Camera(jnp.asarray(eye), jnp.asarray(target), jnp.asarray(up), 0.5, width, 3))
+
+
+def test_an_executable_is_loaded_without_tracing(kept_files, monkeypatch):
+    expected = np.asarray(kept(axes)(camera()))
+    assert len(list(kept_files.folder.iterdir())) == 1
+    later = kept(axes)
+    monkeypatch.setattr(later, "_compiled", None)
+    np.testing.assert_array_equal(later(camera()), expected)
+    np.testing.assert_array_equal(later(camera()), expected)
+
+
+def test_an_executable_that_cannot_be_loaded_again_is_not_kept(kept_files, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("NOT_FOUND: Function sub.7_kernel not found")
+
+    monkeypatch.setattr(executables.serialize_executable, "deserialize_and_load", fail)
+    assert kept(axes)(camera()).shape == (3, 3)
+    assert not kept_files.folder.exists()
+
+
+def test_what_differs_in_shape_type_or_static_values_is_another_executable(kept_files, x64):
+    function = kept(axes)
+    for each in (camera(), camera(width=5), jax.tree.map(lambda x: x.astype(float), camera())):
+        np.testing.assert_array_equal(function(each), raster.view_axes(each))
+    with jax.enable_x64(False):
+        function(camera())
+    assert len(list(kept_files.folder.iterdir())) == 4
+
+
+def test_calls_that_are_traced_or_elsewhere_go_through_jit(kept_files):
+    function = kept(axes)
+    slope = jax.jacobian(lambda x: function(equinox.tree_at(lambda c: c.eye, camera(), x)))(camera().eye)
+    assert np.isfinite(slope).all()
+    jax.jit(function)(camera())
+    jax.vmap(function)(jax.tree.map(lambda x: jnp.stack([x, x]), camera()))
+    with jax.debug_nans(True):
+        function(camera())
+    with jax.disable_jit():
+        function(camera())
+    if jax.device_count() > 1:
+        assert function(jax.device_put(camera(), jax.devices()[1])).devices() == {jax.devices()[1]}
+    assert not kept_files.folder.exists()
+
+
+class Theirs(Camera):
+    """A camera of another class: its code is unknown."""
+
+
+def called_back(x):
+    """It calls Python."""
+    return jax.pure_callback(lambda x: x, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+
+def test_programs_of_unknown_code_and_calls_of_python_are_not_kept(kept_files, monkeypatch):
+    function = kept(axes)
+    theirs = Theirs(**{name: getattr(camera(), name) for name in vars(camera())})
+    np.testing.assert_array_equal(function(theirs), function(camera()))
+    assert len(list(kept_files.folder.iterdir())) == 1
+    assert kept(lambda x: x + 1)(jnp.ones(2)).tolist() == [2, 2]
+    monkeypatch.setattr(raster, "called_back", called_back, raising=False)
+    monkeypatch.setattr(called_back, "__module__", raster.__name__)
+    assert kept(called_back)(jnp.ones(2)).tolist() == [1, 1]
+    assert len(list(kept_files.folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"no zlib", pickle.dumps(1)])
+def test_a_file_that_cannot_be_loaded_is_compiled_anew(content, kept_files):
+    expected = np.asarray(kept(axes)(camera()))
+    (path,) = kept_files.folder.iterdir()
+    kept_files.write(path.name, content)
+    np.testing.assert_array_equal(kept(axes)(camera()), expected)
+    assert len(kept_files.read(path.name)) > 1000
+
+
+def test_threads_compile_an_executable_once(kept_files):
+    function = kept(axes)
+    results: list[Any] = [None] * 4
+
+    def work(number):
+        results[number] = np.asarray(function(camera()))
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert np.ptp(np.stack(results), 0).max() == 0
+    assert len(function._executables) == 1
+    executables.forget()
+    assert not function._executables
+
+
+def test_surroundings_change_with_versions_flags_options_processor_and_code(monkeypatch, tmp_path):
+    found = {names.surroundings()}
+    fixed = inspect.unwrap(names._fixed)
+    monkeypatch.setattr(names, "_fixed", fixed)
+    for change in (
+        lambda: monkeypatch.setattr(names, "version_str", "0.0.1"),
+        lambda: monkeypatch.setattr(names, "processor", lambda: "another"),
+        lambda: monkeypatch.setenv("XLA_FLAGS", "--another"),
+        lambda: monkeypatch.setattr(names, "_PACKAGE", tmp_path),
+        lambda: (tmp_path / "module.py").write_text("1"),
+        lambda: (tmp_path / "module.py").write_text("2"),
+    ):
+        change()
+        monkeypatch.setattr(names, "_STARTED", np.inf)
+        assert names.surroundings() not in found
+        found.add(names.surroundings())
+    with jax.default_matmul_precision("float32"):
+        assert names.surroundings() not in found
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__" / "module.nbi").write_text("of Numba")
+    assert names.surroundings() in found
+    monkeypatch.setattr(names, "_STARTED", 0.0)
+    with pytest.raises(names.UnnamedError, match="has changed"):
+        names.surroundings()
+
+
+@pytest.mark.parametrize("value", [lambda: 0, object(), np.ones(2), np.float32(1), {"a": object()}, called_back])
+def test_values_that_have_no_name_are_refused(value):
+    with pytest.raises(names.UnnamedError):
+        names.described(value)
+
+
+def test_names_tell_values_apart():
+    values = [None, 0, 0.0, False, "0", (0,), [0], {"a": 0}, {"b": 0}, np.dtype("f4"), np.dtype("f8"), Camera, axes]
+    assert len({names.described(each) for each in values}) == len(values)
+    structures = [jax.tree.structure(each) for each in (camera(), camera(width=5), (1,), [1], {"a": 1}, None)]
+    assert len({names.described(each) for each in structures}) == len(structures)
