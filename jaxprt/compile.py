@@ -130,7 +130,7 @@ def make_room() -> None:
     be compiled, and the process ends. Pictures of many views and scenes come to that, because numbers of points vary.
     """
     global _traces
-    if _traces < _FEW or not (_MAPPINGS.exists() and _LIMIT.exists()):
+    if _traces + executables.count() < _FEW or not (_MAPPINGS.exists() and _LIMIT.exists()):
         return
     _traces = 0
     if _MAPPINGS.read_bytes().count(b"\n") > _FULL * int(_LIMIT.read_text()):

@@ -314,6 +314,8 @@ def test_what_differs_in_shape_type_or_static_values_is_another_executable(kept_
     with jax.enable_x64(False):
         function(camera())
     assert len(list(kept_files.folder.iterdir())) == 4
+    with pytest.raises(ValueError, match="Non-hashable static"):
+        kept(inspect.unwrap(raster.rasterize), static=("samples",))(None, camera(), samples=[1])
 
 
 def test_calls_that_are_traced_or_elsewhere_go_through_jit(kept_files):
@@ -375,7 +377,9 @@ def test_threads_compile_an_executable_once(kept_files):
         each.join()
     assert np.ptp(np.stack(results), 0).max() == 0
     assert len(function._executables) == 1
+    assert executables.count() >= 1
     executables.forget()
+    assert executables.count() == 0
     assert not function._executables
 
 

@@ -1,7 +1,7 @@
 """Executables that a later process loads without tracing or compiling them.
 
 JAX's persistent cache spares compiling only. Tracing and lowering a large program take seconds too. `Kept` keeps the
-whole executable, for calls whose program can be named without tracing it: concrete arrays on the default device, and
+whole executable, for calls whose program can be named without tracing it: concrete arrays on the default CPU, and
 static values and containers that this package, Equinox or Python define. Everything else goes through `jax.jit`.
 """
 
@@ -52,11 +52,14 @@ class Kept:
         option = {name: named[name] for name in self._static if name in named}
         operand = argument, {name: value for name, value in named.items() if name not in option}
         leaf, tree = jax.tree.flatten(operand)
-        if not (core.trace_state_clean() and all(map(_concrete, leaf))) or _debugging():
+        if not (core.trace_state_clean() and _ordinary() and all(map(_concrete, leaf))):
             return self._compiled(*argument, **named)
         aval = tuple((each.shape, str(each.dtype), getattr(each, "weak_type", False)) for each in leaf)
         signature = tree, aval, tuple(sorted(option.items())), config.trace_context()
-        executable = self._executables.get(signature)
+        try:
+            executable = self._executables.get(signature)
+        except TypeError:  # a static value that has no hash: JAX says so
+            return self._compiled(*argument, **named)
         if executable is None:
             with self._lock:
                 executable = self._executables.get(signature)
@@ -97,6 +100,11 @@ class Kept:
         return executable
 
 
+def count() -> int:
+    """Number of executables that this process holds."""
+    return sum(len(each._executables) for each in _every)
+
+
 def forget() -> None:
     """Forgets the executables of this process, as `jax.clear_caches` forgets other programs."""
     for each in _every:
@@ -119,10 +127,11 @@ def _place_of(device: Any) -> SingleDeviceSharding:
     return SingleDeviceSharding(device)
 
 
-def _debugging() -> bool:
-    """Whether JAX computes otherwise than by executables, or elsewhere than on the first device."""
-    return (
-        config.disable_jit.value
+def _ordinary() -> bool:
+    """Whether JAX computes by executables on the first device, which is a CPU. On GPUs nothing of this was tested."""
+    return not (
+        jax.default_backend() != "cpu"
+        or config.disable_jit.value
         or config.debug_nans.value
         or config.debug_infs.value
         or config.default_device.value is not None
