@@ -8,10 +8,10 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-long bench tables figures notebooks docs dist clean
+.PHONY: help setup demo view check test test-documents test-long bench tables figures notebooks docs dist clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.setup ## install the package, with what the demo needs
 demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in output/demo
@@ -25,8 +25,11 @@ check: $(VENV)/.setup-test ## format, lint and types
 	$(BIN)/ruff check
 	$(BIN)/pyright
 
-test: check ## check, then all tests, doctests and notebooks at a small size; real data where JAXPRT_DATA names its folder
+test: check ## check, then tests and doctests; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)
+
+test-documents: $(VENV)/.setup-test ## what make test leaves out: pages, notebooks, figures and benchmarks, at a small size
+	$(BIN)/python -m pytest -m "documents and not long" $(ARGS)
 
 test-long: $(VENV)/.setup-test ## what only a long run can show, with the optimization that users get; CONTRIBUTING.md lists it
 	XLA_FLAGS="" $(BIN)/python -m pytest -m long $(ARGS)

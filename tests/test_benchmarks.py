@@ -13,6 +13,8 @@ import jaxprt as prt
 from jaxprt import lobe
 from jaxprt.image import raster
 
+pytestmark = pytest.mark.documents
+
 ROOT = pathlib.Path(__file__).parents[1]
 BENCHMARKS = sorted(
     path.stem

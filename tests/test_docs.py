@@ -24,6 +24,8 @@ import trimesh
 import jaxprt as prt
 from jaxprt.relit import Clusters, Harmonics
 
+pytestmark = pytest.mark.documents
+
 ROOT = pathlib.Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 # The other folders hold what is written when the pages are built.

@@ -13,6 +13,8 @@ from benchmarks.figures import __main__ as program
 from benchmarks.figures import drawing, pages, sun2007
 from jaxprt.scene import builtin
 
+pytestmark = pytest.mark.documents
+
 DOCS = pathlib.Path(__file__).parents[1] / "docs" / "figures"
 
 

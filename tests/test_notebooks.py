@@ -13,6 +13,8 @@ import pytest
 
 from jaxprt import bounces
 
+pytestmark = pytest.mark.documents
+
 FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 2_000_000  # bytes
