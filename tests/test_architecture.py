@@ -14,7 +14,7 @@ import pathlib
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import pytest
 
@@ -65,13 +65,13 @@ def _name(path: pathlib.Path) -> str:
 
 
 PATHS = {_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text(), str(path)) for name, path in PATHS.items()}
-each_module = pytest.mark.parametrize("module", PATHS)
+TEXTS = {name: path.read_text() for name, path in PATHS.items()}
+NODES = {name: list(ast.walk(ast.parse(text, str(PATHS[name])))) for name, text in TEXTS.items()}
 
 
-def imports(tree: ast.AST) -> Iterator[str]:
+def imports(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Full names of what a module imports, anywhere in it; names from jaxprt resolved to modules."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -79,6 +79,9 @@ def imports(tree: ast.AST) -> Iterator[str]:
             for alias in node.names:
                 inner = f"{base}.{alias.name}"
                 yield inner if inner in PATHS else base
+
+
+IMPORTED = {module: set(imports(nodes)) for module, nodes in NODES.items()}
 
 
 def violation(importer: str, imported: str) -> str | None:
@@ -115,86 +118,85 @@ def _inside(importer: list[str], imported: list[str]) -> str | None:
     return f"points up the ladder, from {importer[2]} to {imported[2]}" if same else None
 
 
-@each_module
-def test_imports_point_down(module):
+def test_imports_point_down():
     wrong = [
         f"{module} -> {name}: {reason}"
-        for name in imports(TREES[module])
+        for module, names in IMPORTED.items()
+        for name in names
         if name.partition(".")[0] == "jaxprt" and (reason := violation(module, name))
     ]
     assert not wrong, "\n".join(wrong)
 
 
-@each_module
-def test_imports_are_absolute(module):
-    relative = [name for name in imports(TREES[module]) if name.startswith(".")]
+def test_imports_are_absolute():
+    relative = [f"{module}: {name}" for module, names in IMPORTED.items() for name in names if name.startswith(".")]
     assert not relative, f"write out {relative}"
 
 
-@each_module
-def test_a_library_is_imported_only_where_its_business_is(module):
-    for name in imports(TREES[module]):
-        home = ONLY_IN.get(name.partition(".")[0])
-        assert home is None or module == home or module.startswith(f"{home}."), f"{name} belongs to {home}"
+def test_a_library_is_imported_only_where_its_business_is():
+    for module, names in IMPORTED.items():
+        for name in names:
+            home = ONLY_IN.get(name.partition(".")[0])
+            at_home = home is None or module == home or module.startswith(f"{home}.")
+            assert at_home, f"{name} belongs to {home}, not to {module}"
 
 
-@each_module
-def test_decompositions_and_the_sphere_know_no_brdf_and_no_scene(module):
-    if module.split(".")[1:2] in (["decompose"], ["sphere"]):
-        known = {name.split(".")[1] for name in imports(TREES[module]) if name.startswith("jaxprt.")}
-        assert known <= {"decompose", "sphere", "compile"}
+def test_decompositions_and_the_sphere_know_no_brdf_and_no_scene():
+    for module, names in IMPORTED.items():
+        if module.split(".")[1:2] in (["decompose"], ["sphere"]):
+            known = {name.split(".")[1] for name in names if name.startswith("jaxprt.")}
+            assert known <= {"decompose", "sphere", "compile"}, module
 
 
-@each_module
-def test_jax_is_not_configured(module):
-    text = PATHS[module].read_text()
-    if module.startswith("jaxprt.programs."):  # reads all options; the one that it sets is a default of the user's
-        changed = re.findall(r"(?:config\.update|environ\S*\]\s*=[^=]).*", text)
-        assert all(line.startswith("config.update(_THRESHOLD, ") for line in changed), changed
-        return
-    names = {ast.unparse(node) for node in ast.walk(TREES[module]) if isinstance(node, ast.Attribute)}
-    assert not {name for name in names if re.match(r"jax\.(config|enable_x64|experimental\.enable_x64)\b", name)}
-    assert not re.search(r"from jax(\.\w+)* import .*\b(config|enable_x64)\b", text)
-    if module != "jaxprt.compile":  # which avoids wrong sums of jaxlib 0.10.2
-        assert not re.search(r"environ\S*[\"'](JAX|XLA)_", text)
+def test_jax_is_not_configured():
+    for module in PATHS.keys() - {"jaxprt.cli.play"}:  # which `python -m jaxprt` calls, in a process of its own
+        names = {ast.unparse(node) for node in NODES[module] if isinstance(node, ast.Attribute)}
+        configured = {name for name in names if re.match(r"jax\.(config|enable_x64|experimental\.enable_x64)\b", name)}
+        assert not configured, module
+        assert not re.search(r"from jax(\.\w+)* import .*\b(config|enable_x64)\b", TEXTS[module]), module
+        if module != "jaxprt.compile":  # which avoids wrong sums of jaxlib 0.10.2
+            assert not re.search(r"environ\S*[\"'](JAX|XLA)_", TEXTS[module]), module
 
 
-@each_module
-def test_what_is_compiled_states_the_precision_of_its_products(module):
-    if module in ("jaxprt.compile", "jaxprt.programs.jax_cache"):  # the latter adds 1 to a number
-        return
-    found = [node for node in ast.walk(TREES[module]) if isinstance(node, ast.Attribute) and node.attr == "jit"]
-    assert not found, "jax.jit leaves products to TF32 on GPUs: take jaxprt.compile.jit"
+def test_what_is_compiled_states_the_precision_of_its_products():
+    jitted = [
+        module
+        for module in PATHS.keys() - {"jaxprt.compile"}
+        if any(isinstance(node, ast.Attribute) and node.attr == "jit" for node in NODES[module])
+    ]
+    assert not jitted, f"jax.jit leaves products to TF32 on GPUs: take jaxprt.compile.jit in {jitted}"
 
 
-@each_module
-def test_module_has_a_subject_and_fits_on_a_few_screens(module):
-    assert not VAGUE & set(module.split("."))
-    lines = len(PATHS[module].read_text().splitlines())
-    assert lines <= MOST_LINES, f"{lines} lines: {module} has two subjects"
+def test_modules_have_a_subject_and_fit_on_a_few_screens():
+    vague = [module for module in PATHS if VAGUE & set(module.split("."))]
+    assert not vague
+    lines = {module: len(text.splitlines()) for module, text in TEXTS.items()}
+    long = {module: count for module, count in lines.items() if count > MOST_LINES}
+    assert not long, f"these modules have two subjects: {long}"
 
 
-@each_module
-def test_functions_have_one_idea(module):
-    functions = (node for node in ast.walk(TREES[module]) if isinstance(node, ast.FunctionDef))
-    for each in functions:
-        documented = len((ast.get_docstring(each) or "").splitlines())
-        lines = (each.end_lineno or 0) - each.lineno + 1 - documented
-        assert lines <= MOST_LINES_OF_A_FUNCTION, f"{each.name} has {lines} lines without its docstring"
+def test_functions_have_one_idea():
+    for module, nodes in NODES.items():
+        for function in nodes:
+            if isinstance(function, ast.FunctionDef):
+                documented = len((ast.get_docstring(function) or "").splitlines())
+                lines = (function.end_lineno or 0) - function.lineno + 1 - documented
+                name = f"{module}.{function.name}"
+                assert lines <= MOST_LINES_OF_A_FUNCTION, f"{name} has {lines} lines without its docstring"
 
 
-@each_module
-def test_annotations_are_not_deferred(module):
-    assert "__future__" not in set(imports(TREES[module])), "a linter then unquotes shapes"
+def test_annotations_are_not_deferred():
+    deferred = [module for module, names in IMPORTED.items() if "__future__" in names]
+    assert not deferred, f"a linter then unquotes shapes in {deferred}"
 
 
-@each_module
-def test_third_party_imports_are_declared(module):
+def test_third_party_imports_are_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extra = itertools.chain.from_iterable(project["optional-dependencies"].values())
     declared = {re.split(r"[^\w-]", line)[0].replace("-", "_") for line in (*project["dependencies"], *extra)}
-    used = {name.partition(".")[0] for name in imports(TREES[module])}
-    assert used - set(sys.stdlib_module_names) - {"jaxprt"} <= declared
+    used = {name.partition(".")[0]: module for module, names in IMPORTED.items() for name in names}
+    unknown = used.keys() - set(sys.stdlib_module_names) - {"jaxprt"} - declared
+    assert not unknown, {name: used[name] for name in unknown}
 
 
 def test_rooms_hold_what_the_table_names():
@@ -238,10 +240,14 @@ def test_the_page_lists_the_rungs_of_the_ladder_from_the_top():
     assert {name.split(".")[2] for name in PATHS if re.match(r"jaxprt\.systems\.", name)} == set(RUNG)
 
 
-@pytest.mark.parametrize("name", [name for name in sorted(set(named(PAGE))) if re.fullmatch(r"\w+[./][\w./]+", name)])
-def test_what_the_page_names_exists(name):
+def test_what_the_page_names_exists():
+    names = {name for name in named(PAGE) if re.fullmatch(r"\w+[./][\w./]+", name)}
     # A bare name of a file, such as `system.py`, is one that every system has.
-    assert list(PACKAGE.glob(f"systems/*/{name}")) if re.fullmatch(r"\w+\.py", name) else exists(name)
+    files = {name for name in names if re.fullmatch(r"\w+\.py", name)}
+    missing = [name for name in files if not list(PACKAGE.glob(f"systems/*/{name}"))]
+    assert not missing
+    missing = [name for name in names - files if not exists(name)]
+    assert not missing
 
 
 @pytest.mark.parametrize("name", ["jaxprt/extra", "jaxprt/lobe.py", "jaxprt.extra", "jaxprt.lobe.extra"])
@@ -250,7 +256,7 @@ def test_what_does_not_exist_is_found_out(name):
 
 
 def test_no_imports_form_a_circle():
-    needs = {module: {name for name in imports(TREES[module]) if name in PATHS and name != module} for module in PATHS}
+    needs = {module: {name for name in names if name in PATHS and name != module} for module, names in IMPORTED.items()}
     # Inside a folder its own __init__ does not count: what imports a module of it runs that first.
     graphlib.TopologicalSorter(needs).prepare()
 
