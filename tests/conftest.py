@@ -39,6 +39,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from tests import programs
+
 # Compiling the package's source anew takes each process that tests start a second, and workers three.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
@@ -48,6 +50,18 @@ TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
 # Linux gives a process 65,530 memory mappings, and each compiled program takes several, and 2 MB.
 MAPPINGS, RESIDENT = 40_000, 4e9
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds the option that writes tests/programs.json."""
+    parser.addoption("--keep-programs", action="store_true", help="keep how many programs each test file asks for")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Counts the programs of test files."""
+    counts = programs.Programs(config, forget)
+    programs.watch(counts.count)
+    config.pluginmanager.register(counts)
 
 
 def pytest_collection_finish() -> None:
