@@ -224,22 +224,6 @@ def test_the_order_and_direction_of_triangles_do_not_change_the_picture():
     np.testing.assert_allclose(other.barycentric[..., ::-1], base.barycentric, atol=1e-5)
 
 
-@pytest.mark.parametrize("samples", [1, 4])
-def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch, samples):
-    position, face = _soup(6, 12, reach=1.5)
-    face = np.concatenate([face, face[:6], [[0, 0, 1]]])  # Of equal triangles the first is seen; some have no area.
-    mesh, camera = _mesh(position, face), _camera()
-    wide = raster.rasterize(mesh, camera, samples=samples)
-    monkeypatch.setattr(raster.depths, "WIDE", 64)  # Several steps, some within a triangle.
-    steps = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, **forms: cpu(*arguments))
-    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
-    assert 0 < np.mean(np.asarray(narrow.triangle) >= 0) < 1
-    for other in (wide, steps):
-        np.testing.assert_array_equal(other.triangle, narrow.triangle)
-        np.testing.assert_allclose(other.depth, narrow.depth, rtol=1e-5)
-
-
 @pytest.mark.parametrize(("chunk", "triangles"), [(16, 2), (64, 300)])
 def test_more_patches_than_a_chunk_are_all_drawn(monkeypatch, chunk, triangles):
     position, face = _soup(5, triangles)
@@ -371,3 +355,20 @@ def test_colors_of_whole_numbers_are_drawn(unchecked):
     whole = jnp.full(color.shape, 200, jnp.uint8)
     seen = np.all(raster.rasterize(mesh, camera, samples=4).triangle >= 0, -1)
     np.testing.assert_allclose(pixels.render(mesh, whole, camera)[seen], 200, rtol=1e-5)
+
+
+# The last test here: it forgets all programs, twice.
+@pytest.mark.parametrize("samples", [1, 4])
+def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch, samples):
+    position, face = _soup(6, 12, reach=1.5)
+    face = np.concatenate([face, face[:6], [[0, 0, 1]]])  # Of equal triangles the first is seen; some have no area.
+    mesh, camera = _mesh(position, face), _camera()
+    wide = raster.rasterize(mesh, camera, samples=samples)
+    monkeypatch.setattr(raster.depths, "WIDE", 64)  # Several steps, some within a triangle.
+    steps = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, **forms: cpu(*arguments))
+    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
+    assert 0 < np.mean(np.asarray(narrow.triangle) >= 0) < 1
+    for other in (wide, steps):
+        np.testing.assert_array_equal(other.triangle, narrow.triangle)
+        np.testing.assert_allclose(other.depth, narrow.depth, rtol=1e-5)
