@@ -85,7 +85,9 @@ def floating(value: Any, *, dtype: Any = None) -> Any:
     if isinstance(known, jax.Array):
         return known if known.dtype == dtype else known.astype(dtype)
     with np.errstate(over="ignore"):  # The check of the class refuses infinity.
-        return jnp.asarray(known.astype(dtype))
+        known = known.astype(dtype)
+    with jax.ensure_compile_time_eval():  # What is known stays known while JAX traces a function.
+        return jax.device_put(known)  # jnp.asarray would be a program for each shape.
 
 
 def _float_type(dtype: Any) -> Any:

@@ -26,7 +26,7 @@ _SMOOTHEST = 1e-3  # smallest roughness, because a perfect mirror has no density
 def color(value: Any) -> Any:
     """A scalar or a color as an array of shape [1] or [3]. What is not of numbers is left for the class to refuse."""
     value = scalar(value)
-    return jnp.atleast_1d(value) if isinstance(value, jax.Array) else value
+    return jnp.atleast_1d(value) if isinstance(value, jax.Array) and not value.ndim else value
 
 
 def scalar(value: Any) -> Any:

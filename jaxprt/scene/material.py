@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.compile import jit
-from jaxprt.scene import mipmap, texture
-from jaxprt.scene.mipmap import Mipmap
+from jaxprt.scene import texture
 
 _COLORS = "base_color", "emissive", "specular_color"
 
@@ -36,7 +35,6 @@ class Texture(eqx.Module):
         transform: Affine transform from texture coordinates (u, v, 1), v up, to coordinates in the image.
         set: Index of the mesh's set of texture coordinates that it uses, 0 or 1.
         wrap: Wrap mode along u and along v, each one of ``texture.WRAPS``.
-        mipmap: The image's mip map, from `mipmapped`; if None, it is computed for each picture.
 
     Raises:
         ValueError: The image or the transform is not finite, or the set or wrap mode does not exist.
@@ -48,7 +46,6 @@ class Texture(eqx.Module):
     )
     set: int = eqx.field(static=True, default=0)
     wrap: tuple[str, str] = eqx.field(static=True, default=("repeat", "repeat"))
-    mipmap: Mipmap | None = None
 
     def __check_init__(self):
         """Refuses values that are not finite, and unknown sets and wrap modes."""
@@ -64,28 +61,11 @@ class Texture(eqx.Module):
         if not words or len(self.wrap) != 2 or not set(self.wrap) <= set(texture.WRAPS):
             raise ValueError(f"wrap must be two of {', '.join(texture.WRAPS)}, got {self.wrap}")
 
-    def at(
-        self, *coordinates: Float[Array, "*b 2"], slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None
-    ) -> Float[Array, "*b c"]:
-        """Looks up the image, given all sets of texture coordinates.
-
-        Args:
-            coordinates: Texture coordinates in each set.
-            slopes: For each set, the change of the coordinates from one pixel to the next, to the right and down. The
-                image is then averaged over the footprint of each pixel.
-        """
+    def at(self, *coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b c"]:
+        """Looks up the image, given all sets of texture coordinates. Pictures average it; see `material_table`."""
         turn = self.transform[:, :2]
         moved = jnp.einsum("ij,...j->...i", turn, coordinates[self.set], precision="highest") + self.transform[:, 2]
-        if slopes is None:
-            return texture.lookup(self.image, moved, wrap=self.wrap)
-        slope = jnp.einsum("ij,...j->...i", turn, slopes[self.set], precision="highest")
-        return mipmap.lookup(self.mipmapped().mipmap, moved, slope, wrap=self.wrap)
-
-    def mipmapped(self) -> "Texture":
-        """The texture together with its mip map."""
-        if self.mipmap is not None:
-            return self
-        return eqx.tree_at(lambda each: each.mipmap, self, mipmap.make(self.image), is_leaf=lambda each: each is None)
+        return texture.lookup(self.image, moved, wrap=self.wrap)
 
 
 class Surface(eqx.Module):
@@ -193,11 +173,6 @@ class TexturedMaterial(eqx.Module):
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 
-    def mipmapped(self) -> "TexturedMaterial":
-        """The material with mip maps of all its textures, so that pictures need not compute them each time."""
-        is_texture = lambda each: isinstance(each, Texture)  # noqa: E731
-        return jax.tree.map(lambda each: each.mipmapped() if is_texture(each) else each, self, is_leaf=is_texture)
-
     @property
     def textures(self) -> tuple[Texture, ...]:
         """All textures of the material."""
@@ -211,9 +186,8 @@ class TexturedMaterial(eqx.Module):
         *,
         color: Float[Array, "*b 3"] | None = None,
         handedness: Float[Array, "*b"] | None = None,
-        slopes: tuple[Float[Array, "2 *b 2"], ...] | None = None,
     ) -> Surface:
-        """Evaluates the material at points: vertices of a mesh, or shading points of a picture.
+        """Evaluates the material at vertices of a mesh or other points. Textures are read sharply.
 
         The result is differentiable in the factors, the images and, within texels, the coordinates. If a normal map or
         a direction of anisotropy is zero, the normal of the surface or the tangent is used, and gradients are finite.
@@ -224,8 +198,6 @@ class TexturedMaterial(eqx.Module):
             color: Colors that multiply the base color.
             handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; 1
                 everywhere if None. Results are in the right-handed frame.
-            slopes: For both sets, the change of the coordinates from one pixel to the next, to the right and down.
-                Textures are then averaged over the footprint of each pixel.
 
         Returns:
             The material parameters at the points.
@@ -235,11 +207,11 @@ class TexturedMaterial(eqx.Module):
 
         def value(factor: Array, each: Texture | None) -> Array:
             wide = jnp.broadcast_to(factor, (*batch, *(factor.shape or (1,))))
-            return wide if each is None else wide * each.at(*places, slopes=slopes)
+            return wide if each is None else wide * each.at(*places)
 
         base = value(self.base_color, self.base_color_texture)
-        anisotropy, direction = self._anisotropy(places, slopes)
-        normal = self._normal(places, slopes)
+        anisotropy, direction = self._anisotropy(places)
+        normal = self._normal(places)
         if handedness is not None:
             direction = direction * jnp.stack([jnp.ones_like(handedness), handedness], -1)
             normal = normal * jnp.stack([jnp.ones_like(handedness), handedness, jnp.ones_like(handedness)], -1)
@@ -256,24 +228,24 @@ class TexturedMaterial(eqx.Module):
             normal,
         )
 
-    def _anisotropy(self, places: tuple[Array, ...], slopes: tuple[Array, ...] | None) -> tuple[Array, Array]:
+    def _anisotropy(self, places: tuple[Array, ...]) -> tuple[Array, Array]:
         """Strength and direction of the anisotropy."""
         batch = places[0].shape[:-1]
         cosine, sine = jnp.cos(self.rotation), jnp.sin(self.rotation)
         if self.anisotropy_texture is None:
             direction = jnp.stack([cosine, sine])
             return jnp.broadcast_to(self.anisotropy, batch), jnp.broadcast_to(direction, (*batch, 2))
-        texel = self.anisotropy_texture.at(*places, slopes=slopes)
+        texel = self.anisotropy_texture.at(*places)
         x, y = jnp.moveaxis(_unit(2 * texel[..., :2] - 1), -1, 0)
         direction = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
         return self.anisotropy * texel[..., 2], direction
 
-    def _normal(self, places: tuple[Array, ...], slopes: tuple[Array, ...] | None) -> Array:
+    def _normal(self, places: tuple[Array, ...]) -> Array:
         """Unit normals of the normal map."""
         if self.normal_texture is None:
             up = jnp.asarray([0, 0, 1], self.normal_scale.dtype)
             return jnp.broadcast_to(up, (*places[0].shape[:-1], 3))
-        slope = 2 * self.normal_texture.at(*places, slopes=slopes) - 1
+        slope = 2 * self.normal_texture.at(*places) - 1
         # The last axis comes first, because `_unit` replaces zero by the first axis, here the normal.
         scaled = jnp.stack([slope[..., 2], slope[..., 0] * self.normal_scale, slope[..., 1] * self.normal_scale], -1)
         return jnp.roll(_unit(scaled), -1, -1)

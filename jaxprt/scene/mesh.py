@@ -398,6 +398,23 @@ def _frame(normal: np.ndarray, tangent: np.ndarray) -> tuple[Array, ...]:
     return tuple(jax.device_put(np.concatenate(block)[:count]) for block in (unit, across))
 
 
+def frames(normal: ArrayLike, tangent: ArrayLike) -> Float[np.ndarray, "v 3 3"]:
+    """Shading frames of vertices, as `jaxprt.sphere.directions.frame` has them, by one program for any number of them.
+
+    Args:
+        normal: Unit normals.
+        tangent: Tangents.
+    """
+    normal, tangent = np.asarray(normal), np.asarray(tangent)
+    count = len(normal)
+    if not count:
+        return np.zeros((0, 3, 3), normal.dtype)
+    rows = (
+        np.pad(each, ((0, -count % _BLOCK), (0, 0)), mode="edge").reshape(-1, _BLOCK, 3) for each in (normal, tangent)
+    )
+    return np.concatenate([np.asarray(directions.frame(*each)) for each in zip(*rows, strict=True)])[:count]
+
+
 def areas(mesh: Mesh) -> Float[np.ndarray, " v"]:
     """A third of the area of the triangles around each vertex: weights for means over the surface."""
     face = np.asarray(mesh.face)

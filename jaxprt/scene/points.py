@@ -27,19 +27,19 @@ class Points(eqx.Module):
             that do not belong to a picture.
     """
 
-    corner: Int[Array, "k p"]
-    weight: Float[Array, "k p"]
-    slope: Float[Array, "2 k p"] | None = None
+    corner: Int[Array | np.ndarray, "k p"]
+    weight: Float[Array | np.ndarray, "k p"]
+    slope: Float[Array | np.ndarray, "2 k p"] | None = None
 
     def __len__(self) -> int:
         """Number of points."""
         return self.corner.shape[1]
 
-    def carry(self, attribute: Num[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
+    def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Float[Array, "..."]:
         """Interpolates a vertex attribute at the points. The vertices are along `axis`; the result is linear in it."""
         return _carried(self.corner, self.weight, attribute, axis=axis)
 
-    def slopes(self, attribute: Float[Array, "v c"]) -> Float[Array, "2 p c"]:
+    def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
         assert self.slope is not None
         return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])

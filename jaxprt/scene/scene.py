@@ -18,7 +18,6 @@ from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
-from jaxprt.scene.points import Points
 
 
 class Part(eqx.Module):
@@ -83,27 +82,17 @@ class Part(eqx.Module):
                 field = ("mesh.texture", "second")[each.set]
                 raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
 
-    def surface(self, points: Points | None = None) -> Surface:
-        """Material parameters at the vertices, or at surface points.
-
-        Args:
-            points: Points on the mesh; the vertices if None. If they have slopes, textures are averaged over pixels.
+    def surface(self) -> Surface:
+        """Material parameters at the vertices.
 
         Raises:
             TypeError: The material is a BRDF, which has no textures.
         """
         require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="jaxprt.load_scene")
         assert isinstance(self.material, TexturedMaterial)
-        position, place, second = self.mesh.position, self.mesh.texture, self.second
-        place = jnp.zeros((len(position), 2), position.dtype) if place is None else place
-        if points is None:
-            return self.material.at(place, second, color=self.color, handedness=self.handedness)
-        sets = (place, place if second is None else second)
-        slopes = None if points.slope is None else tuple(points.slopes(each) for each in sets)
-        first, second = (points.carry(each) for each in sets)
-        color = None if self.color is None else points.carry(self.color)
-        side = None if self.handedness is None else jnp.sign(points.carry(self.handedness))
-        return self.material.at(first, second, color=color, handedness=side, slopes=slopes)
+        place = self.mesh.texture
+        place = jnp.zeros((len(self.mesh.position), 2), self.mesh.position.dtype) if place is None else place
+        return self.material.at(place, self.second, color=self.color, handedness=self.handedness)
 
 
 def _place(value: Any) -> Any:

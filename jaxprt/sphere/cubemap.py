@@ -45,7 +45,7 @@ def direction(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: `size` is below 1.
     """
-    return jnp.asarray(_direction(size), jnp.result_type(float))
+    return _constant(_direction(size))
 
 
 def point(*, size: int) -> Float[Array, "6 n n 3"]:
@@ -60,7 +60,12 @@ def point(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: `size` is below 1.
     """
-    return jnp.asarray(_point(size), jnp.result_type(float))
+    return _constant(_point(size))
+
+
+def _constant(value: Float[np.ndarray, "..."]) -> Array:
+    """An array of the host in the default type, put on the device without a program."""
+    return jax.device_put(value.astype(jnp.result_type(float)))
 
 
 def axes() -> Float[np.ndarray, "6 3 3"]:
@@ -82,7 +87,7 @@ def solid_angle(*, size: int) -> Float[Array, "6 n n"]:
     Raises:
         ValueError: `size` is below 1.
     """
-    return jnp.asarray(_solid_angle(size), jnp.result_type(float))
+    return _constant(_solid_angle(size))
 
 
 def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
@@ -100,7 +105,7 @@ def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
     Raises:
         ValueError: `size` is below 1.
     """
-    return jnp.asarray(_vector_area(size), jnp.result_type(float))
+    return _constant(_vector_area(size))
 
 
 @jit

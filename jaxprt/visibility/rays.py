@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Float32, UInt8
 
 from jaxprt.files.arrays import sketch
 from jaxprt.scene import origin as origins
-from jaxprt.scene.mesh import Mesh, relative
-from jaxprt.sphere import cubemap, directions
+from jaxprt.scene.mesh import Mesh, frames, relative
+from jaxprt.sphere import cubemap
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.starts import start_points
@@ -153,10 +153,8 @@ class VisibilityJob(blocks.Job):
             )
         vertex = chosen(mesh, vertex)
         start = start_points(mesh, Occluder(shadowing))[vertex]
-        # Padding to a power of two keeps the number of compiled shapes small.
-        padded = np.pad(vertex, (0, (1 << max(6, (len(vertex) - 1).bit_length())) - len(vertex)))
-        normal, tangent = (np.asarray(each)[padded] for each in (mesh.normal, mesh.tangent))
-        frame = np.asarray(directions.frame(normal, tangent), np.float32)[: len(vertex)]
+        normal, tangent = (np.asarray(each)[vertex] for each in (mesh.normal, mesh.tangent))
+        frame = frames(normal, tangent).astype(np.float32)
         # The key depends on the inputs only: computed values are rounded differently on other processors.
         key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}

@@ -476,9 +476,9 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
     mesh, brdf = sphere
     path = tmp_path / "a.prt"
     relit(sphere, path=path)
-    starts, frame = visibility.start_points, visibility.rays.directions.frame
+    starts, frames = visibility.start_points, visibility.rays.frames
     monkeypatch.setattr(visibility.rays, "start_points", lambda *each: rounded(starts(*each)))
-    monkeypatch.setattr(visibility.rays.directions, "frame", lambda *each: rounded(frame(*each)))
+    monkeypatch.setattr(visibility.rays, "frames", lambda *each: rounded(frames(*each)))
     monkeypatch.setattr(separable.wavelets, "compress", None)  # Nothing is computed again.
     other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
     same(relit((mesh, other), path=path)[:2], expected[:2])

@@ -1,0 +1,397 @@
+"""Materials of many parts as columns, evaluated at points of all parts by one program.
+
+The texels of all textures stand in one array. Which image a part reads, and how, are numbers and not types, so that the
+program depends on the number of points only, and not on the parts or their textures.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from jaxprt.brdf import BlinnPhong, MetallicRoughness
+from jaxprt.compile import kept, known, put, shared_size
+from jaxprt.scene import mipmap, texture
+from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.points import Points
+from jaxprt.scene.scene import Part
+
+# Textures, in the order of their columns.
+TEXTURES = (
+    "base_color_texture",
+    "metallic_texture",
+    "roughness_texture",
+    "emissive_texture",
+    "specular_texture",
+    "specular_color_texture",
+    "anisotropy_texture",
+    "normal_texture",
+)
+COLORS = 6  # of these determine the colors and the roughness of points; the others turn the frames of vertices
+_FACTORS = (
+    ("base_color", 3),
+    ("metallic", 1),
+    ("roughness", 1),
+    ("emissive", 3),
+    ("specular", 1),
+    ("specular_color", 3),
+    ("ior", 1),
+)
+ROW = 1 << 12  # number of points that are evaluated together
+SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
+_LEVELS = 16  # of a mip map at most: images of up to 32,768 texels along an edge
+_PROBES = 4  # lookups along an elongated footprint
+_SMALL = 1 << 16  # values of all textures up to which padding to coarser sizes is not worth avoiding
+_LONG = 1.5  # ratio of length to width above which one lookup is not enough
+
+
+class Values(NamedTuple):
+    """Material parameters at points; `jaxprt.scene.material.Surface` explains them."""
+
+    base_color: Float[Array | np.ndarray, "p 3"]
+    metallic: Float[Array | np.ndarray, " p"]
+    roughness: Float[Array | np.ndarray, " p"]
+    emissive: Float[Array | np.ndarray, "p 3"]
+    specular: Float[Array | np.ndarray, " p"]
+    specular_color: Float[Array | np.ndarray, "p 3"]
+    ior: Float[Array | np.ndarray, " p"]
+
+
+class Look(NamedTuple):
+    """What systems need of the materials at points.
+
+    Attributes:
+        coefficient: Weights of the four terms of `jaxprt.brdf.MetallicRoughness`. Those of `BlinnPhong` are its colors:
+            diffuse, specular, 0 and 0.
+        log_roughness: Logarithm of the roughness; that of metallic-roughness materials is at least `SMOOTHEST`.
+        emitted: Radiance that the surface emits.
+        values: The parameters themselves.
+    """
+
+    coefficient: Float[Array | np.ndarray, "p 4 3"]
+    log_roughness: Float[Array | np.ndarray, " p"]
+    emitted: Float[Array | np.ndarray, "p 3"]
+    values: Values
+
+
+class Texels(eqx.Module):
+    """The mip maps of several images, one after another in one array.
+
+    Attributes:
+        value: Channels of the texels, texel by texel, row by row, level by level, image by image.
+        start: Index of the first value of each level of each image.
+        shape: Height and width of each image; 0 in padding.
+        channels: Number of channels of each image.
+    """
+
+    value: Float[Array | np.ndarray, " t"]
+    start: Int[Array | np.ndarray, "i n"]
+    shape: Int[Array | np.ndarray, "i 2"]
+    channels: Int[Array | np.ndarray, " i"]
+
+
+class MaterialTable(eqx.Module):
+    """Materials of several parts, and what the vertices of these parts hold for them.
+
+    Attributes:
+        factor: Factors of each material.
+        image: Index of the image of each texture of each material; -1 for none.
+        transform: Transform of the texture coordinates of each texture.
+        set: Index of the set of texture coordinates of each texture.
+        wrap: Wrap mode of each texture along u and v, as an index into `texture.WRAPS`.
+        texels: The images.
+        part: Index of the material of each vertex.
+        coordinate: Both sets of texture coordinates of each vertex.
+        color: Color of each vertex, which multiplies the base color.
+    """
+
+    factor: Float[Array | np.ndarray, "m f"]
+    image: Int[Array | np.ndarray, "m s"]
+    transform: Float[Array | np.ndarray, "m s 2 3"]
+    set: Int[Array | np.ndarray, "m s"]
+    wrap: Int[Array | np.ndarray, "m s 2"]
+    texels: Texels
+    part: Int[Array | np.ndarray, " v"]
+    coordinate: Float[Array | np.ndarray, "v 4"]
+    color: Float[Array | np.ndarray, "v 3"]
+
+    def at(self, points: Points) -> Look:
+        """The materials at points. Textures are averaged over the pixels of points that have slopes.
+
+        Outside of `jax.jit` any number of points runs one program, and the result of other numbers than `ROW` is in
+        NumPy.
+        """
+        count = len(points)
+        if count == ROW or not count or not known(points) or points.corner.shape[0] != 3:
+            return _looked(self, points)
+        own = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
+        host = jax.tree.map(np.asarray, points)
+        slope = np.zeros((2, *host.weight.shape), host.weight.dtype) if host.slope is None else host.slope
+        rows = [_looked(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in own]
+        xp = np if known(rows) else jnp
+        return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
+
+    def at_vertices(self) -> Look:
+        """The materials at all vertices; in NumPy unless JAX traces the table."""
+        return self.at(at_vertices(np.arange(len(self.part), dtype=np.int32)))
+
+
+def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
+    """Vertices as points, at which textures are read sharply."""
+    weight = np.zeros((3, len(vertex)), jnp.result_type(float))
+    weight[0] = 1
+    return put(Points(np.stack([vertex] * 3), weight, np.zeros((2, *weight.shape), weight.dtype)))
+
+
+@kept
+def _looked(table: MaterialTable, points: Points) -> Look:
+    values = _values(table, points)
+    shiny = table.factor[:, -1][table.part[points.corner[0]]] > 0
+    none = jnp.zeros_like(values.base_color)
+    colors = jnp.stack([values.base_color, values.specular_color, none, none], 1)
+    material = MetallicRoughness(**{name: value for name, value in values._asdict().items() if name != "emissive"})
+    coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
+    least = jnp.where(shiny, 0, SMOOTHEST)
+    return Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values)
+
+
+def _values(table: MaterialTable, points: Points) -> Values:
+    part = table.part[points.corner[0]]
+    factor = table.factor[part]
+    place = points.carry(table.coordinate)
+    slope = jnp.zeros((2, *place.shape), place.dtype) if points.slope is None else points.slopes(table.coordinate)
+
+    def read(texture: Array) -> Float[Array, "p 3"]:
+        image = table.image[part, texture]
+
+        def found() -> Array:
+            second = table.set[part, texture][:, None] > 0
+            turn = table.transform[part, texture]
+            own = jnp.where(second, place[:, 2:], place[:, :2])
+            change = jnp.where(second, slope[..., 2:], slope[..., :2])
+            moved = jnp.einsum("pij,pj->pi", turn[..., :2], own, precision="highest") + turn[..., 2]
+            moving = jnp.einsum("pij,kpj->kpi", turn[..., :2], change, precision="highest")
+            value = _looked_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
+            return jnp.where(image[:, None] >= 0, value, 1)
+
+        return jax.lax.cond(jnp.any(image >= 0), found, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
+
+    base, metallic, roughness, emissive, specular, tint = jax.lax.map(read, jnp.arange(COLORS))
+    color = points.carry(table.color)
+    first = np.cumsum([0, *(width for _, width in _FACTORS)])
+    each = {name: factor[:, begin : begin + width] for (name, width), begin in zip(_FACTORS, first, strict=False)}
+    return Values(
+        each["base_color"] * base * color,
+        each["metallic"][:, 0] * metallic[:, 0],
+        each["roughness"][:, 0] * roughness[:, 0],
+        each["emissive"] * emissive,
+        each["specular"][:, 0] * specular[:, 0],
+        each["specular_color"] * tint,
+        each["ior"][:, 0],
+    )
+
+
+def _looked_up(
+    texels: Texels,
+    image: Int[Array, " p"],
+    coordinate: Float[Array, "p 2"],
+    slope: Float[Array, "2 p 2"],
+    wrap: Int[Array, "p 2"],
+) -> Float[Array, "p 3"]:
+    """`jaxprt.scene.mipmap.lookup` for points that each read an image of their own."""
+    shape = texels.shape[image]
+    scaled = jax.lax.stop_gradient(slope) * shape[:, ::-1].astype(slope.dtype)
+    length = jnp.sqrt(jnp.sum(scaled**2, -1))
+    long, short = jnp.maximum(length[0], length[1]), jnp.minimum(length[0], length[1])
+    along = jnp.where((length[0] > length[1])[:, None], slope[0], slope[1])
+
+    def probes(count: int) -> Array:
+        level = jnp.log2(jnp.maximum(jnp.maximum(short, long / count), 1.0))
+        offset = (np.arange(count) + 0.5) / count - 0.5
+        if count == 1:
+            return _trilinear(texels, image, shape, coordinate, level, wrap)
+
+        def one(total: Array, step: Array) -> tuple[Array, None]:
+            return total + _trilinear(texels, image, shape, coordinate + step * along, level, wrap), None
+
+        start = jnp.zeros((len(image), 3), texels.value.dtype)
+        return jax.lax.scan(one, start, jnp.asarray(offset, slope.dtype))[0] / count
+
+    flat = jnp.any((long > _LONG * short) & (long > _LONG))
+    return jax.lax.cond(flat, lambda: probes(_PROBES), lambda: probes(1))
+
+
+def _trilinear(texels: Texels, image: Array, shape: Array, coordinate: Array, level: Array, wrap: Array) -> Array:
+    most = jnp.sum(texels.start[image] >= 0, 1) - 1  # the coarsest level
+    low = jnp.minimum(jnp.floor(level).astype(jnp.int32), jnp.maximum(most - 1, 0))
+    upper = jnp.clip(level - low, 0, 1)
+    channels = texels.channels[image]
+    channel = jnp.minimum(jnp.arange(3), channels[:, None] - 1)
+
+    def one(total: Array, step: Array) -> tuple[Array, None]:
+        number = jnp.minimum(low + step, most)
+        height, width = (-(-shape[:, axis] >> number) for axis in (0, 1))
+        start = texels.start[image, number]
+        weight = jnp.where(step > 0, upper, 1 - upper)
+        for (row, column), part in _bilinear(coordinate, height, width, wrap):
+            place = start + (row * width + column) * channels
+            total = total + texels.value[place[:, None] + channel] * (part * weight)[:, None]
+        return total, None
+
+    return jax.lax.scan(one, jnp.zeros((len(image), 3), texels.value.dtype), jnp.arange(2))[0]
+
+
+def _bilinear(coordinate: Array, height: Array, width: Array, wrap: Array) -> list:
+    """`jaxprt.scene.texture.bilinear` with a size and wrap modes for each point."""
+    clamp, mirror = texture.WRAPS.index("clamp"), texture.WRAPS.index("mirror")
+
+    def reduced(place: Array, mode: Array) -> Array:
+        period = jnp.where(mode == mirror, 2, 1)
+        return jnp.where(mode == clamp, jnp.clip(place, 0, 1), place - period * jnp.floor(place / period))
+
+    def inside(index: Array, size: Array, mode: Array) -> Array:
+        turned = index % jnp.where(mode == mirror, 2 * size, size)
+        turned = jnp.where(mode == mirror, jnp.minimum(turned, 2 * size - 1 - turned), turned)
+        return jnp.where(mode == clamp, jnp.clip(index, 0, size - 1), turned)
+
+    x = reduced(coordinate[:, 0], wrap[:, 0]) * width - 0.5
+    y = (1 - reduced(coordinate[:, 1], wrap[:, 1])) * height - 0.5
+    column, row = jnp.floor(x), jnp.floor(y)
+    right, down = x - column, y - row
+    result = []
+    for below, v in ((0, 1 - down), (1, down)):
+        line = inside(row.astype(jnp.int32) + below, height, wrap[:, 1])
+        for beside, u in ((0, 1 - right), (1, right)):
+            result.append(((line, inside(column.astype(jnp.int32) + beside, width, wrap[:, 0])), v * u))
+    return result
+
+
+def of_parts(parts: Sequence[Part]) -> MaterialTable:
+    """The materials of some parts, in the order of the vertices of all of them.
+
+    A part whose material is a BRDF has the values of a white material, which nobody reads.
+    """
+    materials = [part.material for part in parts]
+    count = [len(part.mesh.position) for part in parts]
+    dtype, room = jnp.result_type(float), shared_size(sum(count)) - sum(count)
+
+    def column(each: Sequence[Any], otherwise: float, width: int) -> Any:
+        pairs = zip(count, each, strict=True)
+        rows = [np.full((n, width), otherwise, dtype) if own is None else own for n, own in pairs]
+        return _concatenated([*rows, np.full((room, width), otherwise, dtype)], dtype)
+
+    first = column([part.mesh.texture for part in parts], 0.0, 2)
+    second = column([part.mesh.texture if part.second is None else part.second for part in parts], 0.0, 2)
+    both = jnp.concatenate([first, second], 1) if not known(first, second) else np.concatenate([first, second], 1)
+    part = np.repeat(np.arange(len(parts), dtype=np.int32), count)
+    columns = np.pad(part, (0, room)), both, column([each.color for each in parts], 1.0, 3)
+    held: dict[str, Any] = dict(zip(("part", "coordinate", "color"), columns, strict=True))
+    return MaterialTable(**_rows(materials, dtype), **held)
+
+
+def with_materials(
+    table: MaterialTable,
+    materials: Sequence[TexturedMaterial | Callable],
+    before: Sequence[TexturedMaterial | Callable],
+) -> MaterialTable:
+    """The table with other materials of the same parts.
+
+    Its arrays are at least as large as before, so that materials with fewer or smaller textures run the same programs.
+    Texels are copied only where there are new images.
+
+    Args:
+        table: The table.
+        materials: The new materials.
+        before: Those of the table.
+    """
+    held: dict[str, Any] = {"part": table.part, "coordinate": table.coordinate, "color": table.color}
+    old = _images(before)
+    return MaterialTable(**_rows(materials, table.factor.dtype, old=old, texels=table.texels), **held)
+
+
+def _images(materials: Sequence[TexturedMaterial | Callable]) -> list[Any]:
+    """The images of the textures of some materials, each once."""
+    own = (getattr(material, name, None) for material in materials for name in TEXTURES)
+    return list({id(each.image): each.image for each in own if each is not None}.values())
+
+
+def _rows(
+    materials: Sequence[TexturedMaterial | Callable],
+    dtype: Any,
+    *,
+    old: Sequence[Any] = (),
+    texels: Texels | None = None,
+) -> dict[str, Any]:
+    """Factors, textures and images of some materials, padded to a number of materials that scenes share.
+
+    `texels` holds the images `old` already, and serves again if there are no others.
+    """
+    rows, images = shared_size(len(materials)), _images(materials)
+    if texels is None or {id(each) for each in images} - {id(each) for each in old}:
+        texels = _texels(images, dtype, texels)
+    else:
+        images = old
+    number, image = {id(each): n for n, each in enumerate(images)}, np.full((rows, len(TEXTURES)), -1, np.int32)
+    transform: Any = np.zeros((*image.shape, 2, 3), dtype)
+    sets, wrap = np.zeros(image.shape, np.int32), np.zeros((*image.shape, 2), np.int32)
+    for row, material in enumerate(materials):
+        for column, name in enumerate(TEXTURES):
+            own: Texture | None = getattr(material, name, None)
+            if own is None:
+                continue
+            image[row, column] = number[id(own.image)]
+            sets[row, column] = own.set
+            wrap[row, column] = [texture.WRAPS.index(mode) for mode in own.wrap]
+            transform = _placed(transform, (row, column), own.transform)
+    factor = _concatenated([_factors(material)[None] for material in materials], dtype)
+    padding = np.zeros((rows - len(materials), factor.shape[1]), dtype)
+    made = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
+    return {"factor": _concatenated([factor, padding], dtype), **made}
+
+
+def _placed(array: Any, place: tuple[int, int], value: Any) -> Any:
+    """The array with another value at a place."""
+    if isinstance(value, Tracer) or isinstance(array, Tracer):
+        return jnp.asarray(array).at[place].set(value)
+    array = np.array(array)
+    array[place] = value
+    return array
+
+
+def _factors(material: TexturedMaterial | Callable) -> Any:
+    """The factors of a material as one row, whose last entry is 1 for `BlinnPhong`."""
+    xp = np if known(material) else jnp
+    if isinstance(material, BlinnPhong):
+        colors = {"base_color": material.diffuse, "specular_color": material.specular}
+        every: dict[str, Any] = vars(TexturedMaterial()) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
+        return xp.hstack([*(xp.broadcast_to(every[name], (width,)) for name, width in _FACTORS), 1])
+    own = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
+    return xp.hstack([*(getattr(own, name) for name, _ in _FACTORS), 0])
+
+
+def _concatenated(rows: Sequence[Any], dtype: Any) -> Any:
+    return jnp.concatenate(rows).astype(dtype) if not known(rows) else np.concatenate(rows).astype(dtype)
+
+
+def _texels(images: Sequence[Any], dtype: Any, least: Texels | None = None) -> Texels:
+    """The mip maps of some images in one array, padded to a size that scenes share, or to that of other texels."""
+    rows, room = (1, 4) if least is None else (len(least.shape), len(least.value))
+    rows = max(shared_size(len(images)), rows)
+    start, shape, channels = np.full((rows, _LEVELS), -1), np.ones((rows, 2), np.int32), np.ones(rows, np.int32)
+    start[:, 0], values, total = 0, [], 0
+    for row, image in enumerate(images):
+        for level, own in enumerate(mipmap.levels(image)):
+            start[row, level] = total
+            total += own.size
+            values.append(own.reshape(-1))
+        shape[row], channels[row] = image.shape[:2], image.shape[2]
+    if total >= 1 << 31:
+        raise ValueError(f"textures must have fewer than 2^31 values with their mip maps, got {total}")
+    size = max(shared_size(total, fine=total > _SMALL), room)
+    value = _concatenated([*values, np.ones(size - total, dtype)], dtype)
+    return Texels(value, start.astype(np.int32), shape, channels)
