@@ -1,13 +1,15 @@
-"""Names of array axes, from the type annotations of the fields that hold the arrays."""
+"""Axes of arrays, named by the type annotations of their fields, to join, pad and cut what has vertices."""
 
 import dataclasses
 import typing
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
+
+Held = TypeVar("Held", bound=PyTree)
 
 
 def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
@@ -34,6 +36,47 @@ def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
                 hint = None
                 break
         yield _names(hint, leaf), leaf
+
+
+def joined(values: Sequence[Held], *, size: int) -> Held:  # pyright: ignore[reportInvalidTypeForm]
+    """Transport of several meshes as that of one, with the vertices of one mesh after another.
+
+    Arrays without an axis of vertices are those of the first.
+
+    Args:
+        values: Transport of each mesh, all of one kind.
+        size: Number of vertices of the result. Vertices after those of all meshes repeat the last one.
+    """
+    every = [list(leaves(value)) for value in values]
+    made: dict[int, Any] = {}  # An array that occurs twice stays one array.
+    result = []
+    for number, (axes, leaf) in enumerate(every[0]):
+        if "v" in axes and id(leaf) not in made:
+            axis = axes.index("v")
+            whole = np.concatenate([np.asarray(own[number][1]) for own in every], axis)
+            room = [(0, size - whole.shape[axis] if each == axis else 0) for each in range(whole.ndim)]
+            made[id(leaf)] = jax.device_put(np.pad(whole, room, mode="edge"))
+        result.append(made.get(id(leaf), leaf))
+    return jax.tree.unflatten(jax.tree.structure(values[0]), result)
+
+
+def taken(value: Held, vertex: slice) -> Held:  # pyright: ignore[reportInvalidTypeForm]
+    """Transport or a system at some of its vertices, in NumPy."""
+    return mapped(value, lambda axes, leaf: np.asarray(leaf)[_at(axes, vertex)] if "v" in axes else leaf)
+
+
+def mapped(value: Held, change: Callable[[list[str], Any], Any]) -> Held:  # pyright: ignore[reportInvalidTypeForm]
+    """The value with each array changed by a function of the names of its axes and the array."""
+    made: dict[int, Any] = {}
+    every = list(leaves(value))
+    for axes, leaf in every:
+        if id(leaf) not in made:
+            made[id(leaf)] = change(axes, leaf)
+    return jax.tree.unflatten(jax.tree.structure(value), [made[id(leaf)] for _, leaf in every])
+
+
+def _at(axes: list[str], vertex: slice) -> tuple[slice, ...]:
+    return tuple(vertex if name == "v" else slice(None) for name in axes)
 
 
 def _names(hint: Any, leaf: Any) -> list[str]:

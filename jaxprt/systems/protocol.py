@@ -184,43 +184,32 @@ def check_blend(value: Any) -> None:
         require.kind("the materials", value, Blend, source="jaxprt.systems.protocol.Blend")
 
 
-class _Composite(System):
-    """Several systems that share an origin.
-
-    Attributes:
-        part: The systems.
-    """
-
-    part: tuple[System, ...]
-
-    def __check_init__(self):
-        """Refuses systems of different origins."""
-        origin = {system.origin for system in self.part}
-        if len(origin) > 1:
-            raise ValueError(f"systems must have one origin, got {sorted(origin)}: precompute their parts as one scene")
-
-    @property
-    def origin(self) -> origins.Origin:
-        """Where the zero of all systems is in the coordinates of eyes."""
-        return self.part[0].origin if self.part else origins.ZERO
-
-    def centered(self) -> System:
-        """The same systems for eyes relative to `origin`."""
-        return type(self)(tuple(system.centered() for system in self.part))
-
-
-class Total(_Composite):
+class Total(System):
     """The sum of several systems over the same vertices, such as direct and reflected light.
 
     Attributes:
         part: The systems. All receive the same materials.
     """
 
+    part: tuple[System, ...]
+
     def __check_init__(self):
-        """Refuses systems of different vertices."""
+        """Refuses systems of different origins or vertices."""
+        origin = {system.origin for system in self.part}
+        if len(origin) > 1:
+            raise ValueError(f"systems must have one origin, got {sorted(origin)}: precompute their parts as one scene")
         counts = [system.vertices for system in self.part]
         if len(set(counts)) != 1:
             raise ValueError(f"systems must be one or more with the same number of vertices, got {counts}")
+
+    @property
+    def origin(self) -> origins.Origin:
+        """Where the zero of all systems is in the coordinates of eyes."""
+        return self.part[0].origin if self.part else origins.ZERO
+
+    def centered(self) -> "Total":
+        """The same systems for eyes relative to `origin`."""
+        return Total(tuple(system.centered() for system in self.part))
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""
@@ -251,70 +240,6 @@ class Total(_Composite):
     def vertices(self) -> int:
         """Number of vertices, or of points."""
         return self.part[0].vertices
-
-
-class Joined(_Composite):
-    """Systems of different meshes, with their vertices concatenated in the order of `scene.mesh.join`.
-
-    Materials are a list with one entry for each system, or None.
-
-    Attributes:
-        part: The systems.
-    """
-
-    def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """The light of each system. Systems with the same `shared_light` share one result."""
-        made: dict[tuple, PyTree] = {}
-        result = []
-        for each in self.part:
-            key = each.shared_light
-            lit = each.light(environment) if key is None or key not in made else made[key]
-            if key is not None:
-                made[key] = lit
-            result.append(lit)
-        return tuple(result)
-
-    def shade(self, light: tuple[PyTree, ...], materials: Sequence | None = None) -> tuple[PyTree, ...]:
-        """Light that arrives at the vertices of each system."""
-        require.kind("the light", light, tuple, source="Joined.light")
-        triples = zip(self.part, light, self._given(materials), strict=True)
-        return tuple(each.shade(lit, own) for each, lit, own in triples)
-
-    def view(self, eye: Float[Array, "3"], materials: Sequence | None = None) -> tuple[PyTree, ...]:
-        """The view of each system."""
-        return tuple(each.view(eye, own) for each, own in zip(self.part, self._given(materials), strict=True))
-
-    @promoted
-    def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
-        """Radiance of all vertices. Gray radiance is repeated to the number of colors of the other systems."""
-        require.kind("the light", light, tuple, source="Joined.light")
-        require.kind("the view", view, tuple, source="Joined.view")
-        parts = [each.combine(*sides) for each, *sides in zip(self.part, light, view, strict=True)]
-        colors = max(each.shape[1] for each in parts)
-        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in parts])
-
-    def at(self, points: Sequence) -> "Joined":
-        """The systems at points: `System.at`. Takes a list with the points of each system."""
-        check_list(points, len(self.part))
-        return Joined(tuple(each.at(own) for each, own in zip(self.part, points, strict=True)))
-
-    def _given(self, materials: Sequence | None) -> Sequence:
-        if materials is None:
-            return [None] * len(self.part)
-        if not isinstance(materials, Sequence) or len(materials) != len(self.part):
-            raise TypeError(f"the materials must be a list, one for each of {len(self.part)} parts, got {materials}")
-        return materials
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices."""
-        return sum(each.vertices for each in self.part)
-
-    @property
-    def shared_light(self) -> tuple | None:
-        """The keys of all systems; None if one of them has none."""
-        keys = tuple(each.shared_light for each in self.part)
-        return None if None in keys else (Joined, *keys)
 
 
 def check_list(points: Any, parts: int) -> None:

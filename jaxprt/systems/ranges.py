@@ -42,7 +42,7 @@ def take(value: Piece, start: int, stop: int) -> Piece:
     """
     start, stop = operator.index(start), operator.index(stop)
     if isinstance(value, System) and not isinstance(value, VertexSystem):
-        raise TypeError(f"value must be a system of one mesh, such as a part of RelitScene.system, got {_kind(value)}")
+        raise TypeError(f"value must be a system of one mesh, such as RelitScene.part_system(0), got {_kind(value)}")
     if isinstance(value, VertexSystem) and value.points is not None:
         raise TypeError(f"value must be a system at vertices, got {_kind(value)} at points")
     value = jax.tree.map(_bare, value, is_leaf=lambda each: isinstance(each, SparseTransport))

@@ -18,9 +18,8 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
 from jaxprt.scene import Environment, Mesh, builtin
-from jaxprt.scene.mesh import grid_face, join, make_mesh
+from jaxprt.scene.mesh import grid_face, join, make_mesh, split
 from jaxprt.scene.points import Points, on_triangles
-from jaxprt.sphere import directions
 from jaxprt.systems import protocol
 
 pytestmark = pytest.mark.usefixtures("coarse")
@@ -188,15 +187,15 @@ def reflected(name: str, model: str) -> tuple[prt.System, Any]:
     return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
 
 
+def of_parts(name: str, model: str, **options) -> tuple[prt.System, Any]:
+    """A scene whose parts are the regions of a mesh, all with one BRDF."""
+    parts = [prt.Part(str(n), part, MODELS[model]) for n, part in enumerate(split(mesh(name)))]
+    recipe = prt.relit.Lobes(lobes=6, texels=0)
+    return prt.precompute(prt.Scene(parts), system=recipe, size=SIZE, progress=False, **options), None
+
+
 def between_parts(name: str, model: str) -> tuple[prt.System, Any]:
-    options = {"components": 8, "modes": 12, "edge": 2, "size": 4, "progress": False}
-    whole = mesh(name)
-    table = harmonic.tabulate(MODELS[model], degree=3, error=0.5)
-    frame, region = directions.frame(whole.normal, whole.tangent), np.asarray(whole.region)
-    numbers = range(region.max() + 1)
-    tensor = bounces.precompute(whole, [factored(model)] * len(numbers), **options)
-    parts = [bounces.ReflectingPart(whole.position[region == n], frame[region == n], table) for n in numbers]
-    return bounces.PartBounces(tensor, parts), None
+    return of_parts(name, model, bounces=2, rays=0)
 
 
 def total(name: str, model: str) -> tuple[prt.System, Any]:
@@ -215,7 +214,8 @@ MADE = {
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
     "dynamic": Promise(changing, 0.02, None, linear=False),
     "bounces": Promise(reflected, None, None),
-    "bounces, of parts": Promise(between_parts, None, None),
+    "scene": Promise(of_parts, 0.02, 0.1),
+    "scene with bounces": Promise(between_parts, None, None),
     "dynamic and bounces": Promise(total, None, None, linear=False),
 }
 each_system = pytest.mark.parametrize("name", MADE)
@@ -531,7 +531,7 @@ def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
         prt.shard(light(), [here])
 
 
-OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | bounces.PartBounces | protocol.Total
+OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | prt.RelitScene | protocol.Total
 
 
 def placed(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
@@ -573,7 +573,8 @@ def test_radiance_at_points_is_the_exact_sum_there(name, close):
     position, frame = points.carry(visible.position), points.frame(visible.frame)
     exact = np.asarray(prt.reference.integrate(level.astype(np.uint8), position, frame, GLOSSY, light(), EYE))
     facing = np.sum(np.asarray(frame)[:, 2] * (np.asarray(EYE) - np.asarray(position)), 1) > 0.2
-    color = shown(case._replace(system=case.system.at(points)), light())
+    system, order = placed(case, triangle, weight)
+    color, facing, exact = shown(case._replace(system=system), light()), facing[order], exact[order]
     # What arrives in the frames of three vertices is interpolated there: this mesh is coarse.
     close(color[facing], exact[facing], tolerance=MADE[name].error + 0.05)
 

@@ -84,6 +84,17 @@ def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
             ranges.take(value, 0, 3)
 
 
+def test_ranges_of_a_part_of_a_scene_are_rows_of_the_part(close):
+    ball, floor = builtin.sphere(rings=8, sectors=12), builtin.plane(cells=8)
+    parts = [prt.Part("ball", ball, prt.brdf.Lambert(0.5)), prt.Part("floor", floor, prt.brdf.Lambert(0.5))]
+    relit = prt.precompute(prt.Scene(parts), system="harmonic", size=SIZE, progress=False)
+    light = builtin.daylight(size=SIZE)
+    whole, system = relit.radiance(light, eye=EYE), relit.part_system(1)
+    assert system.vertices == len(floor.position)
+    rows = prt.radiance(ranges.take(system, 3, 70), light, eye=EYE)
+    close(rows, whole[len(ball.position) :][3:70], tolerance=1e-5)
+
+
 def test_ranges_of_transport_with_its_transpose_have_the_gradients_of_their_rows(sparse, brdf, close):
     light = builtin.daylight(size=SIZE)
 
@@ -99,6 +110,8 @@ def test_what_is_no_system_of_one_mesh_has_no_ranges(sparse, brdf):
     mesh = builtin.sphere(rings=12, sectors=14)
     system = separable.SeparableSystem(sparse, brdf)
     points = prt.scene.points.on_triangles(mesh.face, np.array([0, 1]), np.full((2, 3), 1 / 3, np.float32))
-    for value in (mesh, prt.systems.protocol.Joined((system, system)), system.at(points)):
+    part = prt.Part("ball", mesh, prt.brdf.Lambert(0.5))
+    scene = prt.precompute(prt.Scene([part]), system="harmonic", size=SIZE, progress=False)
+    for value in (mesh, scene, prt.total(system, system), system.at(points)):
         with pytest.raises(TypeError, match="value must be a"):
             ranges.take(value, 0, 2)

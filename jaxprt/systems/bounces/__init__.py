@@ -15,7 +15,7 @@ from jaxprt.systems.bounces import (
 )
 from jaxprt.systems.bounces.build import precompute
 from jaxprt.systems.bounces.functions import factor
-from jaxprt.systems.bounces.parts import PartBounces, ReflectingPart
+from jaxprt.systems.bounces.parts import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.relight import arriving, combine, light_side, radiance, view_side
 from jaxprt.systems.bounces.system import BouncesSystem
@@ -23,7 +23,7 @@ from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor
 
 __all__ = [
     "BouncesSystem",
-    "PartBounces",
+    "GroupBounces",
     "Patches",
     "ReflectingPart",
     "SecondBounce",

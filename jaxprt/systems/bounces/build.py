@@ -13,6 +13,7 @@ import tqdm
 from jaxtyping import Array, Float
 
 from jaxprt import require, visibility
+from jaxprt.compile import shared_size
 from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import functions, gather, jobs, patches
@@ -268,7 +269,9 @@ def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run:
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
         found = run.compute(job, f"response_{number}", f"region {number}")["response"]
-        result.append(np.ascontiguousarray(found.swapaxes(1, 2)))
+        padded = np.zeros((shared_size(len(vertex)), *found.shape[:0:-1]), found.dtype)
+        padded[: len(vertex)] = found.swapaxes(1, 2)
+        result.append(padded)
     return tuple(result)
 
 

@@ -88,8 +88,9 @@ class Rays(NamedTuple):
     texel: Int[np.ndarray, "g h"]
 
 
-@functools.partial(jit, static_argnames=("points",))
+@jit
 def arrive(
+    total: Float[Array, "b s p l"],
     response: Float[Array, "v k l"],
     frame: Float[Array, "v 3 3"],
     basis: SeparableBrdf,
@@ -98,12 +99,11 @@ def arrive(
     weight: Float[Array, "g h 3"],
     direction: Float[Array, "g h 3"],
     measure: Float[Array, "g h s"],
-    *,
-    points: int,
 ) -> Float[Array, "b s p l"]:
-    """The light that surfaces send to some points, summed over the rays of each point with given measures.
+    """Adds the light that surfaces send to some points, summed over the rays of each point with given measures.
 
     Args:
+        total: The sum so far, for each point, measure, function and light.
         response: Responses of the light factors at all vertices of the surfaces, from `respond` or `respond_again`. The
             light is the last axis, so that memory is read contiguously.
         frame: Frames of these vertices.
@@ -113,10 +113,9 @@ def arrive(
         weight: Barycentric weights of the hit.
         direction: Directions of the rays.
         measure: Weights of each ray: harmonics times solid angle, or cosine times solid angle over pi.
-        points: Number of points.
 
     Returns:
-        The sum for each point, measure, function and light.
+        The sum with the light of these rays.
     """
 
     def add(total, group):
@@ -127,9 +126,7 @@ def arrive(
         sent = jnp.einsum("hckp,hckl->hpl", view, response[corner])
         return total.at[owner].add(jnp.einsum("hs,hpl->spl", measure, sent).astype(total.dtype)), None
 
-    shape = (points, measure.shape[-1], basis.view_map.shape[-1], response.shape[2])
-    groups = (owner, corner, weight, direction, measure)
-    return jax.lax.scan(add, jnp.zeros(shape, response.dtype), groups)[0]
+    return jax.lax.scan(add, total, (owner, corner, weight, direction, measure))[0]
 
 
 def rays(

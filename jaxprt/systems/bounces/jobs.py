@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float16
 
 from jaxprt import visibility
-from jaxprt.compile import jit
+from jaxprt.compile import jit, shared_size
 from jaxprt.decompose import eigen, tucker
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import cubemap, haar
@@ -23,6 +23,7 @@ from jaxprt.systems.separable import SeparableBrdf
 # Versions of the algorithms that make the results. A release that changes results increments one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
 DEGREE = gather.DEGREE  # degree of the harmonics that arrive
+_GROUPS = 512  # groups of rays that are summed by one program
 _AGAIN = 2  # edge of the light's faces for two bounces
 
 
@@ -63,7 +64,8 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
 
     Attributes:
         bases: Functions of each region.
-        response: Responses of their light factors, at the vertices of each region; the light is the last axis.
+        response: Responses of their light factors, at the vertices of each region, padded to a size that scenes share;
+            the light is the last axis.
         white: Weights of all functions with which the worth of a bounce is estimated.
         scale: Weights of all functions in the errors of decompositions.
         region: Index of each vertex's region.
@@ -95,7 +97,8 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            parts |= {f"response {number}": response.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
+            own = response[: np.sum(self.region == number)]
+            parts |= {f"response {number}": own.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
         return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
@@ -112,14 +115,20 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
             rays, own = found[number], np.flatnonzero(self.region == number)
             local = np.zeros(len(self.region), np.int32)
             local[own] = np.arange(len(own))
-            # Pad to a power of two groups, so that few shapes are compiled. Padding has zero weight.
-            spare = (1 << (len(rays.owner) - 1).bit_length()) - len(rays.owner)
+            # Groups of rays in blocks of one length, which regions and scenes share. Padding has zero weight.
+            spare = -len(rays.owner) % _GROUPS
             owner, corner, weight, texel = (np.concatenate([x, np.zeros((spare, *x.shape[1:]), x.dtype)]) for x in rays)
             point = np.repeat(owner[:, None], texel.shape[1], 1)
             measure = gather.measures(cosine[point], texel, share[point, texel], size=self.size)
-            fixed = (owner, local[corner], weight, way[texel], measure)
-            arrived = gather.arrive(response, self.frame[own], basis, *map(jax.device_put, fixed), points=len(part))
-            result.append(np.asarray(arrived))
+            frame = np.pad(self.frame[own], ((0, len(response) - len(own)), (0, 0), (0, 0)))
+            surface = jax.device_put((response, frame, basis))
+            shape = (shared_size(len(part)), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
+            arrived = jax.device_put(np.zeros(shape, response.dtype))
+            for first in range(0, len(owner), _GROUPS):
+                block = slice(first, first + _GROUPS)
+                fixed = (owner, local[corner], weight, way[texel], measure)
+                arrived = gather.arrive(arrived, *surface, *jax.device_put(tuple(each[block] for each in fixed)))
+            result.append(np.asarray(arrived)[: len(part)])
         return np.concatenate(result, 2)
 
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -189,7 +198,8 @@ class TransferJob(_PathJob):
         coarse = mode.reshape(shape).sum((3, 5)).reshape(len(mode), 6 * edge * edge, -1)
         count = coarse.shape[1] * len(function)
         counts = [np.sum(self.region == number) for number in range(len(self.bases))]
-        response = [np.zeros((n, b.terms, count), np.float32) for n, b in zip(counts, self.bases, strict=True)]
+        pairs = zip(counts, self.bases, strict=True)
+        response = [np.zeros((shared_size(int(n)), b.terms, count), np.float32) for n, b in pairs]
         local = np.zeros(len(self.region), np.int32)
         for number, each in enumerate(counts):
             local[self.region == number] = np.arange(each)

@@ -1,21 +1,24 @@
-"""Bounces between the parts of a scene. Each part has one BRDF with channels that textures weight at its vertices."""
+"""Light that the parts of a scene reflect onto each other, for groups of parts with one BRDF.
+
+Each group has one BRDF with channels that textures weight at its vertices, and all its parts send light with the same
+functions. The weights of these functions are those of each part's mean material.
+"""
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import promoted
+from jaxprt.compile import jit, promoted
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import harmonic, protocol
+from jaxprt.systems import harmonic
 from jaxprt.systems.bounces.jobs import DEGREE
-from jaxprt.systems.bounces.relight import LitTransfer, area_mean, collect, gathered, light_side
+from jaxprt.systems.bounces.relight import LitTransfer, collect, light_side
 from jaxprt.systems.bounces.tensor import TransferTensor
 from jaxprt.systems.bounces.varying import Sent
 from jaxprt.systems.harmonic import HarmonicBrdf
@@ -23,14 +26,14 @@ from jaxprt.systems.protocol import Blend
 
 
 class ReflectingPart(eqx.Module):
-    """The vertices of a part, and the BRDF with which they reflect arriving light that is given in harmonics.
+    """Vertices with one BRDF, with which they reflect arriving light that is given in harmonics.
 
     Attributes:
         position: Positions of the vertices.
         frame: Frames of the vertices; rows are tangent, bitangent, normal.
         brdf: Table of degree 3, from `jaxprt.harmonic.tabulate`.
         sent: Weights of the tensor's functions for each channel of `brdf` and each roughness. None if the channels of
-            both are the same, and light that the part sends to others has one roughness.
+            both are the same, and light that is sent to other surfaces has one roughness.
     """
 
     position: Float[Array, "v 3"]
@@ -57,40 +60,101 @@ class ReflectingPart(eqx.Module):
         return harmonic.combine(light if points is None else points.carry(light, axis=2), view)
 
 
-class PartBounces(protocol.System):
-    """Light that the parts of a scene reflect onto each other and themselves, without direct light.
-
-    Materials are a list with one `Blend` for each part, None for a part that keeps its tabulated BRDF. Light that a
-    part sends to other surfaces has the mean weights and roughness over its area. Differences in albedo are added patch
-    by patch, as diffuse light. Light that a part sends to the eye has the weights and roughness of each vertex.
+class Members(eqx.Module):
+    """Where the vertices of a group stand in the scene.
 
     Attributes:
-        tensor: Transfer tensor from `jaxprt.bounces.precompute`, made with one factored BRDF for each part, with the
-            same channels.
-        part: The parts, in the order of the tensor's vertices.
-        points: Points on each part at which radiance is computed; None for the vertices.
+        vertex: Index of each vertex of the group in the scene; padding repeats the last one.
+        part: Index of the part of each vertex, among the parts of the group.
+        area: Surface area that each vertex represents; 0 in padding.
+        parts: Number of parts of the group.
+    """
+
+    vertex: Int[Array, " v"]
+    part: Int[Array, " v"]
+    area: Float[Array, " v"]
+    parts: int = eqx.field(static=True)
+
+    def mean(self, value: Float[Array, "v *k"]) -> Float[Array, "r *k"]:
+        """Means of a value of the vertices over the area of each part; zero for a part without area."""
+        wide = self.area.reshape(-1, *[1] * (value.ndim - 1))
+        total, whole = (jax.ops.segment_sum(each, self.part, self.parts) for each in (wide * value, self.area))
+        return total / jnp.where(whole > 0, whole, 1).reshape(-1, *[1] * (value.ndim - 1))
+
+
+class GroupBounces(eqx.Module):
+    """Light that the parts of a scene reflect onto each other and themselves, without direct light.
+
+    Light that a part sends to other surfaces has the mean weights and roughness over its area. Differences in albedo
+    are added patch by patch, as diffuse light. Light that a part sends to the eye has the weights and roughness of each
+    vertex or point.
+
+    Attributes:
+        tensor: Transfer tensor from `jaxprt.bounces.precompute`, whose regions are the parts. It is made with one
+            factored BRDF for each part, the same for all parts of a group.
+        group: The vertices of each group, and their BRDF.
+        members: Where the vertices of each group stand.
+        factor: Weights of the functions of each part of a group, as in `TransferTensor.factor`.
+        strength: Albedo of these functions; None without patches.
+        order: Index of each function of the tensor among the functions of all groups, part by part.
+        place: Index of each vertex of the scene among the vertices of all groups.
     """
 
     tensor: TransferTensor
-    part: tuple[ReflectingPart, ...] = eqx.field(converter=tuple)
-    points: tuple[Points, ...] | None = None
+    group: tuple[ReflectingPart, ...] = eqx.field(converter=tuple)
+    members: tuple[Members, ...] = eqx.field(converter=tuple)
+    factor: tuple[Float[Array, "_ _"], ...]
+    strength: tuple[Float[Array, " _"] | None, ...]
+    order: Int[Array, " q"]
+    place: Int[Array, " v"]
 
-    def __check_init__(self):
-        """Refuses tensors of sets, of other vertices, or of parts in another order."""
-        require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
-        counts = [len(each.position) for each in self.part]
-        found = [each.ndim for each in self.tensor.factor]
-        if found != [2] * len(counts):
+    @classmethod
+    def make(
+        cls, tensor: TransferTensor, group: Sequence[ReflectingPart], parts: Sequence[Sequence[int]]
+    ) -> "GroupBounces":
+        """Joins the parts of each group.
+
+        Args:
+            tensor: The tensor, whose regions are the parts.
+            group: The vertices of each group, part after part, and then padding.
+            parts: Indices of the parts of each group.
+
+        Raises:
+            TypeError: `tensor` is not a `TransferTensor`.
+            ValueError: The tensor is of sets, or of other parts or vertices.
+        """
+        require.kind("the tensor", tensor, TransferTensor, source="jaxprt.bounces.precompute")
+        region, numbers = np.asarray(tensor.region), [number for own in parts for number in own]
+        found = [each.ndim for each in tensor.factor]
+        if found != [2] * len(numbers):
             raise ValueError(
-                f"the tensor must have one factored BRDF for each of {len(counts)} parts, got {len(found)} BRDFs, "
+                f"the tensor must have one factored BRDF for each of {len(numbers)} parts, got {len(found)} BRDFs, "
                 f"{sum(each > 2 for each in found)} of them sets"
             )
-        if len(self.tensor.place) != sum(counts):
-            raise ValueError(f"the tensor must have the parts' {sum(counts)} vertices, got {len(self.tensor.place)}")
-        if isinstance(self.tensor.region, Tracer):
-            return
-        if np.any(np.asarray(self.tensor.region) != np.repeat(np.arange(len(counts)), counts)):
-            raise ValueError("the tensor's regions must be the parts in the same order, got other regions")
+        members, area = [], np.asarray(tensor.area)
+        for own, at in zip(group, parts, strict=True):
+            vertex = np.concatenate([np.flatnonzero(region == number) for number in at])
+            room = len(own.position) - len(vertex)
+            if room < 0:
+                raise ValueError(f"a group must have the tensor's {len(vertex)} vertices, got {len(own.position)}")
+            part = np.repeat(np.arange(len(at)), [np.sum(region == number) for number in at])
+            rows = (np.pad(row, (0, room), mode="edge").astype(np.int32) for row in (vertex, part))
+            at_vertex, at_part, whole = jax.device_put((*rows, np.pad(area[vertex], (0, room)).astype(area.dtype)))
+            members.append(Members(at_vertex, at_part, whole, len(at)))
+        size = [len(factor) for factor in tensor.factor]
+        start = np.empty(len(size), int)  # of the functions of each part, among those of all groups
+        start[numbers] = np.cumsum([0, *(size[number] for number in numbers)])[:-1]
+        order = np.concatenate([start[number] + np.arange(size[number]) for number in range(len(size))])
+        place, begin = np.empty(len(region), np.int32), 0
+        for own in members:
+            # In reverse order, so that a vertex keeps its first place and not that of padding.
+            place[np.asarray(own.vertex)[::-1]] = begin + np.arange(len(own.vertex))[::-1]
+            begin += len(own.vertex)
+        kept = order[np.asarray(tensor.function)].astype(np.int32)
+        first = [own[0] for own in parts]
+        strength = [None if tensor.patches is None else tensor.patches.strength[number] for number in first]
+        factor, rows = tuple(tensor.factor[number] for number in first), jax.device_put((kept, place))
+        return cls(tensor, tuple(group), tuple(members), factor, tuple(strength), *rows)
 
     @promoted
     def light(self, environment: Environment) -> LitTransfer:
@@ -98,87 +162,55 @@ class PartBounces(protocol.System):
         return light_side(self.tensor, environment)
 
     @promoted
-    def shade(
-        self, light: LitTransfer, materials: Sequence[Blend | None] | None = None
-    ) -> tuple[Float[Array, "lm _ _"], ...]:
-        """Harmonics of the light that arrives at the vertices of each part, in their frames, given all materials."""
-        require.kind("the light", light, LitTransfer, source="PartBounces.light")
-        blends = list(zip(self.part, self._given(materials), strict=True))
-        means = [self._mean(number, *each) for number, each in enumerate(blends)]
-        rows = [
-            own if mean is None else jnp.matmul(own, mean, precision="highest")
-            for own, mean in zip(self.tensor.factor, means, strict=True)
-        ]
-        arriving = collect(self.tensor, light, gathered(self.tensor, rows), change=self._changes(blends, means))
-        each = jnp.split(arriving, np.cumsum([len(part.position) for part in self.part])[:-1], -1)
-        return tuple(harmonic.local_light(part.frame, own) for part, own in zip(self.part, each, strict=True))
+    def shade(self, light: LitTransfer, materials: Sequence[Blend | None]) -> tuple[Float[Array, "lm _ _"], ...]:
+        """Harmonics of the light that arrives at the vertices of each group, in their frames, given all materials.
 
-    @promoted
-    def view(
-        self, eye: Float[Array, "3"], materials: Sequence[Blend | None] | None = None
-    ) -> tuple[Float[Array, "lm _ _"], ...]:
-        """Harmonics of the BRDF at each vertex or point for its view direction."""
-        eye = require.position("the eye", eye)
-        rows = zip(self.part, self._given(materials), self._points(), strict=True)
-        return tuple(part.view(eye, own, points) for part, own, points in rows)
+        Args:
+            light: The result of `light`.
+            materials: Weights at the vertices of each group; None for a group with a BRDF that cannot change.
+        """
+        require.kind("the light", light, LitTransfer, source="GroupBounces.light")
+        return _arriving(self, light, tuple(materials))
 
-    @promoted
-    def combine(
-        self, light: tuple[Float[Array, "lm _ _"], ...], view: tuple[Float[Array, "lm _ _"], ...]
-    ) -> Float[Array, "_ e"]:
-        """Radiance of reflected light."""
-        require.kind("the light", light, tuple, source="PartBounces.shade")
-        require.kind("the view", view, tuple, source="PartBounces.view")
-        sides = zip(self.part, light, view, self._points(), strict=True)
-        rows = [part.combine(arriving, seen, points) for part, arriving, seen, points in sides]
-        colors = max(each.shape[1] for each in rows)
-        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
-    def at(self, points: Sequence[Points]) -> "PartBounces":
-        """The same system at points on each part, concatenated; see `System.at`. `shade` still uses the vertices."""
-        given = protocol.check_points(points, [len(each.position) for each in self.part])
-        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+@jit
+def _arriving(
+    system: GroupBounces, light: LitTransfer, materials: tuple[Blend | None, ...]
+) -> tuple[Float[Array, "lm _ _"], ...]:
+    rows, changes = [], []
+    for own, members, factor, strength, blend in zip(
+        system.group, system.members, system.factor, system.strength, materials, strict=True
+    ):
+        sent, change = _sent(own, members, factor, strength, blend)
+        rows.append(sent.reshape(-1, sent.shape[-1]))
+        changes.append(change)
+    weight, change = _stacked(rows)[system.order], None
+    if any(each is not None for each in changes):
+        none = [jnp.zeros((len(own.position), 1), own.position.dtype) for own in system.group]
+        pairs = zip(changes, none, strict=True)
+        change = _stacked([zero if each is None else each for each, zero in pairs])[system.place]
+    arriving = collect(system.tensor, light, weight, change=change)
+    pairs = zip(system.group, system.members, strict=True)
+    return tuple(harmonic.local_light(own.frame, arriving[..., members.vertex]) for own, members in pairs)
 
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points if the system was moved to points by `at`."""
-        return len(self.tensor.place) if self.points is None else sum(map(len, self.points))
 
-    def _points(self) -> Sequence[Points | None]:
-        return [None] * len(self.part) if self.points is None else self.points
+def _stacked(rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "_ c"]:
+    """Rows one after another. Gray ones are repeated to the colors of the others."""
+    colors = max(each.shape[1] for each in rows)
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
 
-    def _mean(self, number: int, part: ReflectingPart, blend: Blend | None) -> Float[Array, "k c"] | None:
-        """Mean weights of the tensor's functions over a part's area; None without a blend."""
-        if blend is None:
-            return None
-        channels = self.tensor.factor[number].shape[1] if part.sent is None else part.sent.factor.shape[1]
-        blend.check(len(part.position), channels)
-        first = sum(len(each.position) for each in self.part[:number])
-        area = self.tensor.area[first : first + len(part.position)]
-        return area_mean(blend.weight, area) if part.sent is None else part.sent.mean(blend, area)
 
-    def _changes(self, blends: Sequence, means: Sequence[Array | None]) -> Float[Array, "v c"] | None:
-        """Albedo of each vertex minus the mean of its part; None without blends or patches."""
-        if self.tensor.patches is None or not any(mean is not None for mean in means):
-            return None
-        rows = []
-        for number, ((part, blend), mean) in enumerate(zip(blends, means, strict=True)):
-            if mean is None:
-                rows.append(jnp.zeros((len(part.position), 1), part.position.dtype))
-                continue
-            channel = jnp.matmul(self.tensor.patches.strength[number], self.tensor.factor[number], precision="highest")
-            if part.sent is None:
-                rows.append(jnp.einsum("k,vkc->vc", channel, blend.weight - mean, precision="highest"))
-            else:
-                rows.append(part.sent.values(blend, channel) - jnp.matmul(channel, mean, precision="highest"))
-        colors = max(each.shape[1] for each in rows)
-        return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
-
-    def _given(self, materials: Any) -> Sequence[Blend | None]:
-        if materials is None:
-            return [None] * len(self.part)
-        if not isinstance(materials, Sequence) or len(materials) != len(self.part):
-            raise TypeError(f"the materials must be a list, one for each of {len(self.part)} parts, got {materials}")
-        for each in materials:
-            protocol.check_blend(each)
-        return materials
+def _sent(
+    own: ReflectingPart, members: Members, factor: Array, strength: Array | None, blend: Blend | None
+) -> tuple[Float[Array, "r q _"], Float[Array, "v c"] | None]:
+    """Weights of the functions of each part of a group; and the albedo of each vertex minus that of its part's mean."""
+    if blend is None:
+        return jnp.broadcast_to(factor, (members.parts, *factor.shape)), None
+    blend.check(len(own.position), factor.shape[1] if own.sent is None else own.sent.factor.shape[1])
+    weight = blend.weight if own.sent is None else own.sent.weights(blend)
+    mean = members.mean(weight)
+    change = None
+    if strength is not None:
+        albedo = jnp.matmul(strength, factor, precision="highest")
+        change = jnp.einsum("k,vkc->vc", albedo, weight - mean[members.part], precision="highest")
+    return jnp.einsum("qk,rkc->rqc", factor, mean, precision="highest"), change

@@ -35,35 +35,16 @@ class Sent(eqx.Module):
                 f"for {len(self.knot)} parameters"
             )
 
-    def mean(self, blend: Blend, area: Float[Array, " v"]) -> Float[Array, "p c"]:
-        """Mean weights of the functions over a surface, given the area of each vertex."""
-        return _mean(self, blend, area)
-
-    def values(self, blend: Blend, value: Float[Array, " p"]) -> Float[Array, "v c"]:
-        """Value of each vertex's material, given the value (such as albedo) of each function."""
-        return _values(self, blend, value)
+    def weights(self, blend: Blend) -> Float[Array, "v p c"]:
+        """Weights of the functions for the material of each vertex, given the weights of the BRDF channels there."""
+        return _weights(self, blend)
 
 
-def _shares(sent: Sent, blend: Blend) -> Float[Array, "v n"]:
-    """Weight of each knot at each vertex, for linear interpolation."""
+@jit
+def _weights(sent: Sent, blend: Blend) -> Array:
     if not sent.knot:
-        return jnp.ones((len(blend.weight), 1), blend.weight.dtype)
+        return jnp.einsum("kp,vkc->vpc", sent.factor[0], blend.weight, precision="highest")
     (knot,), (parameter,) = sent.knot, blend.parameter
-    low, upper = (each[:, None] for each in grid.neighbors(grid.place(knot, parameter), size=len(knot)))
-    number = jnp.arange(len(knot))
-    return jnp.where(number == low, 1 - upper, jnp.where(number == low + 1, upper, 0))
-
-
-@jit
-def _mean(sent: Sent, blend: Blend, area: Array) -> Array:
-    whole = jnp.sum(area)
-    share = (area / jnp.where(whole > 0, whole, 1))[:, None] * _shares(sent, blend)
-    total = jnp.tensordot(share, blend.weight, (0, 0), precision="highest")
-    return jnp.einsum("nkp,nkc->pc", sent.factor, total, precision="highest")
-
-
-@jit
-def _values(sent: Sent, blend: Blend, value: Array) -> Array:
-    channel = jnp.matmul(sent.factor, value, precision="highest")
-    each = jnp.matmul(_shares(sent, blend), channel, precision="highest")
-    return jnp.einsum("vk,vkc->vc", each, blend.weight, precision="highest")
+    low, upper = grid.neighbors(grid.place(knot, parameter), size=len(knot))
+    each = [sent.factor[low + step] * part[:, None, None] for step, part in ((0, 1 - upper), (1, upper))]
+    return jnp.einsum("vkp,vkc->vpc", each[0] + each[1], blend.weight, precision="highest")

@@ -97,7 +97,8 @@ class HarmonicBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            raise ValueError(f"the table needs {len(self.knot)} parameters, got {len(parameter)}")
+            given = f"{len(self.knot)} parameters, got {len(parameter)}"
+            raise ValueError(f"the table needs {given}; a system takes them in its materials, as `Blend.parameter`")
         resolution = self.table.shape[-1]
         # At the normal the azimuth is undefined. There (x, y) / sin_o is 0, and so are all coefficients except m = 0.
         sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)

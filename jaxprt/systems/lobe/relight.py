@@ -40,6 +40,7 @@ _RATIO = 1.5  # ratio of successive widths
 _WIDEST = 1.3  # upper limit of widths, in radians
 _COARSE = 0.75  # largest edge of a texel, relative to the width
 REACH = 3.0  # radius of the blur kernel, in widths
+_BLOCK = 6 * 8**2  # directions that are projected at once
 _TILE = 4  # edge of the tiles in which blurred faces are computed, in texels
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
 _FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
@@ -377,6 +378,9 @@ def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
     axes = np.stack([place[:, 0, 1] - place[:, 0, 0], place[:, 1, 0] - place[:, 0, 0], place.mean((1, 2))], 1)
     turn = np.einsum("ji,fjk->fik", axes[0], axes)
     moved = np.swapaxes(np.asarray(cubemap.direction(size=size)).reshape(-1, 3) @ turn, 0, 1)
-    face, s, t = cubemap.project(*np.moveaxis(moved, -1, 0))
+    count = len(moved)
+    padded = np.pad(moved, ((0, -(-count // _BLOCK) * _BLOCK - count), (0, 0), (0, 0)), mode="edge")
+    blocks = [cubemap.project(*np.moveaxis(each, -1, 0)) for each in padded.reshape(-1, _BLOCK, 6, 3)]
+    face, s, t = (np.concatenate([np.asarray(each) for each in rows])[:count] for rows in zip(*blocks, strict=True))
     column, row = (np.clip((np.asarray(x) + 1) / 2 * size, 0, size - 1).astype(np.int32) for x in (s, t))
     return np.asarray(face, np.int32) * size * size + row * size + column

@@ -1,5 +1,7 @@
 """The lobe system: `light`, `shade`, `view` and `combine` for BRDFs as lobes."""
 
+from functools import reduce
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -51,8 +53,11 @@ class LobeSystem(protocol.VertexSystem):
             return view_lobes(self.transport, self.brdf, **options)
         materials.check(self.vertices, len(self.brdf.weight))
         seen = view_lobes(self.transport, self.brdf, *materials.parameter, **options)
-        weight = jnp.einsum("klv,vkc->clv", seen.weight, materials.weight, precision="highest")
-        diffuse = jnp.einsum("kv,vkc->cv", seen.diffuse, materials.weight, precision="highest")
+        # Channel by channel with the vertices last: an einsum would be a small matrix product for each vertex.
+        channel = jnp.moveaxis(materials.weight, 0, 2)
+        pairs = list(zip(seen.weight, seen.diffuse, channel, strict=True))
+        weight = reduce(jnp.add, (lobe * own[:, None] for lobe, _, own in pairs))
+        diffuse = reduce(jnp.add, (albedo * own for _, albedo, own in pairs))
         return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
 
     def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:

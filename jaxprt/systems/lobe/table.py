@@ -116,7 +116,8 @@ class LobeBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            raise ValueError(f"the table needs {len(self.knot)} parameters, got {len(parameter)}")
+            given = f"{len(self.knot)} parameters, got {len(parameter)}"
+            raise ValueError(f"the table needs {given}; a system takes them in its materials, as `Blend.parameter`")
         result = self
         for knot, value in zip(self.knot, parameter, strict=True):
             low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))

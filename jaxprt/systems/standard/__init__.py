@@ -2,10 +2,11 @@
 
 from jaxprt.systems.standard import families, tables
 from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
-from jaxprt.systems.standard.tables import BLINN_PHONG, METALLIC_ROUGHNESS, StandardTable, forget
+from jaxprt.systems.standard.tables import BLINN_PHONG, DEGREE, METALLIC_ROUGHNESS, StandardTable, forget
 
 __all__ = [
     "BLINN_PHONG",
+    "DEGREE",
     "METALLIC_ROUGHNESS",
     "RoughnessFamily",
     "ShininessFamily",

@@ -26,6 +26,7 @@ from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
 
 LOBES = 12  # default number of lobes
+DEGREE = 4  # of the harmonics
 UNIT = 32767  # a component of 1 of a direction, in fixed point
 TEXELS = 64  # edge of the cubemap faces for which numbers of samples are stored
 
@@ -46,6 +47,21 @@ class StandardTable:
     def scale(self) -> Float[np.ndarray, " k"]:
         """Factor of each channel."""
         return np.array(self._stored["channel"], np.float64)
+
+    @property
+    def term(self) -> tuple[int, ...]:
+        """Indices of the channels."""
+        return tuple(range(len(self._stored["channel"])))
+
+    @property
+    def knot(self) -> Float[np.ndarray, " n"]:
+        """Logarithms of roughness at which lobes are tabulated."""
+        return np.array(self._stored["knot"], np.float64)
+
+    @property
+    def most_exponent(self) -> float:
+        """The exponent of `BlinnPhong` at the smallest tabulated roughness."""
+        return float(2 * np.exp(-2 * self.range[0]) - 2)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -86,7 +102,7 @@ class StandardTable:
         """Errors of a shipped table of lobes at its knots and halfway between them; see `lobes`."""
         return np.array(self._stored[f"lobes{count}.error"], np.float64)
 
-    def harmonics(self, degree: int = 4) -> HarmonicBrdf:
+    def harmonics(self, degree: int = DEGREE) -> HarmonicBrdf:
         """The BRDF in spherical harmonics up to a degree, with the error of the whole table.
 
         Raises:

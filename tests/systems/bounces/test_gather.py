@@ -48,7 +48,8 @@ def arrived(response, frame, basis, rays, measure):
     way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)[rays.texel]
     each = measure[rays.texel] if measure.ndim == 2 else measure[rays.owner[:, None], rays.texel]
     fixed = (rays.owner, rays.corner, rays.weight, way, each)
-    return np.asarray(bounces.gather.arrive(response.swapaxes(1, 2), frame, basis, *fixed, points=len(frame)))
+    none = np.zeros((len(frame), each.shape[-1], basis.view_map.shape[-1], response.shape[1]), np.float32)
+    return np.asarray(bounces.gather.arrive(none, response.swapaxes(1, 2), frame, basis, *fixed))
 
 
 def flux(mesh):

@@ -6,6 +6,7 @@ one before.
 """
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from jaxprt.relit.channels import of_part
 from jaxprt.scene import Environment, Mesh, TexturedMaterial, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import directions
-from jaxprt.systems.bounces import PartBounces, ReflectingPart
+from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -51,7 +52,21 @@ def corner() -> Mesh:
     return join([floor, wall])
 
 
-def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> PartBounces:
+class Reflected(NamedTuple):
+    """Reflected light of groups of one part each."""
+
+    bounces: GroupBounces
+
+    def radiance(self, light: Environment, materials: list | None = None) -> np.ndarray:
+        blends = [None] * len(self.bounces.group) if materials is None else materials
+        arriving = self.bounces.shade(self.bounces.light(light), blends)
+        rows = zip(self.bounces.group, arriving, blends, strict=True)
+        colors = [np.asarray(part.combine(lit, part.view(EYE, blend))) for part, lit, blend in rows]
+        most = max(each.shape[1] for each in colors)
+        return np.concatenate([np.broadcast_to(each, (len(each), most)) for each in colors])
+
+
+def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> Reflected:
     """Reflected light between the regions of a mesh."""
     factored = [separable.factor(each, terms=terms, resolution=16) for each in brdfs]
     sizes = {"components": 40, "modes": 24, "edge": 2, "size": 16, "progress": False}
@@ -60,12 +75,32 @@ def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> PartBoun
     own = [np.asarray(mesh.region) == number for number in range(len(brdfs))]
     tables = [harmonic.tabulate(each, degree=3, error=0.5) for each in brdfs]
     parts = zip(own, tables, strict=True)
-    return PartBounces(tensor, tuple(ReflectingPart(mesh.position[at], frame[at], table) for at, table in parts))
+    groups = [ReflectingPart(mesh.position[at], frame[at], table) for at, table in parts]
+    return Reflected(GroupBounces.make(tensor, groups, [[number] for number in range(len(groups))]))
+
+
+def test_parts_of_one_group_send_what_they_send_in_groups_of_their_own(close):
+    """In another order than that of the scene, and with padding."""
+    mesh = join([corner(), make_mesh(np.asarray(corner().position) + 3, corner().face)])
+    mesh = eqx.tree_at(lambda each: each.region, mesh, np.repeat([0, 1, 2], [36, 36, 72]).astype(np.int32))
+    channels = Channels((Lambert(1.0), GLOSSY), jnp.ones(2))
+    alone = made(mesh, [channels] * 3)
+    weight = np.random.default_rng(0).uniform(0.1, 0.9, (144, 2, 3)).astype(np.float32)
+    ends = np.split(weight, [36, 72])
+    expected = alone.radiance(SKY, [prt.Blend(each) for each in ends])
+    first = alone.bounces.group
+    rows = [np.concatenate([np.asarray(getattr(first[n], name)) for n in (2, 0)]) for name in ("position", "frame")]
+    rows = [np.pad(each, [(0, 20)] + [(0, 0)] * (each.ndim - 1), mode="edge") for each in rows]
+    both = ReflectingPart(*map(jnp.asarray, rows), first[0].brdf), first[1]
+    joined = Reflected(GroupBounces.make(alone.bounces.tensor, both, [[2, 0], [1]]))
+    wide = np.pad(np.concatenate([ends[2], ends[0]]), ((0, 20), (0, 0), (0, 0)), mode="edge")
+    found = joined.radiance(SKY, [prt.Blend(wide), prt.Blend(ends[1])])
+    close(np.concatenate([found[72:108], found[128:], found[:72]]), expected, tolerance=1e-5)
 
 
 def test_a_bowl_has_the_light_of_the_closed_form():
     system = made(bowl(), [Lambert(ALBEDO)], count=2, terms=1)
-    color = np.asarray(prt.radiance(system, SKY, eye=EYE))
+    color = system.radiance(SKY)
     inside = np.asarray(bowl().position)[:, 1] < -0.1  # At the rim half of the surface around a vertex is missing.
     once = ALBEDO / 2
     np.testing.assert_allclose(color[inside], once * (once + once**2), rtol=0.06)
@@ -88,8 +123,9 @@ def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
     path = paths.factored(shading)
     assert path.sent is not None
     assert shading.blend is not None
-    sent = path.sent.factor[0] @ bounces.functions.albedo(path.brdf)
-    np.testing.assert_allclose(sent, paths.channels(paths.still(shading)), rtol=0.01, atol=1e-3)
+    each = prt.Blend(jnp.eye(4)[..., None], (jnp.full(4, np.log(roughness)),))
+    sent = path.sent.weights(each)[..., 0] @ bounces.functions.albedo(path.brdf)
+    np.testing.assert_allclose(sent, paths.channels(paths.still(shading)), rtol=0.03, atol=1e-3)
     if roughness == 0.05:
         assert 0.97 < np.sum(sent @ np.asarray(shading.blend.weight[0, :, 0])) < 1.05
 
@@ -97,32 +133,24 @@ def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
 def test_what_parts_send_to_others_follows_their_roughness():
     """Albedo of each roughness, and what it makes of the harmonics of light."""
     metal = prt.Part("metal", corner(), TexturedMaterial(0.8, metallic=1.0, roughness=0.4))
-    shading = of_part(metal, roughness=(0.1, 0.9))
+    shading = of_part(metal)
     path = paths.factored(shading)
     sent = path.sent
     assert sent is not None
     view = jnp.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.8, 0.6]])
     met = bounces.functions.project(path.brdf, degree=3) @ path.brdf.view(view)
     for roughness in (0.35, 0.6, 0.9):
-        blend = prt.Blend(jnp.ones((4, 2, 1)), (jnp.full(4, np.log(roughness)),))
-        weight = sent.mean(blend, jnp.ones(4))[:, 0]
+        blend = prt.Blend(jnp.ones((4, 4, 1)), (jnp.full(4, np.log(roughness)),))
+        weight = sent.weights(blend)[0, :, 0]
         true = paths.channels(shading.brdf(jnp.log(roughness)))
         albedo = bounces.functions.albedo(path.brdf)
         np.testing.assert_allclose(weight @ albedo, true.sum(), rtol=0.01)
-        np.testing.assert_allclose(sent.values(blend, albedo)[:, 0], true.sum(), rtol=0.01)
         exact = harmonic.table.project(shading.brdf(jnp.log(roughness)), view, degree=3, rings=48, sectors=96)
         exact = np.moveaxis(np.sum(exact, 1), 1, 0)
         assert np.linalg.norm(met @ weight - exact) < MISSED * np.linalg.norm(exact)
 
-    # A surface of two kinds of roughness sends the mean of both, and follows each of them.
-    blends = [
-        prt.Blend(jnp.ones((2, 2, 1)), (jnp.log(jnp.array(each)),)) for each in ([0.3, 0.3], [0.7, 0.7], [0.3, 0.7])
-    ]
-    one, other, both = (sent.mean(each, jnp.array([1.0, 3.0])) for each in blends)
-    np.testing.assert_allclose(both, (one + 3 * other) / 4, rtol=1e-5, atol=1e-6)
-
     def of_roughness(logarithm):
-        return jnp.sum(sent.mean(prt.Blend(jnp.ones((2, 2, 1)), (logarithm,)), jnp.array([1.0, 3.0])) ** 2)
+        return jnp.sum(sent.weights(prt.Blend(jnp.ones((2, 4, 1)), (logarithm,))) ** 2)
 
     place, step = jnp.log(jnp.array([0.35, 0.62])), jnp.array([0.01, 0.0])
     numeric = (of_roughness(place + step) - of_roughness(place - step)) / 0.02
@@ -134,24 +162,25 @@ def test_weighted_channels_reflect_as_the_brdf_that_they_add_up_to(close):
     channels = Channels((Lambert(1.0), GLOSSY), jnp.ones(2))
     count = len(mesh.position) // 2
     blend = prt.Blend(jnp.broadcast_to(jnp.asarray(weight), (count, 2, 3)))
-    color = prt.radiance(made(mesh, [channels] * 2, terms=20), SKY, eye=EYE, materials=[blend] * 2)
+    color = made(mesh, [channels] * 2, terms=20).radiance(SKY, [blend] * 2)
     for each in range(3):
         whole = CookTorrance(
             diffuse=weight[0, each] + 0.3 * weight[1, each], specular=0.7 * weight[1, each], roughness=0.5, f0=0.5
         )
-        close(color[:, each], prt.radiance(made(mesh, [whole] * 2, terms=20), SKY, eye=EYE)[:, 0], tolerance=0.01)
+        close(color[:, each], made(mesh, [whole] * 2, terms=20).radiance(SKY)[:, 0], tolerance=0.01)
 
 
 def test_what_a_part_sends_to_others_has_its_mean_color_without_patches():
     mesh = corner()
     system = made(mesh, [Lambert(1.0)] * 2, terms=1)
-    system = eqx.tree_at(lambda each: each.tensor.patches, system, None)
+    bare = eqx.tree_at(lambda each: (each.tensor.patches, each.strength), system.bounces, (None, (None, None)))
+    system = Reflected(bare)
     count = len(mesh.position) // 2
     white = prt.Blend(jnp.ones((count, 1, 3)))
     half = jnp.where(jnp.arange(count)[:, None] % 2 == 0, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    color = prt.radiance(system, SKY, eye=EYE, materials=[prt.Blend(half[:, None]), white])
-    plain = prt.radiance(system, SKY, eye=EYE, materials=[white, white])
-    area = np.asarray(system.tensor.area)[:count]
+    color = system.radiance(SKY, [prt.Blend(half[:, None]), white])
+    plain = system.radiance(SKY, [white, white])
+    area = np.asarray(bare.tensor.area)[:count]
     mean = area @ np.asarray(half) / area.sum()
     np.testing.assert_allclose(color[count:], plain[count:] * mean, rtol=HALF, atol=HALF * np.max(plain))
 
@@ -159,15 +188,13 @@ def test_what_a_part_sends_to_others_has_its_mean_color_without_patches():
 @pytest.mark.usefixtures("unchecked")
 def test_what_does_not_fit_is_refused():
     mesh, count = corner(), len(corner().position) // 2
-    system = made(mesh, [Lambert(1.0)] * 2, terms=1)
+    system = made(mesh, [Lambert(1.0)] * 2, terms=1).bounces
     with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
-        ReflectingPart(mesh.position, system.part[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
+        ReflectingPart(mesh.position, system.group[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
     with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2 BRDFs, 0 of them sets"):
-        PartBounces(system.tensor, system.part[:1])
-    longer = ReflectingPart(mesh.position, jnp.eye(3) + 0 * mesh.position[:, :, None], system.part[0].brdf)
-    with pytest.raises(ValueError, match=rf"must have the parts' {3 * count} vertices, got {2 * count}"):
-        PartBounces(system.tensor, (system.part[0], longer))
-    with pytest.raises(TypeError, match="materials must be a list, one for each of 2 parts"):
-        system.view(EYE, [None])
+        GroupBounces.make(system.tensor, system.group[:1], [[0]])
+    shorter = ReflectingPart(mesh.position[:3], system.group[0].frame[:3], system.group[0].brdf)
+    with pytest.raises(ValueError, match=rf"must have the tensor's {count} vertices, got 3"):
+        GroupBounces.make(system.tensor, (system.group[0], shorter), [[0], [1]])
     with pytest.raises(ValueError, match=rf"must have weights \[{count} vertices, 1 channels, c\]"):
         system.shade(system.light(SKY), [prt.Blend(jnp.ones((count, 2, 3))), None])

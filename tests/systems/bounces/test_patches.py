@@ -13,7 +13,7 @@ from jaxprt.brdf import Lambert
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import directions
-from jaxprt.systems.bounces import PartBounces, ReflectingPart
+from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -31,22 +31,33 @@ def bowl() -> Mesh:
     return make_mesh(ball.position[used], face.reshape(-1, 3), normal=-np.asarray(ball.normal)[used])
 
 
-def made(mesh: Mesh, albedo: float = 1.0, **options) -> PartBounces:
+def made(mesh: Mesh, albedo: float = 1.0, **options) -> GroupBounces:
     """Reflected light between matte regions."""
     regions = np.unique(np.asarray(mesh.region)).tolist()
     matte = separable.factor(Lambert(albedo), terms=1, resolution=8)
     tensor = bounces.precompute(mesh, [matte] * len(regions), **OPTIONS | options)
     table, frame = harmonic.tabulate(Lambert(albedo), degree=3), directions.frame(mesh.normal, mesh.tangent)
     own = [np.asarray(mesh.region) == number for number in regions]
-    return PartBounces(tensor, tuple(ReflectingPart(mesh.position[at], frame[at], table) for at in own))
+    groups = [ReflectingPart(mesh.position[at], frame[at], table) for at in own]
+    return GroupBounces.make(tensor, groups, [[number] for number in regions])
 
 
-def shown(system: PartBounces, materials=None) -> np.ndarray:
-    return np.asarray(prt.radiance(system, SKY, eye=EYE, materials=materials))
+def radiance(system: GroupBounces, light: Environment = SKY, materials=None) -> jax.Array:
+    """Reflected radiance of all vertices, region after region."""
+    blends = [None] * len(system.group) if materials is None else materials
+    arriving = system.shade(system.light(light), blends)
+    rows = zip(system.group, arriving, blends, strict=True)
+    colors = [part.combine(lit, part.view(EYE, blend)) for part, lit, blend in rows]
+    most = max(each.shape[1] for each in colors)
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), most)) for each in colors])
+
+
+def shown(system: GroupBounces, materials=None) -> np.ndarray:
+    return np.asarray(radiance(system, materials=materials))
 
 
 @functools.cache
-def settled() -> PartBounces:
+def settled() -> GroupBounces:
     return made(bowl(), bounces="all")
 
 
@@ -139,7 +150,7 @@ def test_gradients_of_all_bounces_are_finite_differences():
     def total(step, light_step):
         blend = prt.Blend(texture * (1 + step * jnp.arange(count)[:, None, None] / count))
         light = Environment(SKY.radiance.at[2].multiply(1 + light_step))
-        return jnp.mean(prt.radiance(system, light, eye=EYE, materials=[blend]))
+        return jnp.mean(radiance(system, light, [blend]))
 
     slope = jax.grad(total, (0, 1))(0.0, 0.0)
     for number, each in enumerate(slope):
@@ -154,7 +165,7 @@ def test_a_closed_white_room_without_light_stays_dark():
     np.testing.assert_allclose(system.tensor.worth, 0, atol=1e-6)
     np.testing.assert_allclose(shown(system), 0, atol=1e-6)
     np.testing.assert_allclose(np.sum(system.tensor.patches.between, 1), 1, atol=2e-3)
-    slope = jax.grad(lambda x: jnp.sum(prt.radiance(system, Environment(x), eye=EYE)))(SKY.radiance)
+    slope = jax.grad(lambda x: jnp.sum(radiance(system, Environment(x))))(SKY.radiance)
     assert np.isfinite(slope).all()
 
 
@@ -179,7 +190,7 @@ def test_one_triangle_has_one_patch_and_no_reflected_light():
 def test_fewer_components_keep_the_light_of_all_bounces():
     tensor = settled().tensor.truncate(16, modes=20)
     assert tensor.patches.first.shape[1] == 16
-    short = shown(PartBounces(tensor, settled().part))
+    short = shown(GroupBounces.make(tensor, settled().group, [[0]]))
     np.testing.assert_allclose(short.mean(), shown(settled()).mean(), rtol=0.01)
     small = settled().tensor.shorten(nbytes=tensor.nbytes)
     assert small.nbytes <= tensor.nbytes

@@ -184,7 +184,8 @@ def test_diffuse_surfaces_exchange_light_reciprocally():
         rays = found[1 - number]
         each = flux[rays.owner[:, None], rays.texel][..., None]
         fixed = (rays.owner, rays.corner, rays.weight, way[rays.texel], each)
-        arrived = np.asarray(bounces.gather.arrive(jnp.asarray(shining), frame, white, *fixed, points=len(start)))
+        none = np.zeros((len(start), 1, 1, 1), np.float32)
+        arrived = np.asarray(bounces.gather.arrive(none, jnp.asarray(shining), frame, white, *fixed))
         own = np.asarray(scene.region) == number
         cells = round(np.sqrt(own.sum()))
         line = np.ones(cells)
