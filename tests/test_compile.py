@@ -219,32 +219,3 @@ def test_programs_for_gpus_have_no_loops_over_rows_no_branches_to_choose_and_exa
 
 def test_products_inside_maps_and_their_transposes_are_exact(matrix, x, loose):
     assert not loose(jax.grad(ours), x, matrix)
-
-
-def test_programs_are_forgotten_when_they_fill_the_memory_mappings(tmp_path, monkeypatch):
-    mappings, limit = tmp_path / "maps", tmp_path / "max_map_count"
-    mappings.write_text("r-xp\n" * 60)
-    monkeypatch.setattr(compiled, "_MAPPINGS", mappings)
-    monkeypatch.setattr(compiled, "_LIMIT", limit)
-    monkeypatch.setattr(compiled, "_FEW", 1)
-    doubled = jit(lambda x: 2 * x)
-
-    def after(most):
-        limit.write_text(f"{most}\n")
-        doubled(jnp.ones(3))
-        compiled.make_room()
-        return doubled._cache_size()
-
-    assert after(1000) == 1
-    doubled.clear_cache()
-    assert after(65) == 0
-    assert jax.grad(lambda x: doubled(x) + after(65))(1.0) == 2
-
-
-def test_nothing_is_forgotten_where_there_is_no_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled, "_LIMIT", tmp_path / "none")
-    monkeypatch.setattr(compiled, "_FEW", 0)
-    doubled = jit(lambda x: 2 * x)
-    doubled(jnp.ones(3))
-    compiled.make_room()
-    assert doubled._cache_size() == 1

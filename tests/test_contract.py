@@ -36,7 +36,6 @@ from jaxprt import separable as separable_system
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
-from jaxprt.scene import mipmap
 from jaxprt.scene.points import Points
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
@@ -47,6 +46,7 @@ JITTED = type(jax.jit(lambda: 0))
 HOST = {
     "require": "checks values",
     "compile": "takes functions",
+    "programs": "reads and writes files, and compiles",
     "inverse": "takes functions, and fits on the host",
     "cli": "reads and writes files, measures, and serves pages",
     "brdf.fitted": "reads a file",
@@ -54,6 +54,8 @@ HOST = {
     "relit": "traces rays, and chooses by values",
     "files": "reads and writes files",
     "scene.points.on_triangles": "checks values",
+    "scene.material_table": "takes parts; what they look like at points is in tests/scene/test_material_table.py",
+    "scene.mipmap.levels": "its number of results depends on the size",
     "scene.texture.bilinear": "gives numbers of texels",
     "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
@@ -747,6 +749,7 @@ EXAMPLES = {
     ),
     "systems.bounces.gather.arrive": example(
         lambda draw: call(
+            draw.normal(2, 2, draw.separable().view_map.shape[-1], 4),
             draw.normal(5, 2, 4),
             draw.rotation(5),
             draw.separable(),
@@ -756,8 +759,7 @@ EXAMPLES = {
             draw.unit(3, 4),
             draw.normal(3, 4, 2),
         ),
-        gradient=("response", "basis", "weight", "measure"),
-        points=2,
+        gradient=("total", "response", "basis", "weight", "measure"),
     ),
     "systems.harmonic.transfer.transfer": example(
         lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
@@ -781,13 +783,6 @@ EXAMPLES = {
     ),
     "systems.separable.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "scene.texture.lookup": example(lambda draw: call(draw.normal(3, 4, 2), draw.normal(5, 2))),
-    "scene.mipmap.make": example(lambda draw: call(draw.normal(3, 4, 2))),
-    # Footprints are constant.
-    "scene.mipmap.lookup": example(
-        lambda draw: call(mipmap.make(draw.normal(3, 4, 2)), draw.normal(5, 2), 0.3 * draw.normal(2, 5, 2)),
-        gradient=("mipmap", "coordinate"),
-        wrap=("repeat", "clamp"),
-    ),
     "scene.points.placed": example(
         lambda draw: call(
             draw.normal(4, 3), draw.rotation(4), Points(jnp.array([[0, 3], [1, 2]]), jnp.full((2, 2), 0.5))

@@ -59,7 +59,8 @@ print(json.dumps({
 
 
 def start(cache: pathlib.Path, before: str = "", after: str = "", **environment: str) -> subprocess.Popen:
-    clean = {name: value for name, value in os.environ.items() if not name.startswith(jax_cache._VARIABLES)}
+    unset = (*jax_cache._VARIABLES, "JAXPRT_KEEP_PROGRAMS")  # which benchmarks set, and tests of them
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(unset)}
     command = [sys.executable, "-W", "error", "-c", SCRIPT, before, after]
     environment = {**clean, "XDG_CACHE_HOME": str(cache), "HOME": str(cache), "PYTHONPATH": str(ROOT), **environment}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
@@ -121,7 +122,7 @@ def test_the_cache_that_the_user_configures_later_takes_over(tmp_path):
 def untouched(monkeypatch):
     """JAX as it is where nobody has configured its cache: its options, which tests may change."""
     for name in os.environ:
-        if name.startswith(jax_cache._VARIABLES):
+        if name.startswith(jax_cache._VARIABLES) or name == "JAXPRT_KEEP_PROGRAMS":  # which benchmarks set
             monkeypatch.delenv(name)
     options = types.SimpleNamespace(**jax_cache._DEFAULTS)
     options.update = options.__setattr__

@@ -6,6 +6,7 @@ surface that the pixel shows.
 
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -42,11 +43,11 @@ class Pixels(eqx.Module):
             which are black.
     """
 
-    triangle: Int[Array, " p"]
-    barycentric: Float[Array, "p 3"]
-    slope: Float[Array, "p 2 3"]
-    pixel: Int[Array, " p"]
-    coverage: Float[Array, " p"]
+    triangle: Int[Array | np.ndarray, " p"]
+    barycentric: Float[Array | np.ndarray, "p 3"]
+    slope: Float[Array | np.ndarray, "p 2 3"]
+    pixel: Int[Array | np.ndarray, " p"]
+    coverage: Float[Array | np.ndarray, " p"]
     background: Float[Array, "h w"]
 
 
@@ -62,9 +63,9 @@ def shading_points(
     lies at the mean position of its samples, or as close to it as the triangle of the first sample reaches. Surfaces
     seen from behind (see `raster.front`) have no points. The result has zero derivatives.
 
-    Outside of `jax.jit` and `jax.vmap` at most an eighth of the points is added as padding, so that programs compiled
-    for one view usually fit the next. Inside of them the number of points is not known, so there are as many points as
-    samples.
+    Outside of `jax.jit` and `jax.vmap` the points are in NumPy, because their number depends on the view. At most an
+    eighth of them is padding, so that programs compiled for one view often fit the next. Inside of `jax.jit` the number
+    is not known, so there are as many points as samples.
 
     Args:
         fragments: The result of `rasterize`.
@@ -211,15 +212,15 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(each) for each in number.reshape(-1, block)]
 
 
-def _joined(parts: list[tuple[Array, ...]]) -> list[Array]:
-    """Concatenated fields of all parts; outside of jax.jit without most of the padding."""
+def _joined(parts: list[tuple[Array, ...]]) -> list[Any]:
+    """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
-    count = sum(int(np.count_nonzero(part[0] >= 0)) for part in parts)
+    count = sum(int(np.count_nonzero(np.asarray(part[0]) >= 0)) for part in parts)
     unit = 1 << max(count.bit_length() - 4, 0)
     room = max(-(-count // unit) * unit, 1)
     field = (np.concatenate([np.asarray(each) for each in same]) for same in zip(*parts, strict=True))
-    return [jax.device_put(each[:room]) for each in field]
+    return [each[:room] for each in field]
 
 
 # The following is split into several programs, because XLA would fuse all computations of one program into each of its

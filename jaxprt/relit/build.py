@@ -12,15 +12,15 @@ import tqdm
 from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import lamps, reflection, tracing, warn
-from jaxprt.relit.channels import Shading, of_part
+from jaxprt.relit import channels, groups, lamps, reflection, tracing, warn
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
-from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
+from jaxprt.relit.recipes import SYSTEMS, Piece, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.scene.scene import centered, default_camera
-from jaxprt.systems.protocol import Joined, System
+from jaxprt.systems.protocol import System
 from jaxprt.visibility import UnfinishedError
 
 _MOST = 1 << 13  # texels along the edge of a face
@@ -36,7 +36,6 @@ def precompute(
     rate: float = 30.0,
     bounces: int | str | None = None,
     rays: int = RAYS,
-    roughness: tuple[float, float] | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -63,9 +62,6 @@ def precompute(
             reflections are too sharp for the low-order harmonics that represent reflected light. 0 uses harmonics
             alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Only used with
             bounces; see `RelitScene.with_rays`.
-        roughness: Smallest and largest roughness that parts with a `TexturedMaterial` or a `BlinnPhong` may have after
-            precomputation, in addition to the roughness they have now. Requires `system` to be "lobe" or "harmonic". A
-            range costs fitting time and table memory.
         size: Edge of the light's cubemap faces in texels, a power of two. If None, that of the plan's lights, or 64
             without a plan.
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.
@@ -82,22 +78,14 @@ def precompute(
         TypeError: `scene` is not a `Scene`; `system` is not a name, a recipe or a dictionary; `bounces` is not a whole
             number; or a part has a material that no system supports.
         ValueError: There is no system or part of the given name; `size` is not a power of two; `bounces` is negative or
-            a word other than "all"; `roughness` is not two increasing numbers from 0 to 1, or is given without a
-            system; the system of a part does not support its material; or the store at `path` was made from other
-            inputs.
+            a word other than "all"; the system of a part does not support its material; or the store at `path` was
+            made from other inputs.
         NotADirectoryError: `path` is a file.
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    _check_options(size, error, rate, environments, rays, roughness, path, executor)
+    _check_options(size, error, rate, environments, rays, path, executor)
     reflection.check(bounces)
-    if roughness is not None and not (np.shape(roughness) == (2,) and 0 <= roughness[0] <= roughness[1] <= 1):
-        raise ValueError(f"roughness must be two numbers from 0 to 1, the smaller one first, got {roughness!r}")
-    if roughness is not None and system is None:
-        raise ValueError(
-            "roughness must be given together with a system, got no system: "
-            "a plan is made for the materials of the scene"
-        )
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():
@@ -108,47 +96,66 @@ def precompute(
         system, size = wanted.recipes, wanted.size if size is None else size
         bounces = wanted.bounces if bounces is None else bounces
     size = 64 if size is None else size
-    recipes = {part.name: _recipe(system, part.name, scene) for part in scene.parts}
+    recipes = [_recipe(system, part.name, scene) for part in scene.parts]
     near = centered(scene)
-    shadings = [_checked(part, recipes[part.name], roughness) for part in near.parts]
-    mesh = near.mesh
+    shadings = shaded(near.parts, recipes)
+    mesh, whole = near.mesh, scene.mesh
     warn.of_gain(near, shadings)
     warn.of_shells(near)
-    whole = scene.mesh
     warn.of_backs(scene, whole, default_camera(scene, whole))
     names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
-    systems = _systems([recipes[part.name] for part in scene.parts], shadings, targets)
-    lit = lamps.make(near, shadings, systems, targets, scene.point_lights)
-    reflected = None
+    counts = [len(part.mesh.position) for part in scene.parts]
+    parts = groups.kinds(shadings, recipes)
+    place = groups.Place.of(counts, parts, [recipes[own[0]].joins for own in parts])
+    systems = _systems(recipes, shadings, targets, place)
+    lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
+    reflected, lobes = None, None
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
-        reflected = reflection.make(shadings, bounces, Target(mesh, path=folder and folder / "scene", **options))
-    lobes = reflection.sharp(shadings, systems, folder) if bounces and rays else None
-    return RelitScene(scene, Joined(tuple(systems)), shadings, reflected, lamps=lit, lobes=lobes, rays=rays)
+        target = Target(mesh, path=folder and folder / "scene", **options)
+        reflected = reflection.make(shadings, place, bounces, target)
+        lobes = reflection.lobes(shadings, place, systems) if rays else None
+    return RelitScene(scene, shadings, place, systems, reflected, lamps=lit, lobes=lobes, rays=rays)
 
 
-def _systems(recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Sequence[Target]) -> list[System]:
-    """The systems of all parts."""
-    systems, unfinished = [], []
-    for recipe, shading, target in zip(recipes, shadings, targets, strict=True):
+def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:
+    """The `Shading` of each part. Refuses parts that their systems do not support, before tracing rays."""
+    looks = channels.looks(parts)
+    result = []
+    for part, look, recipe in zip(parts, looks, recipes, strict=True):
+        shading = channels.of_part(part, look=look, takes=recipe.takes)
         try:
-            systems.append(recipe.make(shading, target))
-        except UnfinishedError as others:  # Go on with the next part of the scene.
+            check(recipe, shading)
+        except ValueError as error:
+            raise ValueError(f"part {part.name!r}: {error}") from None
+        result.append(shading)
+    return result
+
+
+def _systems(
+    recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Sequence[Target], place: groups.Place
+) -> list[System]:
+    """The system of each group."""
+    systems, unfinished = [], []
+    for own, size in zip(place.parts, place.size, strict=True):
+        pieces = [Piece(shadings[part].mesh, targets[part]) for part in own]
+        try:
+            recipe, joined = recipes[own[0]], groups.joined([shadings[part] for part in own])
+            systems.append(recipe.make(joined, pieces, vertices=size if recipe.joins else None))
+        except UnfinishedError as others:  # Go on with the next group of the scene.
             unfinished.append(others)
     if unfinished:
         raise UnfinishedError("; ".join(map(str, unfinished)))
     return systems
 
 
-def _check_options(size, error, rate, environments, rays, roughness, path, executor) -> None:
+def _check_options(size, error, rate, environments, rays, path, executor) -> None:
     """Refuses options of wrong kinds, and numbers that no system takes."""
     require.executor(executor)
     if path is not None:
         require.path("path", path)
-    if roughness is not None:
-        require.real("roughness", roughness)
     whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
     if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
         raise ValueError(f"size must be a power of two, got {require.shown(size)}; the largest is {_MOST}")
@@ -158,16 +165,6 @@ def _check_options(size, error, rate, environments, rays, roughness, path, execu
     if environments is not None:
         checked(environments, 1.0, 1.0)
     tracing.check_rays(rays)
-
-
-def _checked(part: Part, recipe: Recipe, roughness: tuple[float, float] | None) -> Shading:
-    """The `Shading` of the part. Refuses a part that its system does not support, before tracing rays."""
-    shading = of_part(part, roughness=roughness)
-    try:
-        check(recipe, shading)
-    except ValueError as error:
-        raise ValueError(f"part {part.name!r}: {error}") from None
-    return shading
 
 
 def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:

@@ -1,96 +1,104 @@
-"""The points of a picture that are shaded, in rows of few lengths, and the picture that their colors make."""
+"""The points of a picture in rows of one length, and the picture that their colors make.
 
-from collections.abc import Sequence
+How many points a picture has depends on the view. What depends on that number stays in NumPy on the host, so that a new
+view runs the programs of the last one.
+"""
 
-import equinox as eqx
+from functools import partial
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from jaxprt.compile import jit
-from jaxprt.image import raster, resolve
+from jaxprt.compile import jit, known, put
 from jaxprt.image.pixels import Pixels
-from jaxprt.scene import Camera, Environment
+from jaxprt.scene import Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
 
-CHUNK = 1 << 13  # number of points that are shaded together
-_FEWEST = 1 << 10
+ROW = 1 << 12  # number of points that are shaded together
 
 
-class Canvas(eqx.Module):
-    """The points of a picture that are shaded, and where their colors go.
-
-    Attributes:
-        pixels: The points that are shaded.
-        order: Index of each point's color in the list of all colors, row after row.
-        ray: Unit direction in world space from the eye through the center of each pixel, to look up the background.
-    """
-
-    pixels: Pixels
-    order: Int[Array, " p"]
-    ray: Float[Array, "h w 3"]
-
-
-def rows_of(chosen: Array | np.ndarray) -> Int[Array, "m p"]:
-    """Indices of the chosen points, in rows of few different lengths, so that pictures share compiled programs."""
+def rows_of(chosen: Array | np.ndarray) -> Int[Array | np.ndarray, "m p"]:
+    """Indices of the chosen points in rows of one length; -1 is padding."""
     if isinstance(chosen, Tracer):
         count = len(chosen)
-        index = jnp.nonzero(chosen, size=count, fill_value=-1)[0]
+        index: Any = jnp.nonzero(chosen, size=count, fill_value=-1)[0]
     else:
         index = np.flatnonzero(np.asarray(chosen))
         count = len(index)
-    row = CHUNK if count > CHUNK else max(_FEWEST, 1 << max(count - 1, 0).bit_length())
-    rows = -(-count // row)
-    # NumPy, if the number of points is known: JAX would compile for each number.
+    rows = -(-count // ROW)
     pad = jnp.pad if isinstance(index, Tracer) else np.pad
-    return jnp.asarray(pad(index, (0, rows * row - count), constant_values=-1).reshape(rows, row))
+    return pad(index, (0, rows * ROW - count), constant_values=-1).reshape(rows, ROW).astype(np.int32)
 
 
-@jit
-def points_of(pixels: Pixels, face: Int[Array, "f 3"], first: int | Array, index: Int[Array, " p"]) -> Points:
-    """Some points of a picture that lie on one part. Padding (index -1) lies on the first vertex of the part.
-
-    This is a compiled program by itself, so that the programs that shade do not depend on the picture's number of
-    points.
+def points_of(
+    pixels: Pixels, face: Int[Array | np.ndarray, "f 3"], shift: Int[Array | np.ndarray, " v"], index: Any
+) -> tuple[Points, Points]:
+    """Some points of a picture that lie on one group: on the mesh of all parts, and on the group.
 
     Args:
         pixels: The points of the picture.
         face: Triangles of the mesh of all parts.
-        first: Index of the part's first vertex in that mesh.
-        index: Indices of the points; -1 in padding.
+        shift: Index of each vertex in this mesh, minus its index in its group.
+        index: Indices of the points; -1 in padding, which repeats the first point.
     """
-    own = jnp.maximum(index, 0)
-    padding = index < 0
-    corner = face[jnp.maximum(pixels.triangle[own], 0)].T - first
-    # Padding lies on a vertex, so that its colors are finite.
-    weight = jnp.where(padding, jnp.asarray([[1.0], [0], [0]], pixels.barycentric.dtype), pixels.barycentric[own].T)
-    slope = jnp.where(padding, 0, jnp.moveaxis(pixels.slope[own], 0, -1))
-    return Points(jnp.where(padding, 0, corner), weight, slope)
+    xp: Any = np if known(pixels, face, shift, index) else jnp
+    own = xp.where(index < 0, xp.maximum(index[0], 0), index)
+    corner = xp.asarray(face)[xp.maximum(xp.asarray(pixels.triangle)[own], 0)].T
+    weight, slope = (xp.asarray(each)[own] for each in (pixels.barycentric, pixels.slope))
+    # Padding of the picture itself has weights of zero. It lies on a vertex, so that its colors are finite.
+    weight = xp.where(xp.sum(weight, 1, keepdims=True) > 0, weight, xp.asarray([1.0, 0.0, 0.0], weight.dtype)).T
+    slope = xp.moveaxis(slope, 0, -1)
+    of_group = corner - xp.asarray(shift)[corner]
+    return put(Points(corner, weight, slope)), put(Points(of_group, weight, slope))
 
 
-def lay_out(pixels: Pixels, index: Sequence[Array], camera: Camera) -> Canvas:
-    """The canvas of some points. `index` holds their indices in the order in which they are shaded, -1 in padding."""
-    every = [each.ravel() for each in index]
-    count = len(pixels.triangle)
-    if any(isinstance(each, Tracer) for each in every):
-        row = jnp.concatenate(every)
-        place = jnp.where(row < 0, count, row)
-        order = jnp.zeros(count, jnp.int32).at[place].set(jnp.arange(len(row), dtype=jnp.int32), mode="drop")
-    else:
-        row = np.concatenate([np.zeros(0, np.int32), *every])
-        order = np.zeros(count, np.int32)
-        order[row[row >= 0]] = np.flatnonzero(row >= 0)
-    return Canvas(pixels, jnp.asarray(order), raster.ray_direction(camera))
+@partial(jit, static_argnames="colors")
+def sky(
+    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+) -> Float[Array, "h w _"]:
+    """The environment where nothing hides it, in a number of colors.
+
+    Args:
+        environment: The light.
+        ray: Unit direction in world space from the eye through the center of each pixel.
+        share: Fraction of each pixel that sees nothing else.
+        colors: Number of colors of the picture.
+    """
+    behind = background(environment, ray)
+    share = share.astype(behind.dtype)[..., None]
+    picture = jnp.where(share > 0, share * behind, 0)
+    return jnp.broadcast_to(picture, (*picture.shape[:2], colors))
 
 
-@jit
-def drawn(canvas: Canvas, rows: Sequence[Array], environment: Environment) -> Float[Array, "h w c"]:
-    """The picture of points with the given colors, in rows as they were shaded, in front of the environment."""
-    sky = background(environment, canvas.ray)
-    colors = max([sky.shape[-1], *(each.shape[-1] for each in rows)])
-    flat = [jnp.broadcast_to(each, (*each.shape[:-1], colors)).reshape(-1, colors) for each in rows]
-    # One more color, so that the list is not empty if nothing is seen.
-    color = jnp.concatenate([*flat, jnp.zeros((1, colors), sky.dtype)])
-    return resolve(canvas.pixels, color.at[canvas.order].get(mode="promise_in_bounds"), background=sky)
+def drawn(
+    picture: Float[Array, "h w c"], pixels: Pixels, index: Int[Array | np.ndarray, "*m"], color: Float[Array, "*m d"]
+) -> Float[Array, "h w c"]:
+    """The picture with the colors of some points added, each to its pixel. The picture before is used up.
+
+    Args:
+        picture: The picture so far.
+        pixels: The points of the picture.
+        index: Indices of the points; -1 in padding.
+        color: Their colors.
+    """
+    xp = np if known(pixels, index) else jnp
+    index = index.reshape(-1)
+    own = xp.maximum(index, 0)
+    pixel, coverage = (xp.asarray(each)[own] for each in (pixels.pixel, pixels.coverage))
+    coverage = xp.where(index < 0, xp.zeros((), coverage.dtype), coverage)
+    return _added(picture, pixel, coverage, color.reshape(-1, color.shape[-1]))
+
+
+@partial(jit, donate_argnames="picture")
+def _added(
+    picture: Float[Array, "h w c"], pixel: Int[Array, " p"], coverage: Float[Array, " p"], color: Float[Array, "p d"]
+) -> Float[Array, "h w c"]:
+    height, width, colors = picture.shape
+    share = coverage.astype(picture.dtype)[:, None]
+    part = jnp.where(share > 0, share * jnp.broadcast_to(color, (len(color), colors)), 0)
+    flat = picture.reshape(-1, colors)
+    return flat.at[pixel].add(part, mode="promise_in_bounds").reshape(height, width, colors)

@@ -6,7 +6,6 @@ import weakref
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -29,7 +28,6 @@ class Caster:
     def __init__(self, mesh: Mesh):
         self.mesh, self.occluder = mesh, Occluder(mesh)
         self.face, self.normal = np.asarray(mesh.face), np.asarray(mesh.normal)
-        self.part = np.asarray(mesh.region)[self.face[:, 0]]
 
     @cached_property
     def bend(self) -> Float[np.ndarray, " f"]:
@@ -47,28 +45,24 @@ class Caster:
         return start_points(self.mesh, self.occluder)
 
     def cast(
-        self, rays: Rays, first: int, points: Points | None
+        self, rays: Rays, points: Points, *, at_vertices: bool
     ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
         """The triangle that each ray hits (-1 for none), barycentric weights of the hit, and origins of the rays.
 
         Args:
-            rays: Rays that start from vertices or points of a part.
-            first: Index of the part's first vertex.
-            points: The points; None for the vertices.
+            rays: Rays that start from vertices or points.
+            points: The points of the scene.
+            at_vertices: Whether each point is the vertex that is its first corner.
         """
         way, chance = np.asarray(rays.direction, np.float32), np.asarray(rays.chance)
-        if points is None:
-            corner = first + np.arange(way.shape[1])[:, None]
-            start = self.start[corner[:, 0]]
-        else:
-            corner = first + np.asarray(points.corner).T
-            start = point_starts(self.mesh, Points(jnp.asarray(corner.T), points.weight))
+        corner = np.asarray(points.corner).T[:, : 1 if at_vertices else 3]
+        start = self.start[corner[:, 0]] if at_vertices else point_starts(self.mesh, points)
         ray, own = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
         found, weight = first_fronts(self.occluder, self.normal, start[own], np.ascontiguousarray(way[ray, own]))
         # Ignore hits of the ray's own triangle, or of a triangle around its own vertex: the origin may lie below it.
         met = self.face[found]
-        itself = np.all(met == corner[own], 1) if points is not None else np.any(met == corner[own], 1)
+        itself = np.any(met == corner[own], 1) if at_vertices else np.all(met == corner[own], 1)
         triangle[ray, own], barycentric[ray, own] = np.where(itself, -1, found), weight
         return triangle, barycentric, start
 

@@ -1,33 +1,34 @@
-"""Converts a part of a scene to the input of the systems: a mesh with shading frames, and a BRDF with weights.
+"""Converts parts of a scene to the input of the systems: a mesh with shading frames, and a BRDF with weights.
 
-A metallic-roughness material is a sum of fixed gray BRDFs whose weights are textures; see
-`jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, which a system tabulates or factors
-once. If roughness varies, they are tabulated over its logarithm.
+A metallic-roughness material is a sum of four fixed gray BRDFs whose weights are textures; see
+`jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, whose table over roughness all
+such materials share (`jaxprt.systems.standard`). An ideally diffuse material has one channel and no table. Parts of one
+`Kind` can share a system.
 """
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.compile import jit
-from jaxprt.scene import Mesh, Part
+from jaxprt.compile import jit, known
+from jaxprt.scene import Mesh, Part, material_table
 from jaxprt.scene.material import Surface, TexturedMaterial
+from jaxprt.scene.material_table import SMOOTHEST, Look
 from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
+from jaxprt.systems import standard
 from jaxprt.systems.protocol import Blend
-from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+from jaxprt.systems.standard import RoughnessFamily, StandardTable
 
-_SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
 _STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
 _EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
 _RARE = 0.02  # smallest scale of a channel, relative to the largest
@@ -36,19 +37,20 @@ _BARE = (3,)  # the only term of a Lambertian material
 
 
 class Shading(eqx.Module):
-    """A part of a scene as input of the systems.
+    """A part of a scene, or several parts of one kind, as input of the systems.
 
     Attributes:
-        mesh: The part's mesh, with normals from the normal map and tangents along the anisotropy.
+        mesh: The mesh, with normals from the normal map and tangents along the anisotropy.
         brdf: The BRDF, with one channel for each weight of `blend`. If `knot` is not empty, it is a function from the
-            logarithm of roughness to a BRDF: a `RoughnessFamily` or a `ShininessFamily`.
+            logarithm of roughness to a BRDF.
         exact: The BRDF at every vertex, for the exact sum over all texels.
-        knot: Logarithms of roughness at which to tabulate the BRDF; empty if roughness does not vary.
+        knot: Logarithms of roughness at which the BRDF is tabulated; empty if roughness does not vary.
         blend: Weights of the channels at each vertex, and the logarithm of roughness there if it varies. None for a
             part with a BRDF that cannot change.
         emitted: Radiance that the surface emits; None if it does not emit.
-        term: Indices of the terms of `MetallicRoughness` that are channels.
+        term: Indices of the channels among the coefficients of a `Look`.
         scale: Factor of each channel. The weights of `blend` are divided by it.
+        table: The standard tables of the BRDF; None for a BRDF with tables of its own.
     """
 
     mesh: Mesh
@@ -56,13 +58,19 @@ class Shading(eqx.Module):
     exact: Callable
     knot: tuple[np.ndarray, ...] = ()
     blend: Blend | None = None
-    emitted: Float[Array, "v 3"] | None = None
+    emitted: Float[Array | np.ndarray, "v 3"] | None = None
     term: tuple[int, ...] = eqx.field(static=True, default=())
-    scale: Float[Array, " k"] | None = None
+    scale: Float[Array | np.ndarray, " k"] | None = None
+    table: StandardTable | None = eqx.field(static=True, default=None)
+
+    @property
+    def matte(self) -> bool:
+        """Whether the surface is ideally diffuse."""
+        return isinstance(self.brdf, Lambert)
 
 
 class Appearance(eqx.Module):
-    """A material evaluated at the vertices of a part, in the form that the part's system takes.
+    """A material evaluated at vertices or points, in the form that systems take.
 
     Attributes:
         blend: Weights of the BRDF's channels; None for a part with a BRDF that cannot change.
@@ -70,115 +78,171 @@ class Appearance(eqx.Module):
     """
 
     blend: Blend | None
-    emitted: Float[Array, "v 3"] | None = None
+    emitted: Float[Array | np.ndarray, "v 3"] | None = None
 
 
-def of_part(part: Part, *, roughness: tuple[float, float] | None = None) -> Shading:
+def blend(look: Look, term: tuple[int, ...], scale: Float[Array | np.ndarray, " k"], *, varies: bool) -> Blend:
+    """The weights of a system's channels at points with given materials.
+
+    Args:
+        look: The materials at the points.
+        term: Indices of the channels among the coefficients.
+        scale: Factor of each channel.
+        varies: Whether the system takes the roughness of each point.
+    """
+    weight = look.coefficient[:, np.asarray(term)] / scale[:, None]
+    return Blend(weight, (look.log_roughness,) if varies else ())
+
+
+def _any_table(_: StandardTable) -> bool:
+    return True
+
+
+def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTable], bool] = _any_table) -> Shading:
     """Converts a part of a scene to a `Shading`, the input of the systems.
 
     A texture of anisotropy is replaced by its mean, with a warning.
 
     Args:
         part: The part.
-        roughness: Smallest and largest roughness that the part's material may have after precomputation, in addition to
-            the roughness it has now. For `BlinnPhong`, roughness is the square root of 2 / (exponent + 2).
+        look: The material at the vertices, in NumPy; evaluated here if None.
+        takes: Function that says whether the system reads a standard table. If it does not, the channels are the terms
+            that the material needs, and the system is made for the roughness that it has.
 
     Raises:
         TypeError: The material is one BRDF for each vertex, or a table that already includes the cosine.
     """
-    if not isinstance(part.material, TexturedMaterial):
-        if isinstance(part.material, PerVertex):
-            raise TypeError(
-                f"the material of part {part.name!r} must be one BRDF for all vertices or a TexturedMaterial, "
-                "got a BRDF for each vertex"
-            )
-        brdf = grid.as_argument(part.material)
-        if isinstance(brdf, BlinnPhong) and roughness is not None:
-            return _shiny(part.mesh, brdf, roughness)
-        return Shading(part.mesh, brdf, brdf)
-    surface = part.surface()
-    _warn_of_varying_anisotropy(part.name, surface)
-    material = _material(surface)
-    term = material.needed() or _BARE
-    if term == _BARE:
-        brdf, knot, scale = Lambert(1.0), (), jnp.ones(1)
-    else:
-        knot = _knots(material.roughness if roughness is None else jnp.append(material.roughness, jnp.array(roughness)))
-        scale = jnp.mean(jnp.abs(material.coefficient()[:, np.asarray(term)]), (0, 2))
-        scale = jnp.maximum(scale, _RARE * jnp.max(scale))
-        brdf = RoughnessFamily(term, scale, material.anisotropy[0])
-        if not knot:
-            brdf = brdf(jnp.log(jnp.maximum(jnp.mean(material.roughness), _SMOOTHEST)))
-    blend = _blend(material, term, scale, varies=bool(knot))
-    mesh = _turned(part.mesh, surface)
-    return Shading(mesh, brdf, PerVertex(material), knot, blend, _emitted(surface), term, scale)
-
-
-def _shiny(mesh: Mesh, brdf: BlinnPhong, roughness: tuple[float, float]) -> Shading:
-    """A part with a Blinn-Phong material. Its colors and exponent may change only if a range of roughness is given."""
-    own = jnp.exp(_log_roughness(brdf.exponent))
-    knot = _knots(jnp.append(own, jnp.array(roughness)), least=min(_SMOOTHEST, float(own)))
-    if not knot:
-        return Shading(mesh, brdf, brdf)
-    scale = jnp.stack([jnp.mean(brdf.diffuse), jnp.mean(brdf.specular)])
-    scale = jnp.maximum(scale, _RARE * jnp.max(scale)) + (jnp.max(scale) <= 0)
-    blend = _shiny_blend(brdf, scale, len(mesh.position))
-    return Shading(mesh, ShininessFamily(scale), brdf, knot, blend, scale=scale)
-
-
-def _log_roughness(exponent: Array) -> Array:
-    return jnp.log(2 / (exponent + 2)) / 2
-
-
-def _shiny_blend(brdf: BlinnPhong, scale: Array, count: int) -> Blend:
-    """The weights of a Blinn-Phong material, the same for every vertex or point."""
-    weight = jnp.stack([jnp.broadcast_to(each, (3,)) for each in (brdf.diffuse, brdf.specular)]) / scale[:, None]
-    roughness = jnp.broadcast_to(_log_roughness(brdf.exponent), (count,))
-    return Blend(jnp.broadcast_to(weight, (count, *weight.shape)), (roughness,))
-
-
-def _shiny_appearance(part: Part, shading: Shading, brdf: BlinnPhong) -> Appearance:
-    assert shading.scale is not None
-    least, most = exponent_range(shading)
-    if _known(brdf.exponent) and not least * (1 - _EQUAL) <= float(brdf.exponent) <= most * (1 + _EQUAL):
-        raise ValueError(
-            f"part {part.name!r} was precomputed for exponents from {least:.3g} to {most:.3g}, got {brdf.exponent:.3g}"
+    material = part.material
+    if isinstance(material, PerVertex):
+        raise TypeError(
+            f"the material of part {part.name!r} must be one BRDF for all vertices or a TexturedMaterial, "
+            "got a BRDF for each vertex"
         )
-    return Appearance(_shiny_blend(brdf, shading.scale, len(part.mesh.position)))
+    if isinstance(material, BlinnPhong):
+        return _shiny(part, material, look, takes)
+    if not isinstance(material, TexturedMaterial):
+        brdf = grid.as_argument(material)
+        return Shading(part.mesh, brdf, brdf)
+    look = _look(part) if look is None else look
+    mesh, anisotropy = _framed(part)
+    exact = PerVertex(_metallic(look, anisotropy))
+    emitted = look.emitted if np.any(look.emitted) else None
+    needed = tuple(k for k in range(len(_NAMES)) if np.any(look.coefficient[:, k])) or _BARE
+    if needed == _BARE:
+        scale = np.ones(1, look.coefficient.dtype)
+        return Shading(mesh, Lambert(1.0), exact, (), blend(look, _BARE, scale, varies=False), emitted, _BARE, scale)
+    table = standard.METALLIC_ROUGHNESS
+    if anisotropy > _EQUAL or not takes(table):
+        return _alone(mesh, exact, look, emitted, needed, anisotropy)
+    own = blend(look, table.term, table.scale, varies=True)
+    return Shading(mesh, table.family, exact, (table.knot,), own, emitted, table.term, table.scale, table)
 
 
-def appearance(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Appearance:
+def _alone(mesh: Mesh, exact: PerVertex, look: Look, emitted: Any, term: tuple[int, ...], anisotropy: float) -> Shading:
+    """A part with a table of its own, over the roughness that it has."""
+    knot = _knots(np.asarray(look.log_roughness))
+    scale = np.mean(np.abs(look.coefficient[:, np.asarray(term)]), (0, 2))
+    scale = np.maximum(scale, _RARE * np.max(scale)).astype(look.coefficient.dtype)
+    brdf: Any = RoughnessFamily(term, jnp.asarray(scale), jnp.asarray(anisotropy, scale.dtype))
+    if not knot:
+        brdf = brdf(jnp.asarray(np.mean(look.log_roughness)))
+    return Shading(mesh, brdf, exact, knot, blend(look, term, scale, varies=bool(knot)), emitted, term, scale)
+
+
+def _shiny(part: Part, brdf: BlinnPhong, look: Look | None, takes: Callable[[StandardTable], bool]) -> Shading:
+    """A part with a Blinn-Phong material. One sharper than the standard tables keeps a table of its own."""
+    table = standard.BLINN_PHONG
+    if np.ndim(brdf.exponent) or float(brdf.exponent) > table.most_exponent or not takes(table):
+        return Shading(part.mesh, brdf, brdf)
+    look = _look(part) if look is None else look
+    own = blend(look, table.term, table.scale, varies=True)
+    return Shading(part.mesh, table.family, brdf, (table.knot,), own, None, table.term, table.scale, table)
+
+
+def looks(parts: Sequence[Part]) -> list[Look]:
+    """The materials at the vertices of each part, by one program for all."""
+    every, result, first = material_table.of_parts(parts).at_vertices(), [], 0
+    for part in parts:
+        own = slice(first, first + len(part.mesh.position))
+        result.append(Look(*jax.tree.map(lambda each, own=own: each[own], tuple(every))))
+        first = own.stop
+    return result
+
+
+def _look(part: Part) -> Look:
+    """The material at the vertices of a part. Its roughness is known if JAX does not trace it."""
+    (look,) = looks([part])
+    if known(look) or not known(plain := dataclasses.replace(part, material=rough(part.material))):
+        return look
+    with jax.ensure_compile_time_eval():
+        return look._replace(log_roughness=looks([plain])[0].log_roughness)
+
+
+def rough(material: Any) -> Any:
+    """A material of the same roughness as another, with everything else as by default."""
+    if not isinstance(material, TexturedMaterial):
+        return material
+    return TexturedMaterial(roughness=material.roughness, roughness_texture=material.roughness_texture)
+
+
+def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
+    """The BRDF of each vertex or point."""
+    values = {name: value for name, value in look.values._asdict().items() if name != "emissive"}
+    zero = 0 * values["roughness"]
+    return MetallicRoughness(**values, anisotropy=zero + anisotropy, rotation=zero)
+
+
+def appearance(
+    part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong, *, look: Look | None = None
+) -> Appearance:
     """Evaluates a new material at the vertices of a precomputed part.
 
-    Textures of color, metallic, specular and emission may have any values. Roughness must be in the precomputed range.
-    Inside `jax.jit`, where values are unknown, vertices that need something that was not precomputed get NaN.
-    Derivatives ignore terms that were not precomputed.
+    Textures may have any values. Parts with the standard tables take any material of their model. Other parts take what
+    their own tables hold. Inside `jax.jit`, where values are unknown, vertices that need something that was not
+    precomputed get NaN. Derivatives ignore terms that were not precomputed.
 
     Args:
         part: The part.
         shading: The `Shading` of the part, from `of_part`.
         material: The new material.
+        look: The new material at the vertices; evaluated here if None.
 
     Raises:
-        ValueError: The material uses texture coordinates that the mesh lacks, or has a term, a roughness, an anisotropy
-            or a normal map that was not precomputed.
+        ValueError: The material uses texture coordinates that the mesh lacks, has a normal map that was not
+            precomputed, or a term, a roughness or an anisotropy that the part's own tables lack.
         TypeError: The part was precomputed with a Blinn-Phong material and the new one is metallic-roughness, or vice
             versa.
     """
-    shiny = isinstance(shading.brdf, ShininessFamily)
+    new = replaced(part, shading, material)
+    look = _look(new) if look is None else look
+    assert shading.scale is not None
+    own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    emitted = None if known(look.emitted) and not np.any(look.emitted) else look.emitted
+    if isinstance(material, BlinnPhong):
+        return Appearance(own)
+    fits = _fits(part.name, shading, look)
+    weight = own.weight if known(fits) else jnp.where(fits[:, None, None], own.weight, jnp.nan)
+    return Appearance(Blend(weight, own.parameter), emitted)
+
+
+def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Part:
+    """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
+    shiny = shading.table is standard.BLINN_PHONG
     if isinstance(material, BlinnPhong) != shiny:
         kind = "BlinnPhong" if shiny else "TexturedMaterial"
         raise TypeError(f"the material of part {part.name!r} must be a {kind}, got {type(material).__name__}")
     if isinstance(material, BlinnPhong):
-        return _shiny_appearance(part, shading, material)
-    surface = dataclasses.replace(part, material=material).surface()
-    new = _material(surface)
-    _check_shape(part, shading, surface, new)
-    assert shading.scale is not None
-    blend = _blend(new, shading.term, shading.scale, varies=bool(shading.knot))
-    fits = _fits(part.name, shading, new)
-    weight = jnp.where(fits[:, None, None], blend.weight, jnp.nan) if isinstance(fits, Tracer) else blend.weight
-    return Appearance(Blend(weight, blend.parameter), _emitted(surface))
+        most = standard.BLINN_PHONG.most_exponent
+        if known(material.exponent) and not 0 <= float(material.exponent) <= most * (1 + _EQUAL):
+            raise ValueError(
+                f"the exponent of part {part.name!r} must be at most {most:.3g}, got {float(material.exponent):.3g}: "
+                "precompute the scene with it"
+            )
+        return dataclasses.replace(part, material=material)
+    new = dataclasses.replace(part, material=material)
+    if known(material, shading):
+        _check_frames(part, shading, new)
+    return new
 
 
 def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
@@ -193,84 +257,101 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
     """
     if isinstance(material, Appearance):
         return jax.tree.map(points.carry, material)
-    own = part.material if material is None else material
-    if isinstance(own, BlinnPhong) and isinstance(shading.brdf, ShininessFamily):
-        assert shading.scale is not None
-        return Appearance(_shiny_blend(own, shading.scale, len(points)))
-    if not isinstance(own, TexturedMaterial):
+    if shading.blend is None:
         return Appearance(None)
-    surface = (part if material is None else dataclasses.replace(part, material=material)).surface(points)
     assert shading.scale is not None
-    blend = _blend(_material(surface), shading.term, shading.scale, varies=bool(shading.knot))
-    return Appearance(blend, surface.emissive)
+    own = part if material is None else dataclasses.replace(part, material=material)
+    look = material_table.of_parts([own]).at(points)
+    return Appearance(blend(look, shading.term, shading.scale, varies=bool(shading.knot)), look.emitted)
 
 
-def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | None]:
+def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tuple[Blend | None, Callable]:
+    """The materials of several parts of one kind at points on all of them: weights of the channels, and the BRDF.
+
+    Args:
+        parts: The parts.
+        shading: One `Shading` for all of them.
+        points: Points on the joined mesh of the parts.
+    """
+    if shading.blend is None:
+        return None, shading.exact
+    assert shading.scale is not None
+    look = material_table.of_parts(parts).at(points)
+    own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    if isinstance(parts[0].material, BlinnPhong):
+        values = look.values
+        exponent = 2 / values.roughness**2 - 2
+        return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
+    return own, PerVertex(_metallic(look, _anisotropy(shading)))
+
+
+def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None]:
     """The BRDF at points of a part for the exact sum over all texels, and the radiance that the points emit.
 
     Textures are averaged over the pixel of each point. At points that do not belong to a picture they are sampled.
     """
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None
-    surface = part.surface(points)
-    return PerVertex(_material(surface)), surface.emissive
+    look = material_table.of_parts([part]).at(points)
+    return PerVertex(_metallic(look, _anisotropy(shading))), look.emitted
 
 
-def _fits(name: str, shading: Shading, new: MetallicRoughness) -> Array:
+def _fits(name: str, shading: Shading, look: Look) -> Any:
     """Whether the terms and the roughness of each vertex were precomputed. If values are known, refuses others."""
+    if shading.table is not None:
+        return np.ones(len(look.log_roughness), bool)
     missing = np.setdiff1d(np.arange(len(_NAMES)), shading.term)
-    needed = jnp.any(new.coefficient()[:, missing] != 0, (0, 2))
-    if _known(needed) and np.any(np.asarray(needed)):
-        names = [_NAMES[k] for k in missing[np.asarray(needed)]]
+    xp = np if known(look) else jnp
+    needed = xp.any(look.coefficient[:, missing] != 0, (0, 2))
+    if known(needed) and np.any(needed):
+        names = [_NAMES[k] for k in missing[needed]]
         raise ValueError(
             f"part {name!r} was precomputed without the terms that the new material needs ({', '.join(names)}): "
             "precompute it with a material that has them"
         )
-    fits = ~jnp.any(new.coefficient()[:, missing] != 0, (1, 2))
-    if shading.term == _BARE:
+    fits = ~xp.any(look.coefficient[:, missing] != 0, (1, 2))
+    if shading.matte:
         return fits
-    low, high = roughness_range(shading)
-    inside = (new.roughness >= low - _EQUAL) & (new.roughness <= high + _EQUAL)
-    if _known(inside) and not np.all(np.asarray(inside)):
-        given = jax.lax.stop_gradient(new.roughness)
+    low, high = _log_range(shading)
+    inside = (look.log_roughness >= low - _EQUAL) & (look.log_roughness <= high + _EQUAL)
+    if known(inside) and not np.all(inside):
+        given = jnp.exp(jax.lax.stop_gradient(look.log_roughness))
         raise ValueError(
-            f"part {name!r} was precomputed for roughness from {low:.3f} to {high:.3f}, got a material from "
-            f"{jnp.min(given):.3f} to {jnp.max(given):.3f}: precompute it with a material that covers "
-            "both ranges"
+            f"part {name!r} was precomputed for roughness from {np.exp(low):.3f} to {np.exp(high):.3f}, got a material "
+            f"from {jnp.min(given):.3f} to {jnp.max(given):.3f}: precompute it with a material that covers both ranges"
         )
     return fits & inside
 
 
-def roughness_range(shading: Shading) -> tuple[Array, Array]:
-    """Smallest and largest roughness that a part was precomputed for."""
-    if not shading.knot:
-        old = _old(shading).roughness
-        return jnp.min(old), jnp.max(old)
-    (knot,) = shading.knot
-    # Smaller roughness is treated as that of the first knot.
-    least, most = jnp.exp(knot[0]), jnp.exp(knot[-1])
-    return jnp.where(least <= _SMOOTHEST + _EQUAL, 0, least), most
+def roughness_range(shading: Shading) -> tuple[float, float]:
+    """Smallest and largest roughness that the material of a part may have."""
+    if shading.table is not None:
+        return 0.0, 1.0
+    low, high = _log_range(shading)
+    return float(np.exp(low)), float(np.exp(high))
 
 
-def exponent_range(shading: Shading) -> tuple[float, float]:
-    """Smallest and largest exponent that a Blinn-Phong part was precomputed for."""
-    (knot,) = shading.knot
-    least, most = (2 * np.exp(-2 * knot[each]) - 2 for each in (-1, 0))
-    return max(float(least), 0.0), float(most)
+def _log_range(shading: Shading) -> tuple[float, float]:
+    """Logarithms of the smallest and the largest roughness of a part with a table of its own."""
+    if shading.knot:
+        return float(shading.knot[0][0]), float(shading.knot[0][-1])
+    assert isinstance(shading.exact, PerVertex)
+    assert isinstance(shading.exact.model, MetallicRoughness)
+    own = np.log(np.maximum(np.asarray(shading.exact.model.roughness), SMOOTHEST))
+    return float(own.min()), float(own.max())
 
 
-def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRoughness) -> None:
-    """Refuses an anisotropy or normals that differ from the precomputed ones, if their values are known."""
-    if not _known(surface, shading):
-        return
-    before, now = (float(each.anisotropy[0]) for each in (_old(shading), new))
-    anisotropic = before > _EQUAL and shading.term != _BARE
-    if abs(before - now) > _EQUAL and shading.term != _BARE:
+def _check_frames(part: Part, shading: Shading, new: Part) -> None:
+    """Refuses an anisotropy or normals that differ from the precomputed ones."""
+    before = _anisotropy(shading)
+    mesh, now = _framed(new)
+    if abs(before - now) > _EQUAL and not shading.matte:
         raise ValueError(
             f"part {part.name!r} was precomputed for an anisotropy of {before:.3f}, got a material of {now:.3f}"
         )
-    mesh = _turned(part.mesh, surface)
-    for field, matters in (("normal", True), ("tangent", anisotropic)):
+    if mesh is shading.mesh:
+        return
+    for field, matters in (("normal", True), ("tangent", before > _EQUAL and not shading.matte)):
         first, second = (np.asarray(getattr(each, field)) for each in (shading.mesh, mesh))
         if matters and np.abs(first - second).max() > _EQUAL:
             what = {"normal": "normal map", "tangent": "direction of anisotropy"}[field]
@@ -279,59 +360,36 @@ def _check_shape(part: Part, shading: Shading, surface: Surface, new: MetallicRo
             )
 
 
-def _old(shading: Shading) -> MetallicRoughness:
-    """The material that a part was precomputed with."""
+def _anisotropy(shading: Shading) -> float:
+    """The anisotropy that a part was precomputed with."""
     assert isinstance(shading.exact, PerVertex)
     assert isinstance(shading.exact.model, MetallicRoughness)
-    return shading.exact.model
+    return float(shading.exact.model.anisotropy[0])
 
 
-def _known(*value: Any) -> bool:
-    """Whether no array is traced by JAX."""
-    return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
-
-
-def _blend(material: MetallicRoughness, term: tuple[int, ...], scale: Array, *, varies: bool) -> Blend:
-    weight = material.coefficient()[:, np.asarray(term)] / scale[:, None]
-    return Blend(weight, (jnp.log(jnp.maximum(material.roughness, _SMOOTHEST)),) if varies else ())
-
-
-def _emitted(surface: Surface) -> Float[Array, "v 3"] | None:
-    return None if _known(surface.emissive) and not np.any(np.asarray(surface.emissive)) else surface.emissive
-
-
-def _material(surface: Surface) -> MetallicRoughness:
-    """The material at every vertex. Its anisotropy is the mean strength, along the tangent."""
-    ones = jnp.ones_like(surface.roughness)
-    return MetallicRoughness(
-        base_color=surface.base_color,
-        metallic=surface.metallic,
-        roughness=surface.roughness,
-        ior=surface.ior,
-        specular=surface.specular,
-        specular_color=surface.specular_color,
-        anisotropy=jnp.mean(surface.anisotropy) * ones,
-        rotation=0 * ones,
-    )
-
-
-def _warn_of_varying_anisotropy(name: str, surface: Surface) -> None:
+def _framed(part: Part) -> tuple[Mesh, float]:
+    """The mesh with normals from the normal map and tangents along the anisotropy, and the mean anisotropy."""
+    material = part.material
+    assert isinstance(material, TexturedMaterial)
+    if material.normal_texture is None and not float(material.anisotropy):
+        return part.mesh, 0.0
+    surface = part.surface()
     strength = np.asarray(surface.anisotropy)
     if np.ptp(strength) > _EQUAL:
         warnings.warn(
-            f"the anisotropy of part {name!r} varies from {strength.min():.2f} to {strength.max():.2f} over its "
+            f"the anisotropy of part {part.name!r} varies from {strength.min():.2f} to {strength.max():.2f} over its "
             f"texture, which is not supported: its mean {strength.mean():.2f} is used everywhere",
             stacklevel=3,
         )
+    return _turned(part.mesh, surface), float(strength.mean())
 
 
-def _knots(roughness: Float[Array, " v"], *, least: float = _SMOOTHEST) -> tuple[np.ndarray, ...]:
+def _knots(log_roughness: Float[np.ndarray, " v"]) -> tuple[np.ndarray, ...]:
     """Logarithms of roughness between the smallest and the largest; none if these are equal."""
-    low, high = (max(float(each), least) for each in (jnp.min(roughness), jnp.max(roughness)))
-    if high - low <= _EQUAL:
+    low, high = float(np.min(log_roughness)), float(np.max(log_roughness))
+    if np.exp(high) - np.exp(low) <= _EQUAL:
         return ()
-    count = 1 + int(np.ceil(np.log(high / low) / np.log(_STEP)))
-    return (np.linspace(np.log(low), np.log(high), count),)
+    return (np.linspace(low, high, 1 + int(np.ceil((high - low) / np.log(_STEP)))),)
 
 
 def _turned(mesh: Mesh, surface: Surface) -> Mesh:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxprt.brdf import grid
 from jaxprt.compile import jit
@@ -46,21 +46,25 @@ def curvature(shading: Shading, system: System) -> float:
     Returns:
         The ratio in 1 / radian^2.
     """
+    inner = system.system if isinstance(system, BrightTexels) else system
+    degree_of = inner.degree if isinstance(inner, HarmonicSystem) else None
+    if shading.table is not None:
+        assert shading.blend is not None
+        weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
+        return shading.table.curvature(float(np.min(np.asarray(shading.blend.parameter[0]))), weight, degree_of)
     brdf: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     wo = jnp.asarray(_VIEW)
     mirror = jnp.asarray(_VIEW * [-1, -1, 1])
     wi, area = hemisphere.arcs(mirror, rings=_RINGS, sectors=_SECTORS)
     value = np.asarray(grid.as_argument(brdf)(wi, jnp.broadcast_to(wo, wi.shape)), np.float64)
     if shading.blend is not None:
-        value = value @ np.asarray(jnp.mean(shading.blend.weight, 0), np.float64)
+        value = value @ np.mean(np.asarray(shading.blend.weight, np.float64), 0)
     mass = value.mean(-1) * np.asarray(area) * np.maximum(np.asarray(wi)[:, 2], 0)
     cosine = np.clip(np.asarray(wi, np.float64) @ np.asarray(mirror, np.float64), -1, 1)
     degree = np.arange(_DEGREE + 1)
     # Each column of the Vandermonde matrix is the Legendre polynomial of one degree.
     zonal = mass @ np.polynomial.legendre.legvander(cosine, _DEGREE)
-    inner = system.system if isinstance(system, BrightTexels) else system
-    if isinstance(inner, HarmonicSystem):
-        zonal = zonal[: inner.degree + 1]
+    zonal = zonal[: None if degree_of is None else degree_of + 1]
     degree = degree[: len(zonal)]
     power = (2 * degree + 1) / (degree + 0.5) ** 2 * zonal**2
     total = power.sum()
@@ -68,27 +72,19 @@ def curvature(shading: Shading, system: System) -> float:
 
 
 @jit
-def error(
-    position: Float[Array, "v 3"],
-    normal: Float[Array, "v 3"],
-    face: Int[Array, "f 3"],
-    eye: Float[Array, "3"],
-    curvature: Float[Array, " v"],
-) -> Float[Array, " f"]:
+def error(mesh: Mesh, eye: Float[Array, "3"], curvature: Float[Array, " v"]) -> Float[Array, " f"]:
     """Relative error of radiance that is interpolated over each triangle, at most 1.
 
     Args:
-        position: Positions of the vertices.
-        normal: Normals of the vertices.
-        face: Vertex indices of the triangles.
+        mesh: The triangles.
         eye: Position of the viewer.
         curvature: Result of `curvature` for the part of each vertex.
     """
-    toward = directions.normalize(eye - position)
-    mirror = 2 * jnp.sum(normal * toward, -1, keepdims=True) * normal - toward
-    a, b, c = (mirror[face[:, k]] for k in range(3))
+    toward = directions.normalize(eye - mesh.position)
+    mirror = 2 * jnp.sum(mesh.normal * toward, -1, keepdims=True) * mesh.normal - toward
+    a, b, c = (mirror[mesh.face[:, k]] for k in range(3))
     square = jnp.stack([jnp.sum((x - y) ** 2, -1) for x, y in ((a, b), (b, c), (c, a))])
-    return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[face[:, 0]], 1)
+    return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[mesh.face[:, 0]], 1)
 
 
 @jit

@@ -5,23 +5,22 @@ import math
 import statistics
 import timeit
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.exact import exact_pixels
-from jaxprt.scene import Camera, Environment, Mesh, Scene, builtin
+from jaxprt.scene import Environment, Mesh, Scene, builtin
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol, reference
-from jaxprt.systems.protocol import Joined, System
 
 JUDGED = 1350  # number of points, of all parts together, whose exact radiance is computed
 FEWEST = 100  # smallest number of points of one part
@@ -82,34 +81,21 @@ def _percent(errors: Sequence[float]) -> str:
     return ", ".join("-" if math.isnan(each) else f"{100 * each:.1f} %" for each in errors)
 
 
-def measure(
-    picture: Callable[[Environment, Camera], Array],
-    camera: Camera,
-    direct: Joined,
-    system: System,
-    scene: Scene,
-    shadings: Sequence[Shading],
-    environments: Sequence[Environment],
-) -> Report:
+def measure(scene: Any, environments: Sequence[Environment]) -> Report:
     """Measures a scene against the exact sum: pixels of pictures, and a sample of its vertices from eight views.
 
     Args:
-        picture: Function (environment, camera) -> picture of the scene in direct light, [h, w, c].
-        camera: The first camera. Two more cameras are placed on other sides of the scene.
-        direct: The systems of all parts, for direct light.
-        system: The system whose bytes and times are reported; it includes bounces if there are any.
-        scene: The scene.
-        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        scene: The relit scene, with its origin at zero. Times and bytes include bounces; errors are of direct light.
         environments: Environments of one size.
     """
-    size, mesh = checked(environments, 1.0, 1.0), scene.mesh
-    views, blends = views_around(mesh), [each.blend for each in shadings]
-    seen = [direct.view(jnp.asarray(eye), blends) for eye in views]
-    lit = [direct.light(each) for each in environments]
+    size, mesh, shadings = checked(environments, 1.0, 1.0), scene.mesh, scene.shading
+    direct, views = scene.direct, views_around(mesh)
+    seen = [direct.view(jnp.asarray(eye)) for eye in views]
+    lit = [direct.shade(direct.light(each)) for each in environments]
     color = np.stack([[np.asarray(direct.combine(light, view)) for view in seen] for light in lit])
-    pixels = _pictures(picture, camera, scene, shadings, environments)
+    pixels = _pictures(direct.picture, scene.camera, scene.scene, shadings, environments)
     parts, first = [], 0
-    for part, shading, each in zip(scene.parts, shadings, direct.part, strict=True):
+    for number, (part, shading) in enumerate(zip(scene.scene.parts, shadings, strict=True)):
         count = len(part.mesh.position)
         few = max(FEWEST, round(JUDGED * count / len(mesh.position)))
         vertex = np.sort(np.random.default_rng(1).permutation(count)[:few])
@@ -117,24 +103,27 @@ def measure(
         judged = np.arange(len(vertex))
         exact = _exact(visible, judged, _exact_brdf(shading, vertex), environments, views)
         facing, now = _facing(visible, judged, views), color[:, :, first + vertex]
+        if shading.emitted is not None:
+            now = now - np.asarray(shading.emitted)[vertex]
         pairs = zip(np.broadcast_to(now, exact.shape), exact, strict=True)
         vertex_errors = tuple(relative_error(a[facing], b[facing]) for a, b in pairs)
-        shown = tuple(pixels[1][:, len(parts)])
-        parts.append(PartReport(part.name, count, shown, vertex_errors, protocol.memory(each)))
+        shown = tuple(pixels[1][:, number])
+        nbytes = protocol.memory(scene.part_system(number))
+        parts.append(PartReport(part.name, count, shown, vertex_errors, nbytes))
         first += count
 
     def arriving():
-        return system.shade(system.light(environments[0]), blends)
+        return scene.shade(scene.light(environments[0]))
 
     def view():
-        return system.view(jnp.asarray(views[0]), blends)
+        return scene.view(jnp.asarray(views[0]))
 
     arrived, viewed = arriving(), view()
     new_light, new_view = (
-        seconds(lambda: system.combine(arriving(), viewed)),
-        seconds(lambda: system.combine(arrived, view())),
+        seconds(lambda: scene.combine(arriving(), viewed)),
+        seconds(lambda: scene.combine(arrived, view())),
     )
-    return Report(tuple(parts), tuple(pixels[0]), tuple(pixels[2]), new_light, new_view, protocol.memory(system))
+    return Report(tuple(parts), tuple(pixels[0]), tuple(pixels[2]), new_light, new_view, scene.nbytes)
 
 
 def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ and possibly another roughness. Such a part uses a few functions that are fitted
 table of their weights over roughness.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,8 +19,9 @@ from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.brdf.microfacet import SchlickDiffuse
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
-from jaxprt.systems import bounces, harmonic, separable
+from jaxprt.systems import bounces, harmonic, separable, standard
 from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.standard import StandardTable
 
 _TERMS, _RESOLUTION = 24, 32  # number of terms, and edge of the maps, of BRDFs along light paths
 _FUNCTIONS = 2  # number of functions that represent lobes of any roughness
@@ -49,48 +51,50 @@ def factored(shading: Shading) -> Path:
     Lobes too narrow for the resolution of the maps are widened: otherwise a smooth metal would send many
     times the light that it receives. Each channel is scaled to its true albedo. Widening is acceptable because the
     light that arrives elsewhere is represented by low-order harmonics, which are wider still.
+
+    Parts with the standard tables share one result, for any roughness.
     """
-    knot = _finer(shading.knot)
-    members = [shading.brdf(jnp.asarray(each)) for each in knot[0]] if knot else [shading.brdf]
+    if shading.table is not None:
+        return _standard(shading.table)
+    return _factored(still(shading), shading.brdf, shading.knot if shading.blend is not None else ())
+
+
+@functools.cache
+def _standard(table: StandardTable) -> Path:
+    if table is standard.METALLIC_ROUGHNESS:
+        return Path(*table.paths())
+    return _factored(table.family, table.family, (table.knot,))
+
+
+def _factored(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
+    """The factored BRDF of a family over roughness, or of one BRDF; `alone` is it at one roughness."""
+    knot = _finer(knot)
+    members = [brdf(jnp.asarray(each)) for each in knot[0]] if knot else [alone]
     matte = _matte(members[0])
-    if shading.blend is None or matte is None or matte.all():
-        return Path(_alone(still(shading)), None)
+    if matte is None or matte.all():
+        return Path(_alone(alone), None)
     wide = [_lobes(each, ~matte) for each in members]
     # Lobes that are widened to the same width become one member of the set.
     first = [0] + [n for n in range(1, len(wide)) if not _equal(wide[n - 1], wide[n])]
     lobes = [wide[n] for n in first]
-    brdf, weight = bounces.functions.shared(lobes, functions=_FUNCTIONS, terms=_TERMS, resolution=_RESOLUTION)
+    shared, weight = bounces.functions.shared(lobes, functions=_FUNCTIONS, terms=_TERMS, resolution=_RESOLUTION)
     own = np.searchsorted(first, np.arange(len(wide)), side="right") - 1
-    factor = np.zeros((len(members), len(matte), brdf.view_map.shape[-1]), np.asarray(weight).dtype)
+    factor = np.zeros((len(members), len(matte), shared.view_map.shape[-1]), np.asarray(weight).dtype)
     factor[:, ~matte] = np.asarray(weight)[own]
     factor[:, matte, -1] = 1
-    kept = factor @ np.asarray(bounces.functions.albedo(brdf))
+    kept = factor @ np.asarray(bounces.functions.albedo(shared))
     true = np.stack([channels(each) for each in members])
     factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
-    dtype = brdf.view_map.dtype
-    return Path(brdf, Sent(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
-
-
-def alike(one: Shading, other: Shading) -> bool:
-    """Whether two parts can share one factored BRDF: their BRDFs and their ranges of roughness are equal."""
-    pair = one.brdf, other.brdf
-    knots = [each.knot for each in (one, other)]
-    if (one.blend is None) != (other.blend is None) or len(knots[0]) != len(knots[1]):
-        return False
-    leaves, kinds = zip(*(jax.tree.flatten(each) for each in pair), strict=True)
-    if kinds[0] != kinds[1] or not all(eqx.is_array(leaf) for leaf in (*leaves[0], *leaves[1])):
-        return False
-    pairs = [*zip(*leaves, strict=True), *zip(*knots, strict=True)]
-    return all(np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=_SAME, atol=0) for a, b in pairs)
+    dtype = shared.view_map.dtype
+    return Path(shared, Sent(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
 
 
 def typical(shading: Shading, path: Path) -> Float[Array, "p c"] | None:
     """Mean weights, over the part's vertices, of the channels with which it sends light; None without a blend."""
     if shading.blend is None:
         return None
-    if path.sent is None:
-        return jnp.mean(shading.blend.weight, 0)
-    return path.sent.mean(shading.blend, jnp.ones(len(shading.blend.weight)))
+    weight = shading.blend.weight if path.sent is None else path.sent.weights(shading.blend)
+    return jax.device_put(np.mean(np.asarray(weight), 0))
 
 
 def albedo(shading: Shading) -> Float[np.ndarray, "3"]:

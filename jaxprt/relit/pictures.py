@@ -1,74 +1,94 @@
 """Pictures of scenes. Radiance is computed at pixels where interpolation between vertices would be too inaccurate."""
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.brdf import Lambert
-from jaxprt.compile import Between, finished, jit, make_room, promoted
-from jaxprt.image import rasterize, shading_points
+from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
+from jaxprt.image import raster, rasterize, shading_points
 from jaxprt.image.pixels import Pixels
-from jaxprt.relit import interpolation, tracing
-from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
-from jaxprt.relit.channels import at_points
-from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
-from jaxprt.scene import Camera, Environment, Mesh
-from jaxprt.scene.camera import localized
-from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.protocol import System
+from jaxprt.relit import canvas, interpolation, tracing
+from jaxprt.relit.groups import Arriving, Stage, Surface
+from jaxprt.relit.surface import Viewed, carried, lit, view
+from jaxprt.relit.tracing import Reflections
+from jaxprt.scene import Camera, Environment
+from jaxprt.scene.material_table import Look
+from jaxprt.scene.points import Points
 
 # Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
 SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
 _ERROR = 0.01  # RMS error of interpolated radiance above which radiance is computed at the pixels
 
 
-class PartPixels(eqx.Module):
-    """The points of a picture that lie on one part.
+class Row(eqx.Module):
+    """Points of a picture on one group that are shaded together.
 
     Attributes:
-        number: Index of the part.
-        at_pixels: Whether radiance is computed at the points. If not, it is computed at the vertices and interpolated.
-        index: Indices of the points among all points of the picture, in rows that are shaded together; -1 is padding.
-        kept: What `look` returns for each row; None if it is recomputed for each light.
+        number: Index of the group.
+        samples: Number of sample points along the edge of each bright texel.
+        interpolated: Whether radiance is interpolated between vertices, and not computed at the points.
+        index: Indices of the points among all points of the picture; -1 is padding.
+        kept: What does not depend on the light; None if it is computed anew for each light.
     """
 
     number: int = eqx.field(static=True)
-    at_pixels: bool = eqx.field(static=True)
-    index: Int[Array, "m p"]
-    kept: tuple[PyTree, ...] | None
+    samples: int = eqx.field(static=True)
+    interpolated: bool = eqx.field(static=True)
+    index: Int[Array | np.ndarray, " p"]
+    kept: Viewed | None
+
+
+class VertexRow(eqx.Module):
+    """Vertices of a group from which one channel of its BRDF is interpolated.
+
+    Attributes:
+        number: Index of the group.
+        channel: Index of the channel.
+        vertex: Indices of the vertices in the group.
+        kept: What does not depend on the light; None if it is computed anew for each light.
+        points: The vertices as points of the scene and of the group.
+    """
+
+    number: int = eqx.field(static=True)
+    channel: int = eqx.field(static=True)
+    vertex: Int[np.ndarray, " p"]
+    points: tuple[Points, Points]
+    kept: Viewed | None
 
 
 class PictureView(eqx.Module):
     """All of a picture that does not depend on the light; `RelitScene.picture_view` makes it.
 
     Attributes:
-        mesh: The mesh of all parts.
-        system: The system of all parts.
+        stage: The scene and its materials.
+        arriving: Function from an environment to the light that arrives at the scene.
         camera: The camera of the drawn pixels.
-        surface: One `Surface` for each part.
-        canvas: The points that are shaded, and their pixels.
+        pixels: The points of the picture.
+        ray: Unit direction in world space from the eye through the center of each drawn pixel.
+        rows: The points in rows that are shaded together.
+        vertices: Vertices between which radiance is interpolated, in rows that are shaded together.
+        reflected: Traced reflections of the points of sharp groups, in the order of their rows; None without.
         fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
-        part: The points of each part that the picture shows.
-        lamp: Radiance of each lamp; None without lamps.
-        reflected: Traced reflections of the sharp parts, one entry for each row of points; None without.
     """
 
-    mesh: Mesh
-    system: System
+    stage: Stage
+    arriving: Callable[[Environment], Arriving]
     camera: Camera
-    surface: tuple[Surface, ...]
-    canvas: Canvas
-    part: tuple[PartPixels, ...]
-    lamp: Float[Array, "n 3"] | None
-    reflected: tracing.Reflections | None = None
+    pixels: Pixels
+    ray: Float[Array, "h w 3"]
+    rows: tuple[Row, ...]
+    vertices: tuple[VertexRow, ...]
+    reflected: Reflections | None = None
     fold: int = eqx.field(static=True, default=1)
 
     @promoted
@@ -85,55 +105,68 @@ class PictureView(eqx.Module):
         require.colors("the light", environment.radiance)
         if environment.radiance.ndim != 4:
             raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
-        blends = [each.appearance.blend for each in self.surface]
-        arriving = finished(self.system.shade(self.system.light(environment), blends), between)
-        if self.surface[0].reflecting is None:
-            arriving = arriving, [None] * len(self.surface)
-        direct, reflected = arriving
-        arrived = ((own, (direct[own.number], reflected[own.number], self.lamp)) for own in self.part)
-        rows = [self._rows(*each, between) for each in arrived]
-        if self.reflected is not None:
-            plain = [tracing.flattened(each) for each in self.surface]
-            more = iter(self.reflected.radiance(plain, (direct, reflected), self.lamp))
-            sharp = [isinstance(self.surface[own.number].reflecting, SharpPart) for own in self.part]
-            rows = [
-                each + jnp.stack([next(more) for _ in each]) if traced else each
-                for each, traced in zip(rows, sharp, strict=True)
-            ]
-        return _folded(drawn(self.canvas, rows, environment), fold=self.fold)
+        arriving = finished(self.arriving(environment), between)
+        vertices = self._vertices(arriving, between)
+        traced = iter(()) if self.reflected is None else iter(self.reflected.radiance(self.stage, arriving))
+        colors = environment.radiance.shape[-1]
+        rows: list[tuple[Any, Array]] = []
+        for row in self.rows:
+            color = self._color(row, arriving, vertices)
+            if self.stage.is_sharp(row.number):
+                color = color + next(traced)
+            rows.append((row.index, finished(color, between)))
+            colors = max(colors, color.shape[-1])
+        picture = canvas.sky(environment, self.ray, self.pixels.background, colors=colors)
+        for index, color in rows:
+            picture = canvas.drawn(picture, self.pixels, index, color)
+        return picture if self.fold == 1 else _folded(picture, fold=self.fold)
 
-    def _rows(
-        self, own: PartPixels, arriving: tuple[PyTree, PyTree, PyTree], between: Between
-    ) -> Float[Array, "m p c"]:
-        """Colors of the points of a part."""
-        make_room()
-        surface, eye = self.surface[own.number], self.camera.eye
-        vertices = None if own.at_pixels else finished(at_vertices(surface, arriving, eye), between)
-        if own.kept is not None:
-            return jnp.stack([finished(lit(surface, arriving, vertices, view), between) for view in own.kept])
+    def _color(self, row: Row, arriving: Arriving, vertices: dict[int, Array]) -> Float[Array, "p c"]:
+        """Colors of the points of a row."""
+        surface, stage = self.stage.surfaces[row.number].sampled(row.samples), self.stage
+        if isinstance(row.index, Tracer):
+            return self._color_of_some(row, arriving)
+        if row.interpolated:
+            points, own = self._points(row.index)
+            return carried(surface, vertices[row.number], own, stage.look(points), stage.given[row.number])
+        if row.kept is not None:
+            return lit(surface, arriving.at(row.number), row.kept)
+        shade = partial(self._shaded, surface, row)
+        return (shade if known(arriving, stage, self.camera) else jax.checkpoint(shade))(arriving)
 
-        def row(index):
-            points = points_of(self.canvas.pixels, self.mesh.face, surface.first, index)
-            return finished(shaded(surface, arriving, vertices, points, eye, at_pixels=own.at_pixels), between)
+    def _shaded(self, surface: Surface, row: Row, arriving: Arriving) -> Float[Array, "p c"]:
+        points, own = self._points(row.index)
+        seen = _seen(self.stage, surface, row.number, points, own, self.camera)
+        return lit(surface, arriving.at(row.number), seen)
 
-        if not isinstance(own.index, Tracer):
-            return jnp.stack([row(index) for index in own.index])
-        shape = jax.eval_shape(row, own.index[0])
+    def _color_of_some(self, row: Row, arriving: Arriving) -> Float[Array, "p c"]:
+        """`_color` inside of `jax.jit`, where most rows may be padding alone."""
+        surface = self.stage.surfaces[row.number].sampled(row.samples)
+        shape = jax.eval_shape(lambda: self._shaded(surface, row, arriving))
+        none = jnp.zeros(shape.shape, shape.dtype)
+        shade = jax.checkpoint(partial(self._shaded, surface, row))
+        return jax.lax.cond(jnp.any(row.index >= 0), shade, lambda _: none, arriving)
 
-        def some(index):
-            none = jnp.zeros(shape.shape, shape.dtype)
-            return jax.lax.cond(jnp.any(index >= 0), lambda: row(index), lambda: none)
+    def _points(self, index: Any) -> tuple[Points, Points]:
+        return canvas.points_of(self.pixels, self.stage.face, self.stage.shift, index)
 
-        return jax.lax.map(some, own.index)
+    def _vertices(self, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
+        """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
+        colors: dict[int, np.ndarray] = {}
+        for row in self.vertices:
+            surface = self.stage.surfaces[row.number]
+            seen = _seen_alone(self.stage, row, self.camera) if row.kept is None else row.kept
+            color = np.asarray(finished(lit(surface, arriving.at(row.number), seen), between))
+            shape = (surface.channels, self.stage.place.size[row.number], color.shape[1])
+            colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
+        return {number: put(color) for number, color in colors.items()}
 
 
 def make(
-    mesh: Mesh,
-    system: System,
-    surfaces: Sequence[Surface],
+    stage: Stage,
+    arriving: Callable[[Environment], Arriving],
     camera: Camera,
     *,
-    lamp: Float[Array, "n 3"] | None,
     samples: int,
     keep: bool,
     between: Between,
@@ -141,11 +174,9 @@ def make(
     """Finds the shaded points of a picture, and computes what depends on the camera and the materials.
 
     Args:
-        mesh: The mesh of all parts; its regions are the indices of the parts.
-        system: The system of all parts.
-        surfaces: One `Surface` for each part.
-        camera: The camera.
-        lamp: Radiance of each lamp; None without lamps.
+        stage: The scene and its materials.
+        arriving: Function from an environment to the light that arrives at the scene.
+        camera: The camera, relative to the origin of the scene.
         samples: Number of coverage samples of each pixel: 1, 4 or 16.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
         between: Function that is called between steps of the work, as in `RelitScene.picture`.
@@ -156,27 +187,51 @@ def make(
     if type(samples) is not int or samples not in SAMPLES:
         raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
     samples, fold = SAMPLES[samples]
-    mesh, camera = localized(mesh, camera)
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
-    if not any(isinstance(each.reflecting, SharpPart) for each in surfaces):
-        pixels, rows = _placed(mesh, surfaces, camera, samples, between)
-    else:
-        with tracing.now(mesh, camera, [each.curvature for each in surfaces]):
-            pixels, rows = _placed(mesh, surfaces, camera, samples, between)
-    parts, asked = [], []
-    for number, at_pixels, index in rows:
-        surface, kept = surfaces[number], None
-        with tracing.now(pixels, mesh.face, index):
-            points = [points_of(pixels, mesh.face, surface.first, each) for each in index]
-        if keep and not isinstance(index, Tracer):
-            kept = tuple(look(surface, each, camera.eye, at_pixels=at_pixels) for each in points)
-        parts.append(PartPixels(number, at_pixels, index, kept))
-        if isinstance(surface.reflecting, SharpPart):
-            looks = (at_points(surface.part, surface.shading, surface.material, each) for each in points)
-            asked += [tracing.Asked(number, *each) for each in zip((look.blend for look in looks), points, strict=True)]
-    canvas = lay_out(pixels, [each.index for each in parts], camera)
-    reflected = tracing.trace(mesh, surfaces, asked, jnp.asarray(camera.eye), keep=keep) if asked else None
-    return PictureView(mesh, system, camera, tuple(surfaces), canvas, tuple(parts), lamp, reflected, fold)
+    with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
+        pixels, rows, between_vertices = _placed(stage, camera, samples, between)
+    made, asked = [], []
+    for row in rows:
+        surface = stage.surfaces[row.number].sampled(row.samples)
+        points, own = canvas.points_of(pixels, stage.face, stage.shift, row.index)
+        if keep and not row.interpolated and not isinstance(row.index, Tracer):
+            row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
+        if stage.is_sharp(row.number):
+            blend = stage.blend(row.number, points, own)
+            asked.append(tracing.Asked(row.number, points, own, blend, stage.sharp_at(row.number, points)))
+        made.append(row)
+    reflected = tracing.trace(stage, asked, jnp.asarray(camera.eye), keep=keep) if asked else None
+    ray = raster.ray_direction(camera)
+    vertices = tuple(_vertex_rows(stage, between_vertices, camera, keep=keep))
+    return PictureView(stage, arriving, camera, pixels, ray, tuple(made), vertices, reflected, fold)
+
+
+def _vertex_rows(
+    stage: Stage, interpolated: Sequence[Sequence[int]], camera: Camera, *, keep: bool
+) -> Iterator[VertexRow]:
+    """The vertices of the parts of each group that are interpolated, in rows, once for each channel."""
+    for number, parts in enumerate(interpolated):
+        for vertex, points, own in stage.vertices(parts) if parts else ():
+            for channel in range(stage.surfaces[number].channels):
+                row = VertexRow(number, channel, vertex, (points, own), None)
+                yield dataclasses.replace(row, kept=_seen_alone(stage, row, camera)) if keep else row
+
+
+def _seen_alone(stage: Stage, row: VertexRow, camera: Camera) -> Viewed:
+    """What does not depend on the light, at vertices with one channel of the BRDF alone."""
+    points, own = row.points
+    alone = stage.alone(row.number, stage.look(points), row.channel)
+    return _seen(stage, stage.surfaces[row.number], row.number, points, own, camera, alone)
+
+
+def _seen(
+    stage: Stage, surface: Surface, number: int, points: Points, own: Points, camera: Camera, look: Look | None = None
+) -> Viewed:
+    """What does not depend on the light, for a row of points with their materials, or others."""
+    look = stage.look(points) if look is None else look
+    given, sharp = stage.given[number], stage.sharp_at(number, points)
+    # The view does not depend on the samples of bright texels.
+    return view(surface.sampled(1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp)
 
 
 @partial(jit, static_argnames="fold")
@@ -187,48 +242,63 @@ def _folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c
 
 
 def _placed(
-    mesh: Mesh, surfaces: Sequence[Surface], camera: Camera, samples: int, between: Between
-) -> tuple[Pixels, list[tuple[int, bool, Array]]]:
-    """The points of a picture. For each visible part: its index, whether to shade at its points, and their indices."""
-    bend = _bends([each.curvature for each in surfaces], mesh.region)
-    fragments = finished(rasterize(mesh, camera, samples=samples), between)
-    pixels = shading_points(fragments, mesh, camera, uneven=interpolation.uneven(mesh, camera, bend))
+    stage: Stage, camera: Camera, samples: int, between: Between
+) -> tuple[Pixels, list[Row], tuple[tuple[int, ...], ...]]:
+    """The points of a picture in rows that are shaded alike, and the parts of each group that are interpolated."""
+    fragments = finished(rasterize(stage.mesh, camera, samples=samples), between)
+    uneven = interpolation.uneven(stage.mesh, camera, stage.bend)
+    pixels = shading_points(fragments, stage.mesh, camera, uneven=uneven)
     finished(pixels, between)
-    owner, wrong = _judged(mesh, bend, pixels, camera)
-    rows = []
-    for number, surface in enumerate(surfaces):
-        index = rows_of(owner == number)
-        if index.size:
-            rows.append((number, _pays(surface, wrong, index), index))
-    return pixels, rows
+    if not known(pixels, stage.mesh):
+        return pixels, list(_traced_rows(stage, pixels)), ((),) * len(stage.surfaces)
+    triangle = np.asarray(pixels.triangle)
+    owner = np.where(triangle >= 0, stage.part[stage.face[np.maximum(triangle, 0), 0]], -1)
+    interpolated = _interpolated(stage, owner, triangle, camera)
+    return pixels, list(_rows(stage, owner, interpolated)), interpolated
 
 
-@jit
-def _bends(curvature: Sequence[Array], region: Int[Array, " v"]) -> Float[Array, " v"]:
-    """Curvature of the radiance of each vertex's part."""
-    return jnp.stack(curvature)[region]
+def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
+    """The points in rows by group, inside of `jax.jit`: as many rows for each group as if it had all points."""
+    first = jnp.asarray(stage.face)[jnp.maximum(pixels.triangle, 0), 0]
+    owner = jnp.where(pixels.triangle >= 0, jnp.asarray(stage.part)[first], -1)
+    for number, own in enumerate(stage.place.parts):
+        samples = max(stage.samples[part] for part in own)
+        for index in canvas.rows_of(jnp.isin(owner, jnp.asarray(own))):
+            yield Row(number, samples, False, index, None)
 
 
-@jit
-def _judged(
-    mesh: Mesh, bend: Float[Array, " v"], pixels: Pixels, camera: Camera
-) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
-    """The part of each point (-1 in padding), and the relative error of radiance that is interpolated there."""
-    wrong = interpolation.error(mesh.position, mesh.normal, mesh.face, camera.eye, bend)
-    own = jnp.maximum(pixels.triangle, 0)
-    return jnp.where(pixels.triangle >= 0, mesh.region[mesh.face[:, 0]][own], -1), wrong[own]
+def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]) -> Iterator[Row]:
+    """The points in rows by group, number of samples, and whether radiance is interpolated."""
+    for number, own in enumerate(stage.place.parts):
+        between = interpolated[number]
+        for index in canvas.rows_of(np.isin(owner, between)):
+            yield Row(number, 1, True, index, None)
+        rest = [part for part in own if part not in between]
+        for samples in sorted({stage.samples[part] for part in rest}):
+            same = [part for part in rest if stage.samples[part] == samples]
+            for index in canvas.rows_of(np.isin(owner, same)):
+                yield Row(number, samples, False, index, None)
 
 
-def _pays(surface: Surface, wrong: Array, index: Array) -> bool:
-    """Whether to compute radiance at the points of a part.
+def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera: Camera) -> tuple[tuple[int, ...], ...]:
+    """Parts of each group whose radiance is interpolated between vertices: where that is accurate, and less work.
 
-    It is done if interpolation between vertices is too inaccurate, or if the part has more vertices than points. Not
-    for Lambertian parts, because their radiance is linear in the interpolated transfer.
+    Not for ideally diffuse groups, whose radiance is linear in the interpolated transfer, nor where users give
+    materials at vertices, nor inside of `jax.jit`.
     """
-    if isinstance(surface.shading.brdf, Lambert):
-        return False
-    if isinstance(index, Tracer) or isinstance(wrong, Tracer):
-        return True
-    used = np.asarray(index)
-    used = used[used >= 0]
-    return len(used) < surface.system.vertices or bool(np.mean(np.asarray(wrong)[used] ** 2) > _ERROR**2)
+    nothing = ((),) * len(stage.surfaces)
+    if not known(camera, stage.bend):
+        return nothing
+    place, seen = stage.place, np.bincount(owner[owner >= 0], minlength=len(stage.samples))
+    free = [not surface.matte and given is None for surface, given in zip(stage.surfaces, stage.given, strict=True)]
+    channels = [surface.channels for surface in stage.surfaces]
+    may = [
+        free[group] and count > channels[group] * n
+        for count, group, n in zip(seen, place.group, place.counts, strict=True)
+    ]
+    if not any(may):
+        return nothing
+    wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
+    square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
+    good = np.asarray(may) & (square <= _ERROR**2 * seen)
+    return tuple(tuple(part for part in own if good[part]) for own in place.parts)

@@ -1,4 +1,4 @@
-"""Chooses the system and its parameters for each part of a scene, with the fewest bytes that meet a given error.
+"""Chooses the system of each group of parts, and its parameters: the one with the fewest bytes that meets an error.
 
 Candidate recipes are run on a sample of each part's vertices. Their error is measured against the exact sum over all
 texels, from eight views, under every light. Bytes and times of the sample are scaled to the whole part.
@@ -21,8 +21,7 @@ from jaxprt import require
 from jaxprt.brdf import Lambert
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import reflection
-from jaxprt.relit.channels import of_part
+from jaxprt.relit import channels, groups, reflection
 from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
@@ -54,19 +53,19 @@ _SIZES = (
 _TERMS = tuple(Clusters(*each, members=MEMBERS) for each in _SIZES)
 
 
-class PartPlan(eqx.Module):
-    """The plan of one part.
+class GroupPlan(eqx.Module):
+    """The plan of one group: all parts with materials of one kind.
 
     Attributes:
-        name: Name of the part.
-        vertices: Number of vertices of the part.
+        names: Names of the parts.
+        vertices: Number of vertices of all of them.
         mesh_error: Relative L2 error that the mesh adds in any system, under the worst of the lights. It comes from
             shadows that are finer than the triangles.
         chosen: The chosen candidate.
         considered: All candidates, in the order in which they were measured.
     """
 
-    name: str
+    names: tuple[str, ...] = eqx.field(static=True)
     vertices: int
     mesh_error: float
     chosen: Candidate
@@ -77,7 +76,8 @@ class Plan(eqx.Module):
     """The plan of a scene; `print` shows it as a table.
 
     Attributes:
-        part: One plan for each part of the scene.
+        names: Names of the parts.
+        group: One plan for each group of parts.
         reflected: Fraction of each part's radiance (column) that was reflected by other surfaces at least once (row 0),
             twice (row 1) and three times (row 2). Relative L2, estimated for diffuse surfaces.
         bounces: Smallest number of bounces that omits at most `asked` of the radiance of every part: 0, 1, 2 or "all".
@@ -87,7 +87,8 @@ class Plan(eqx.Module):
         key: Fingerprint of the scene and the lights. A stored plan with another fingerprint is refused.
     """
 
-    part: tuple[PartPlan, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    group: tuple[GroupPlan, ...]
     reflected: Float[np.ndarray, "b p"]
     bounces: int | str
     asked: float
@@ -97,36 +98,36 @@ class Plan(eqx.Module):
 
     @property
     def error(self) -> float:
-        """Predicted relative L2 error of the part with the largest error."""
-        return max(each.chosen.error for each in self.part)
+        """Predicted relative L2 error of the group with the largest error."""
+        return max(each.chosen.error for each in self.group)
 
     @property
     def seconds(self) -> float:
         """Time of a frame with a new light and a new view on this machine, without rasterization."""
-        return sum(each.chosen.seconds for each in self.part)
+        return sum(each.chosen.seconds for each in self.group)
 
     @property
     def nbytes(self) -> int:
         """Size of transport and BRDFs in bytes, without the data of bounces."""
-        return sum(each.chosen.nbytes for each in self.part)
+        return sum(each.chosen.nbytes for each in self.group)
 
     @property
     def recipes(self) -> dict[str, Recipe]:
         """The recipe of each part, for `jaxprt.precompute`."""
-        return {each.name: each.chosen.recipe for each in self.part}
+        return {name: group.chosen.recipe for group in self.group for name in group.names}
 
     def __str__(self) -> str:
         """The table of all candidates; a star marks the chosen one."""
         rows = [f"error asked {100 * self.asked:g} %, {self.rate:g} frames per second"]
-        for part in self.part:
-            rows.append(f"{part.name}: {part.vertices} vertices")
-            chosen = repr(part.chosen.recipe)  # In a plan loaded from a file, `chosen` is a copy: compare by value.
-            rows += [f"  {'*' if repr(each.recipe) == chosen else ' '} {each}" for each in part.considered]
-            advice = "; `jaxprt.refine` divides its triangles" if part.mesh_error > self.asked else ""
-            rows.append(f"    {100 * part.mesh_error:.1f} % of shadows between its vertices{advice}")
-        for part, (once, twice, often) in zip(self.part, 100 * self.reflected.T, strict=True):
+        for group in self.group:
+            rows.append(f"{', '.join(group.names)}: {group.vertices} vertices")
+            chosen = repr(group.chosen.recipe)  # In a plan loaded from a file, `chosen` is a copy: compare by value.
+            rows += [f"  {'*' if repr(each.recipe) == chosen else ' '} {each}" for each in group.considered]
+            advice = "; `jaxprt.refine` divides its triangles" if group.mesh_error > self.asked else ""
+            rows.append(f"    {100 * group.mesh_error:.1f} % of shadows between its vertices{advice}")
+        for name, (once, twice, often) in zip(self.names, 100 * self.reflected.T, strict=True):
             rows.append(
-                f"{part.name}: {once:.1f} % of its light is reflected, {twice:.1f} % twice or more, "
+                f"{name}: {once:.1f} % of its light is reflected, {twice:.1f} % twice or more, "
                 f"{often:.1f} % three times or more"
             )
         rows.append(f"bounces: {self.bounces}")
@@ -159,7 +160,7 @@ def plan(
         environments: Environments under which the error must hold, all of one size. If None, those of the scene, or the
             two built-in ones if it has none.
         error: Largest relative L2 error of the radiance of each part, at the vertices and between them. It does not
-            include shadows that are finer than the triangles; see `PartPlan.mesh_error`. If None, it is 0.05 for each
+            include shadows that are finer than the triangles; see `GroupPlan.mesh_error`. If None, it is 0.05 for each
             part where a system reaches that. For other parts the system with the smallest error is chosen, with a
             warning.
         rate: Frames per second for the whole scene, each with a new light and a new view, without rasterization.
@@ -183,39 +184,45 @@ def plan(
     asked = ERROR if error is None else error
     size = checked(environments, asked, rate)
     mesh, views = scene.mesh, views_around(scene.mesh)
-    total, parts = len(mesh.position), []
-    shadings, key = [of_part(part) for part in scene.parts], key_of(scene, environments)
-    pairs = enumerate(zip(scene.parts, shadings, strict=True))
-    for number, (part, shading) in tqdm.tqdm(
-        pairs, desc="plan", unit="part", total=len(shadings), disable=not progress
-    ):
-        sample = Sample.make(part, shading, mesh, total, size, environments, views)
-        count = len(part.mesh.position)
+    total, plans = len(mesh.position), []
+    looks = channels.looks(scene.parts)
+    shadings = [channels.of_part(part, look=look) for part, look in zip(scene.parts, looks, strict=True)]
+    key = key_of(scene, environments)
+    parts = groups.kinds(shadings, [_LOBES[0]] * len(shadings))
+    for number, own in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
+        members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)
+        sample = Sample.make(members, [shadings[part] for part in own], mesh, total, size, environments, views)
+        count = len(sample.shading.mesh.position)
         kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
-        considered = tuple(_considered(sample, kept, asked, count / total / rate))
+        alone = None
+        if len(own) == 1:
+            alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=_TERMS[0].takes))
+        considered = tuple(_considered(sample, alone, kept, asked, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= asked]
         if not good:
             best = min(considered, key=lambda each: each.error)
-            _unmet(part.name, best, error)
+            _unmet(names, best, error)
             good = [best]
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
-        parts.append(PartPlan(part.name, count, sample.mesh_error, chosen, considered))
+        plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
     reflected = reflection.fractions(shadings, environments)
     bounces = reflection.needed(reflected, asked)
-    return Plan(tuple(parts), reflected, bounces, float(asked), float(rate), size, key)
+    names = tuple(part.name for part in scene.parts)
+    return Plan(names, tuple(plans), reflected, bounces, float(asked), float(rate), size, key)
 
 
-def _unmet(name: str, best: Candidate, error: float | None) -> None:
-    """Refuses a part for which no system meets a given error; warns if none was given."""
+def _unmet(names: Sequence[str], best: Candidate, error: float | None) -> None:
+    """Refuses a group for which no system meets a given error; warns if none was given."""
     least = best.error * MARGIN
+    name = f"part {names[0]!r}" if len(names) == 1 else f"parts {', '.join(map(repr, names))}"
     if error is not None:
         raise ValueError(
-            f"error must be at least {least:.3g} for part {name!r}, which {best.recipe} reaches; got {error}. "
+            f"error must be at least {least:.3g} for {name}, which {best.recipe} reaches; got {error}. "
             "Ask for a larger error, or name a system"
         )
     warnings.warn(
-        f"no system reaches an error of {100 * ERROR:g} % for part {name!r}: {best.recipe} is chosen, which reaches "
+        f"no system reaches an error of {100 * ERROR:g} % for {name}: {best.recipe} is chosen, which reaches "
         f"{100 * least:.1f} %",
         stacklevel=3,
     )
@@ -233,8 +240,10 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
     return blocks.fingerprint(np.frombuffer(kinds.encode(), np.uint8), *arrays)
 
 
-def _considered(sample: Sample, folder: pathlib.Path | None, error: float, seconds: float):
+def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | None, error: float, seconds: float):
     """Measures candidates of each system: a bisection along its ladder, to the first step that meets the error.
+
+    `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
 
     Some steps are skipped: those with more bytes than a candidate that already meets the error (twice as many if that
     candidate is too slow); those close to a step that misses the error by far; and those of a system whose smallest
@@ -243,14 +252,18 @@ def _considered(sample: Sample, folder: pathlib.Path | None, error: float, secon
     if isinstance(sample.shading.brdf, Lambert):
         ladders: list[tuple] = [_DIFFUSE]
     else:
-        ladders = [_HARMONIC, _LOBES] + ([] if sample.shading.knot else [_TERMS])
+        ladders = [_HARMONIC, _LOBES] + ([] if alone is None else [_TERMS])
+    table = sample.shading.table
+    if table is not None:
+        ladders = [tuple(each for each in own if own is _TERMS or each.takes(table)) for own in ladders]
     most = math.inf  # largest number of bytes that is worth measuring
     for ladder in ladders:
         least = [sample.least_bytes(recipe) for recipe in ladder]
         low, high = 0, sum(each <= most for each in least)
         while low < high:  # Assumption: from one step to the next, the error decreases by at most half.
             middle = (low + high) // 2
-            each = _measured(sample, ladder[middle], folder)
+            own = alone if alone is not None and isinstance(ladder[middle], Clusters) else sample
+            each = _measured(own, ladder[middle], folder)
             yield each
             if each.error * MARGIN > error:
                 halvings = math.log2(min(each.error, 1e6) * MARGIN / error)

@@ -4,9 +4,9 @@ import dataclasses
 import functools
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from typing import Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,13 +15,15 @@ import numpy as np
 from jaxprt import require, visibility
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.kept import kept
 from jaxprt.scene import Mesh
-from jaxprt.systems import bright_texels, harmonic, lobe, separable
+from jaxprt.systems import axes, bright_texels, harmonic, lobe, separable, standard
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
-from jaxprt.visibility import StoredVisibility
+from jaxprt.systems.standard import StandardTable
+from jaxprt.visibility import StoredVisibility, UnfinishedError
+
+T = TypeVar("T")
 
 _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low degrees
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
@@ -88,13 +90,52 @@ class Target:
         return {"occluder": self.occluder, "vertex": self.vertex}
 
 
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A mesh whose rays start together, and where and how to trace them.
+
+    Attributes:
+        mesh: The mesh of a part.
+        target: What casts shadows, and where and how to compute.
+    """
+
+    mesh: Mesh
+    target: Target
+
+
 @runtime_checkable
 class Recipe(Protocol):
-    """The parameters of a system, and the method that precomputes it for a part."""
+    """The parameters of a system, and the method that precomputes it for parts of one kind.
 
-    def make(self, shading: Shading, target: Target) -> System:
-        """Precomputes the system of a part."""
+    Attributes:
+        joins: Whether parts with one BRDF share a system.
+    """
+
+    joins: ClassVar[bool]
+
+    def takes(self, table: StandardTable) -> bool:
+        """Whether the system reads a standard table; otherwise parts have BRDFs of their own."""
         ...
+
+    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
+        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
+        ...
+
+
+def _joined(pieces: Sequence[Piece], vertices: int | None, trace: Callable[[Piece], T]) -> T:
+    """The transport of all pieces. Those that other machines have not finished are reported together."""
+    made, unfinished = [], []
+    for piece in pieces:
+        try:
+            made.append(trace(piece))
+        except UnfinishedError as others:  # Go on with the next part of the scene.
+            unfinished.append(others)
+    if unfinished:
+        raise UnfinishedError("; ".join(map(str, unfinished)))
+    if len(made) == 1 and vertices is None:
+        return made[0]
+    count = sum(len(piece.mesh.position) for piece in pieces)
+    return axes.joined(made, size=count if vertices is None else vertices)
 
 
 class Lobes(eqx.Module):
@@ -106,21 +147,23 @@ class Lobes(eqx.Module):
             many, because a texel costs it only about 1/30 as much; every bright light source then has a sharp shadow.
     """
 
+    joins: ClassVar = True
+
     lobes: int = 12
     texels: int = 16
 
-    def make(self, shading: Shading, target: Target) -> System:
-        """Precomputes the system of a part."""
-        if target.known is None:
-            transport = lobe.precompute(shading.mesh, size=target.size, **target.traced(), **target.options("lobe"))
-        else:
-            transport = target.known.pyramid
+    def takes(self, table: StandardTable) -> bool:
+        """Whether a table with this number of lobes is shipped."""
+        return self.lobes in table.counts
+
+    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
+        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
+        transport = _joined(pieces, vertices, _pyramid)
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
             matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
-        path = None if target.path is None else pathlib.Path(f"{target.path}_table_{self.lobes}.prt")
-        table = lobe_table(shading, self.lobes, path)
+        table = lobe_table(shading, self.lobes)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
@@ -141,18 +184,30 @@ class Harmonics(eqx.Module):
             Not used for Lambertian parts.
     """
 
+    joins: ClassVar = True
+
     degree: int = 4
     laplacian: float = 1.0
 
-    def make(self, shading: Shading, target: Target) -> System:
-        """Precomputes the system of a part."""
-        options = {"degree": self.degree, "size": min(target.size, _HARMONIC_SIZE), **target.traced()}
+    def takes(self, table: StandardTable) -> bool:
+        """Whether a table of this degree is shipped."""
+        return self.degree <= standard.DEGREE
+
+    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
+        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
+        matte = isinstance(shading.brdf, Lambert)
+        trace = harmonic.precompute_diffuse if matte else harmonic.precompute
+        store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
+
+        def one(piece: Piece) -> Any:
+            size = min(piece.target.size, _HARMONIC_SIZE)
+            options = piece.target.traced() | piece.target.options(store)
+            return trace(piece.mesh, degree=self.degree, size=size, **options)
+
+        transport = _joined(pieces, vertices, one)
         if isinstance(shading.brdf, Lambert):
-            vectors = harmonic.precompute_diffuse(shading.mesh, **options, **target.options(f"vectors_{self.degree}"))
-            return harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
-        table = harmonic_table(shading, degree=self.degree)
-        matrices = harmonic.precompute(shading.mesh, **options, **target.options(f"matrices_{self.degree}"))
-        return harmonic.HarmonicSystem(matrices, table, self.laplacian)
+            return harmonic.DiffuseSystem(transport, shading.brdf.albedo)
+        return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the transfer vectors or matrices."""
@@ -169,18 +224,25 @@ class Terms(eqx.Module):
         resolution: Edge of the maps of the terms in texels.
     """
 
+    joins: ClassVar = False
+
     terms: int = 4
     keep: int = 96
     resolution: int = 48
 
-    def make(self, shading: Shading, target: Target) -> System:
+    def takes(self, table: StandardTable) -> bool:
+        """Never: one BRDF is factored."""
+        return False
+
+    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
         check(self, shading)
+        mesh, target = pieces[0].mesh, pieces[0].target
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
         keep = min(self.keep, 6 * target.size**2)
         options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
-        return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
+        return separable.SeparableSystem(separable.precompute(mesh, factored, **options), factored)
 
 
 class Clusters(eqx.Module):
@@ -196,6 +258,8 @@ class Clusters(eqx.Module):
         members: Approximate number of vertices of a cluster.
     """
 
+    joins: ClassVar = False
+
     terms: int = 32
     resolution: int = 64
     components: int = 16
@@ -204,13 +268,18 @@ class Clusters(eqx.Module):
     texels: int = 16
     members: int = 225
 
-    def make(self, shading: Shading, target: Target) -> System:
+    def takes(self, table: StandardTable) -> bool:
+        """Never: one BRDF is factored."""
+        return False
+
+    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
         check(self, shading)
+        mesh, target = pieces[0].mesh, pieces[0].target
         known = target.known
         if known is None:
             options = {**target.traced(), **target.options("visibility")}
-            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
+            known = Known(visibility.precompute(mesh, size=target.size, **options))
         visible = known.visible
         clusters, terms, sizes = self._sizes(shading, len(visible.position), visible.size)
         factored = known.factored(shading.brdf, terms, self.resolution)
@@ -243,24 +312,46 @@ SYSTEMS: dict[str, Recipe] = {
 }
 
 
+def _pyramid(piece: Piece) -> LobeTransport:
+    """The visibility pyramids of a piece."""
+    target = piece.target
+    if target.known is not None:
+        return target.known.pyramid
+    return lobe.precompute(piece.mesh, size=target.size, **target.traced(), **target.options("lobe"))
+
+
 def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:
     """The system with an exact sum over the brightest texels, if there are any."""
     texels = min(texels, 6 * size * size - 1)
     if not texels:
         return system
-    sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
-    samples = bright_texels.samples_for(sharpest, size=size)
+    samples = samples_of(shading, size)
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
 
 
-def lobe_table(shading: Shading, lobes: int, path: pathlib.Path | None) -> lobe.LobeBrdf:
-    """The BRDF of a part as a table of lobes, over roughness if that varies; stored in a folder if one is given."""
-    key = shading.brdf, shading.knot, lobes
-    return kept(path, key, lambda: lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot))
+def samples_of(shading: Shading, size: int) -> int:
+    """Number of points along the edge of a bright texel at which the BRDF of a part is evaluated."""
+    if shading.matte:
+        return 1
+    if shading.table is not None:
+        assert shading.blend is not None
+        return shading.table.samples(float(np.min(np.asarray(shading.blend.parameter[0]))), size)
+    sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
+    return bright_texels.samples_for(sharpest, size=size)
+
+
+def lobe_table(shading: Shading, lobes: int) -> lobe.LobeBrdf:
+    """The BRDF of a part as a table of lobes, over roughness if that varies."""
+    if shading.table is not None:
+        counts = shading.table.counts
+        return shading.table.lobes(lobes if lobes in counts else min(counts, key=lambda each: abs(each - lobes)))
+    return lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot)
 
 
 def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:
     """The BRDF of a part as a table of harmonics, over roughness if that varies."""
+    if shading.table is not None:
+        return shading.table.harmonics(degree)
     if not shading.knot:
         return harmonic.tabulate(shading.brdf, degree=degree)
     # Lobes are moved and widened between knots. Harmonics are interpolated linearly, so they need more knots.

@@ -1,31 +1,26 @@
 """Light that the parts of a scene reflect onto each other: estimates of its size, and its precomputation."""
 
-import pathlib
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TypeVar
+from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import Lambert
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
+from jaxprt.relit.groups import Place
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment, Mesh
-from jaxprt.scene.mesh import join
-from jaxprt.sphere import directions
+from jaxprt.scene.mesh import frames, join
 from jaxprt.systems import bounces, harmonic
-from jaxprt.systems.bounces import PartBounces, ReflectingPart, traced
+from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import TransferVector
 from jaxprt.systems.lobe import LobeBrdf, LobeSystem
 from jaxprt.systems.protocol import System
-
-T = TypeVar("T")
 
 ALL = bounces.build.ALL
 _EACH = 3  # number of bounces that are estimated one by one; further ones are extrapolated as a geometric series
@@ -52,52 +47,66 @@ def check(count: int | str | None) -> None:
         raise ValueError(f"bounces must be at least 0, and below 2^31, or {ALL!r}, got {count}")
 
 
-def make(shadings: Sequence[Shading], count: int | str, target: Target) -> PartBounces:
+def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Target) -> GroupBounces:
     """Precomputes the light that all parts reflect onto each other and themselves.
 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
+        place: Where the vertices of the parts stand in their groups.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
 
     Returns:
         The system of reflected light alone.
     """
-    mesh = _joined(shadings)
-    sent = _alike(shadings, paths.factored)
-    tables = _alike(shadings, partial(harmonic_table, degree=DEGREE))
+    mesh, first = _joined(shadings), [shadings[own[0]] for own in place.parts]
+    of_group = [paths.factored(shading) for shading in first]
+    sent = [of_group[number] for number in place.group]
     weights = [paths.typical(*each) for each in zip(shadings, sent, strict=True)]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(mesh, [each.brdf for each in sent], weights=weights, bounces=count, **options)
-    frame = [directions.frame(each.mesh.normal, each.mesh.tangent) for each in shadings]
-    parts = [
-        ReflectingPart(each.mesh.position, axes, table, sent=path.sent)
-        for each, axes, table, path in zip(shadings, frame, tables, sent, strict=True)
-    ]
-    return PartBounces(tensor, tuple(parts))
+    groups = []
+    for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
+        own = [shadings[part].mesh for part in place.parts[number]]
+        frame = [frames(mesh.normal, mesh.tangent) for mesh in own]
+        position = place.column(number, [mesh.position for mesh in own])
+        table = harmonic_table(shading, degree=DEGREE)
+        position, axes = jax.device_put((position, place.column(number, frame)))
+        groups.append(ReflectingPart(position, axes, table, sent=path.sent))
+    return GroupBounces.make(tensor, groups, place.parts)
 
 
-def sharp(shadings: Sequence[Shading], systems: Sequence[System], folder: pathlib.Path | None) -> list[LobeBrdf | None]:
-    """For each part, its lobes if its reflections are traced; None if harmonics represent its reflections well enough.
+def lobes(shadings: Sequence[Shading], place: Place, systems: Sequence[System]) -> list[LobeBrdf | None]:
+    """For each group, its BRDF as lobes if some of its parts are sharp, or may become so; None for other groups.
 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
-        systems: The systems of the parts. If one has a table of lobes, it is used.
-        folder: Folder that stores tables that are made here; None stores nothing.
+        place: Where the vertices of the parts stand in their groups.
+        systems: The systems of the groups. If one has a table of lobes, it is used.
     """
     result: list[LobeBrdf | None] = []
-    for number, (shading, system) in enumerate(zip(shadings, systems, strict=True)):
-        if isinstance(shading.brdf, Lambert):
+    for own, system in zip(place.parts, systems, strict=True):
+        shading = shadings[own[0]]
+        if shading.matte:
             result.append(None)
             continue
         inner = system.system if isinstance(system, BrightTexels) else system
-        table = inner.brdf if isinstance(inner, LobeSystem) else None
-        if table is None:
-            path = None if folder is None else folder / f"{number}_sharp_{_LOBES}.prt"
-            table = lobe_table(shading, _LOBES, path)
-        result.append(table if traced.is_sharp(table) else None)
+        table = inner.brdf if isinstance(inner, LobeSystem) else lobe_table(shading, _LOBES)
+        may = shading.table is not None or any(is_sharp(shadings[part], table) for part in own)
+        result.append(table if may else None)
     return result
+
+
+def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
+    """Whether reflections of a part are too sharp for the harmonics of arriving light, so that they are traced."""
+    if table is None or shading.matte:
+        return False
+    if shading.table is not None:
+        assert shading.blend is not None
+        weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
+        return shading.table.is_sharp(float(np.min(np.asarray(shading.blend.parameter[0]))), weight)
+    return bool(traced.is_sharp(table))
 
 
 def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
@@ -146,12 +155,3 @@ def _joined(shadings: Sequence[Shading]) -> Mesh:
     """The meshes of all parts as one mesh, whose regions are the parts."""
     one = [eqx.tree_at(lambda mesh: mesh.region, each.mesh, jnp.zeros_like(each.mesh.region)) for each in shadings]
     return join(one)
-
-
-def _alike(shadings: Sequence[Shading], make: Callable[[Shading], T]) -> list[T]:
-    """The result of `make` for each part. Parts with equal BRDFs, apart from colors, share one result."""
-    known: list[tuple[Shading, T]] = []
-    for each in shadings:
-        same = [made for other, made in known if paths.alike(each, other)]
-        known.append((each, same[0] if same else make(each)))
-    return [made for _, made in known]

@@ -3,10 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from jaxprt.image import rasterize, shading_points
-from jaxprt.relit.canvas import Canvas, drawn, lay_out, points_of, rows_of
+from jaxprt.compile import put
+from jaxprt.image import raster, rasterize, shading_points
+from jaxprt.image.pixels import Pixels
+from jaxprt.relit import canvas
 from jaxprt.scene import Camera, Environment, Mesh
 from jaxprt.scene.camera import localized
 from jaxprt.scene.points import Points
@@ -20,15 +22,19 @@ class RegionsView(eqx.Module):
         system: The system.
         materials: Materials of the regions, in the form that `System.view` takes.
         camera: The camera.
-        canvas: The points that are shaded, and their pixels.
-        points: For each row that is shaded at once, the points on each region.
+        pixels: The points of the picture.
+        ray: Unit direction in world space from the eye through the center of each pixel.
+        index: For each row that is shaded at once, the indices of the points on each region; -1 in padding.
+        points: The points of each row on each region.
         kept: View of each row, in the form of the system; None if it is recomputed for each light.
     """
 
     system: System
     materials: PyTree
     camera: Camera
-    canvas: Canvas
+    pixels: Pixels
+    ray: Float[Array, "h w 3"]
+    index: tuple[Int[np.ndarray, "r p"], ...]
     points: tuple[tuple[Points, ...], ...]
     kept: tuple[PyTree, ...] | None
 
@@ -39,12 +45,16 @@ class RegionsView(eqx.Module):
             TypeError: `environment` is not an `Environment`.
             ValueError: The environment is a batch, or has another size than the system requires.
         """
-        arriving, rows = self.system.shade(self.system.light(environment), self.materials), []
+        arriving, colors = self.system.shade(self.system.light(environment), self.materials), []
         for number, points in enumerate(self.points):
             system = self.system.at(points)
             view = system.view(jnp.asarray(self.camera.eye), self.materials) if self.kept is None else self.kept[number]
-            rows.append(system.combine(arriving, view))
-        return drawn(self.canvas, rows, environment)
+            colors.append(system.combine(arriving, view))
+        most = max([environment.radiance.shape[-1], *(each.shape[-1] for each in colors)])
+        picture = canvas.sky(environment, self.ray, self.pixels.background, colors=most)
+        for index, color in zip(self.index, colors, strict=True):
+            picture = canvas.drawn(picture, self.pixels, index.reshape(-1), color)
+        return picture
 
 
 def of_regions(
@@ -66,16 +76,25 @@ def of_regions(
     pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
     region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
     owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
-    every = [np.flatnonzero(owner == number) for number in range(region.max() + 1)]
-    rows, width = rows_of(owner == np.argmax([len(each) for each in every])).shape
-    index = np.stack([np.pad(each, (0, rows * width - len(each)), constant_values=-1) for each in every])
-    index = jnp.asarray(index.reshape(len(every), rows, width).swapaxes(0, 1))
+    every = [canvas.rows_of(owner == number) for number in range(region.max() + 1)]
+    most = max(len(rows) for rows in every)
+    index = np.stack([np.pad(rows, ((0, most - len(rows)), (0, 0)), constant_values=-1) for rows in every], 1)
     # Index of each vertex among those of its region.
     place = np.zeros(len(region), np.int32)
     for number in range(len(every)):
         member = np.flatnonzero(region == number)
         place[member] = np.arange(len(member))
-    corner = jnp.asarray(place[face])
-    points = tuple(tuple(points_of(pixels, corner, 0, each) for each in row) for row in index)
+    shift = np.arange(len(region)) - place
+    points = tuple(tuple(_points(pixels, face, shift, each) for each in row) for row in index)
     kept = tuple(system.at(row).view(jnp.asarray(camera.eye), materials) for row in points) if keep else None
-    return RegionsView(system, materials, camera, lay_out(pixels, list(index), camera), points, kept)
+    return RegionsView(system, materials, camera, pixels, raster.ray_direction(camera), tuple(index), points, kept)
+
+
+def _points(pixels: Pixels, face: np.ndarray, shift: np.ndarray, index: np.ndarray) -> Points:
+    """Points on a region. A row of padding alone lies on the first vertex of the region."""
+    if index[0] < 0:
+        corner = np.zeros((3, len(index)), np.int32)
+        weight = np.zeros((3, len(index)), pixels.barycentric.dtype)
+        weight[0] = 1
+        return put(Points(corner, weight, np.zeros((2, *weight.shape), weight.dtype)))
+    return canvas.points_of(pixels, face, shift, index)[1]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,12 +14,13 @@ from jaxtyping import Array
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.relit.channels import Shading, at_points, exact_at
+from jaxprt.relit import channels, groups
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import FEWEST, JUDGED, relative_error, seconds
-from jaxprt.relit.recipes import Known, Recipe, Target
+from jaxprt.relit.recipes import Known, Piece, Recipe, Target
 from jaxprt.scene import Environment, Mesh, Part
+from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points, placed
-from jaxprt.sphere import directions
 from jaxprt.systems import protocol, reference, separable
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.protocol import Blend, System
@@ -29,7 +30,7 @@ _CLUSTERS = 24  # number of measured clusters, of all parts together: errors dif
 
 
 class Candidate(eqx.Module):
-    """Error and cost of one recipe for one part, measured on a sample.
+    """Error and cost of one recipe for one group, measured on a sample.
 
     Attributes:
         recipe: The recipe.
@@ -55,7 +56,7 @@ class Candidate(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """Some vertices of a part, points on the triangles between them, and the reference radiance of the points.
+    """Some vertices of a group of parts, points on the triangles between them, and the points' reference radiance.
 
     Attributes:
         shading: Mesh, BRDF and channel weights of the part.
@@ -86,10 +87,28 @@ class Sample:
 
     @classmethod
     def make(
-        cls, part: Part, shading: Shading, scene: Mesh, total: int, size: int, environments, views: np.ndarray
+        cls,
+        parts: Sequence[Part],
+        shadings: Sequence[Shading],
+        scene: Mesh,
+        total: int,
+        size: int,
+        environments: Sequence[Environment],
+        views: np.ndarray,
     ) -> "Sample":
-        """Chooses whole clusters of vertices, traces their visibility, and computes the reference radiance."""
-        mesh = shading.mesh
+        """Chooses whole clusters of vertices, traces their visibility, and computes the reference radiance.
+
+        Args:
+            parts: The parts of a group.
+            shadings: The `Shading` of each of them.
+            scene: The mesh of all parts of the scene.
+            total: Number of its vertices.
+            size: Edge of the lights' cubemap faces in texels.
+            environments: The lights.
+            views: Positions of the viewers.
+        """
+        mesh = join([_one_region(shading.mesh) for shading in shadings])
+        shading = dataclasses.replace(groups.joined(shadings), mesh=mesh)
         count = len(mesh.position)
         clusters = max(1, round(count / MEMBERS))
         member = separable.members.cluster(mesh.position, mesh.normal, clusters=clusters)
@@ -102,12 +121,22 @@ class Sample:
         points = _scattered(mesh, vertex, few)
         target = Target(scene, size=size, vertex=vertex, known=Known(visible), progress=False)
         whole = Points(jnp.asarray(vertex)[points.corner], points.weight)
-        blend = at_points(part, shading, None, whole).blend
+        blend, brdf = channels.materials_at(parts, shading, whole)
         level = points.carry(jnp.asarray(visible.seen(np.arange(len(vertex))), jnp.float32))
         seen = np.asarray(jnp.round(level)).astype(np.uint8)
-        facing, exact, mesh_error = _judged(part, shading, whole, seen, scene, environments, views)
+        facing, exact, mesh_error = _judged(mesh, brdf, whole, seen, scene, environments, views)
         ratio, lights = count / len(vertex), tuple(environments)
         return cls(shading, target, ratio, points, blend, facing, exact, mesh_error, lights, views, seconds)
+
+    def alone(self, part: Part, shading: Shading) -> "Sample | None":
+        """The sample of the group's only part with a BRDF of its own; None if that varies over the surface."""
+        if shading.knot or shading.matte:
+            return None
+        vertex = self.target.vertex
+        assert vertex is not None
+        whole = Points(jnp.asarray(vertex)[self.points.corner], self.points.weight)
+        blend, _ = channels.materials_at([part], shading, whole)
+        return dataclasses.replace(self, shading=shading, blend=blend)
 
     def least_bytes(self, recipe: Any) -> int:
         """Smallest number of bytes that a recipe needs for the whole part."""
@@ -117,7 +146,7 @@ class Sample:
     def measure(self, recipe: Recipe) -> Candidate:
         """Runs a recipe on the sample and measures its error and cost."""
         start = time.perf_counter()
-        system = recipe.make(self.shading, self.target)
+        system = recipe.make(self.shading, [Piece(self.shading.mesh, self.target)])
         seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
         wrong = max(self._error(system, *each) for each in zip(self.environments, self.exact, strict=True))
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
@@ -159,9 +188,13 @@ def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
     return Points(jnp.asarray(corner[chosen].T), jnp.asarray(weight.T))
 
 
+def _one_region(mesh: Mesh) -> Mesh:
+    return eqx.tree_at(lambda each: each.region, mesh, np.zeros(len(mesh.position), np.int32))
+
+
 def _judged(
-    part: Part,
-    shading: Shading,
+    mesh: Mesh,
+    brdf: Callable,
     points: Points,
     told: np.ndarray,
     scene: Mesh,
@@ -173,11 +206,9 @@ def _judged(
     The error is the relative L2 difference between radiance with the visibility `told` and radiance with rays traced
     from the points, under the worst light.
     """
-    mesh = shading.mesh
-    position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
+    position, frame = placed(mesh.position, jnp.asarray(frames(mesh.normal, mesh.tangent)), points)
     toward = views[:, None] - np.asarray(position)
     facing = np.einsum("vi,wvi->wv", np.asarray(frame)[:, 2], toward) > 0
-    brdf, _ = exact_at(part, shading, points)
     brdf = brdf if isinstance(brdf, PerVertex) else grid.as_argument(brdf)
     batch = Environment(jnp.stack([light.radiance for light in environments]))
     rays = visibility.Occluder(scene)

@@ -1,10 +1,11 @@
-"""Precomputed scenes: one system for each part, and methods for radiance and pictures of the whole scene."""
+"""Precomputed scenes: systems of groups of parts, and methods for radiance and pictures of the whole scene."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -12,23 +13,28 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
-from jaxprt.compile import Between, promoted
-from jaxprt.relit import interpolation, measuring, pictures, tracing
+from jaxprt.compile import Between, compile_time, known, promoted, put
+from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
-from jaxprt.relit.channels import Appearance, Shading, appearance, at_points
+from jaxprt.relit.channels import Appearance, Shading, appearance
+from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surface
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
-from jaxprt.relit.surface import Surface
-from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
+from jaxprt.relit.recipes import samples_of
+from jaxprt.relit.surface import combine, view_of
+from jaxprt.relit.tracing import Reflections
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
+from jaxprt.scene.material_table import MaterialTable
 from jaxprt.scene.points import Points
-from jaxprt.systems import protocol
-from jaxprt.systems.bounces import PartBounces
+from jaxprt.systems import axes, protocol
+from jaxprt.systems.bounces import GroupBounces
 from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.protocol import Blend, Joined, System, Total
+from jaxprt.systems.protocol import Blend, System
 
 RAYS = 8  # reflection rays of each vertex or point of a sharp part
 
@@ -37,28 +43,16 @@ class SceneView(eqx.Module):
     """What depends on the view and the materials of a scene.
 
     Attributes:
-        part: View of each part, in the form of its system.
-        emitted: Radiance that each vertex emits; None if no part emits.
-        lit: For each part, radiance of its vertices due to each lamp of unit radiance; None without lamps.
+        group: For each group, the view of direct light, of reflected light and of lamps.
+        emitted: Radiance that each vertex of each group emits; None for a group that does not emit.
+        stage: The scene and its materials.
         reflected: Reflections that sharp parts show by ray tracing; None without.
     """
 
-    part: tuple[PyTree, ...]
-    emitted: Float[Array, "v 3"] | None
-    lit: tuple[Float[Array, "n _ _"], ...] | None = None
-    reflected: tracing.Reflections | None = None
-
-
-class SceneLight(eqx.Module):
-    """The light that arrives at a scene with lamps.
-
-    Attributes:
-        arriving: Light of the environment, in the form of the parts' systems.
-        lamp: Radiance of each lamp; for a point light, its intensity.
-    """
-
-    arriving: PyTree
-    lamp: Float[Array, "n 3"]
+    group: tuple[tuple[PyTree, PyTree, PyTree], ...]
+    emitted: tuple[Float[Array | np.ndarray, "_ 3"] | None, ...]
+    stage: Stage
+    reflected: Reflections | None = None
 
 
 class RelitScene(System):
@@ -72,54 +66,66 @@ class RelitScene(System):
 
     Attributes:
         scene: The scene.
-        direct: The systems of the parts, for direct light.
         shading: Mesh, BRDF and channel weights of each part.
+        place: Where the vertices of the parts stand in the groups.
+        surfaces: One `Surface` for each group of parts of one kind.
+        appearance: The materials at the vertices of each group.
         bounces: The system of light that the parts reflect onto each other; None without bounces.
         lamps: Emitting parts and point lights; None if there are none. `bounces` does not include their light.
         mesh: The mesh of all parts, with the original normals (without normal maps).
+        drawn: The same mesh, padded.
+        table: The materials of all parts as columns.
         camera: The first camera of the scene. If it has none, a camera that shows the whole scene from slightly above.
             Cameras, eyes and point lights are in the coordinates of the scene's file.
         curvature: How fast the radiance of each part varies with direction, from
             `jaxprt.relit.interpolation.curvature`.
+        lobes: BRDF, as lobes, of each group with parts whose reflections are too sharp for harmonics; None for others.
         points: Points on each part at which radiance is computed; None for the vertices.
-        mipmapped: Material of each part with mipmaps of its textures; None for a part with a BRDF.
-        lobes: BRDF, as lobes, of each part whose reflections are too sharp for harmonics; None for other parts.
+        samples: Number of sample points along the edge of each bright texel, for each part.
+        sharp: Whether reflections of each part are traced.
         rays: Number of reflection rays that each vertex or point of a sharp part sends.
     """
 
     scene: Scene
-    direct: Joined
     shading: tuple[Shading, ...]
-    bounces: PartBounces | None
+    place: Place
+    surfaces: tuple[Surface, ...]
+    appearance: tuple[Appearance, ...]
+    bounces: GroupBounces | None
     lamps: SceneLamps | None
     mesh: Mesh
+    drawn: Mesh
+    table: MaterialTable
     camera: Camera
-    curvature: Float[Array, " n"]
-    points: tuple[Points, ...] | None
-    mipmapped: tuple[TexturedMaterial | None, ...]
+    curvature: Float[np.ndarray | Array, " n"]
     lobes: tuple[LobeBrdf | None, ...]
+    points: tuple[Points, ...] | None
+    samples: tuple[int, ...] = eqx.field(static=True)
+    sharp: tuple[bool, ...] = eqx.field(static=True)
     rays: int = eqx.field(static=True)
 
     def __init__(
         self,
         scene: Scene,
-        direct: Joined,
         shading: Sequence[Shading],
-        bounces: PartBounces | None = None,
+        place: Place,
+        systems: Sequence[System],
+        bounces: GroupBounces | None = None,
         *,
         lamps: SceneLamps | None = None,
         lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
     ):
-        """Joins the meshes of the parts.
+        """Joins the parts.
 
         Args:
             scene: The scene.
-            direct: The systems of the parts for direct light, in order.
             shading: Mesh, BRDF and weights of each part, from `jaxprt.relit.channels.of_part`.
+            place: Where the vertices of the parts stand in the groups.
+            systems: The system of each group for direct light.
             bounces: The system of light that the parts reflect onto each other; None without bounces.
             lamps: Emitting parts and point lights, precomputed; None without.
-            lobes: BRDF, as lobes, of each sharp part, and None for other parts. None if no part is sharp.
+            lobes: BRDF, as lobes, of each group with sharp parts, and None for other groups. None if no part is sharp.
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
         """
@@ -132,40 +138,70 @@ class RelitScene(System):
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
-        self.direct, self.shading, self.bounces, self.lamps = direct, tuple(shading), bounces, lamps
+        self.shading, self.place, self.bounces, self.lamps = tuple(shading), place, bounces, lamps
         self.mesh, self.points, self.rays = scene.mesh, None, rays
-        self.lobes = tuple(None for _ in scene.parts) if lobes is None else tuple(lobes)
-        self.mipmapped = tuple(
-            part.material.mipmapped() if isinstance(part.material, TexturedMaterial) else None for part in scene.parts
+        self.drawn = groups.padded(self.mesh)
+        self.lobes = tuple(None for _ in systems) if lobes is None else tuple(lobes)
+        self.table = jax.device_put(material_table.of_parts(self.scene.parts))
+        own = [Appearance(each.blend, each.emitted) for each in shading]
+        self.appearance = tuple(jax.device_put(place.gathered(number, own)) for number in range(len(systems)))
+        self.surfaces = tuple(
+            groups.surface(
+                shading[members[0]],
+                system,
+                None if bounces is None else bounces.group[number],
+                None if lamps is None else lamps.group[number],
+            )
+            for number, (members, system) in enumerate(zip(place.parts, systems, strict=True))
         )
-        pairs = zip(shading, direct.part, strict=True)
-        self.curvature = jnp.asarray([interpolation.curvature(*each) for each in pairs], self.mesh.position.dtype)
+        pairs = zip(shading, place.group, strict=True)
+        found = [traits(each, systems[number], self.lobes[number]) for each, number in pairs]
+        curvature, samples, sharp = zip(*found, strict=True)
+        self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
 
     @property
-    def system(self) -> Joined | Total:
-        """The system of all vertices without emission: direct light of the environment, and bounces if requested."""
-        return self.direct if self.bounces is None else protocol.total(self.direct, self.bounces)
+    def direct(self) -> "RelitScene":
+        """The scene in direct light of the environment only, without bounces and lamps."""
+        surfaces = tuple(dataclasses.replace(own, lit=None) for own in self.surfaces)
+        return self._replaced(surfaces=surfaces, lamps=None).without_bounces()
+
+    def without_bounces(self) -> "RelitScene":
+        """The scene without light that its parts reflect onto each other."""
+        surfaces = tuple(dataclasses.replace(own, reflecting=None) for own in self.surfaces)
+        return self._replaced(surfaces=surfaces, bounces=None, lobes=tuple(None for _ in surfaces))
+
+    def _replaced(self, **fields: Any) -> "RelitScene":
+        """A copy with other fields. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
+        made = object.__new__(RelitScene)
+        for field in dataclasses.fields(self):
+            object.__setattr__(made, field.name, fields.get(field.name, getattr(self, field.name)))
+        return made
 
     @promoted
-    def light(self, environment: Environment) -> tuple[PyTree, ...]:
-        """Projects an environment, of one color or three, for the systems of all parts."""
+    def light(self, environment: Environment) -> SceneLight:
+        """Projects an environment, of one color or three, for the systems of all groups."""
         colors = protocol.one_light(environment).radiance.shape[-1]
         if colors not in (1, 3):
             raise ValueError(f"the light of a scene must have 1 or 3 colors, got {colors}")
-        return self.system.light(environment)
+        return groups.light(self.surfaces, self.bounces, environment)
 
     @promoted
-    def shade(self, light: PyTree, materials: Mapping[str, Any] | None = None) -> PyTree:
-        """The light that arrives at all parts, given the materials. Redone when the light or the materials change."""
+    def shade(self, light: SceneLight, materials: Mapping[str, Any] | None = None) -> Arriving:
+        """The light that arrives at all groups, given the materials. Redone when the light or the materials change."""
+        require.kind("the light", light, SceneLight, source="RelitScene.light")
         given, changed = scene_lamps.split(self.lamps, materials)
-        every = self._all(given)
-        arriving = self.system.shade(light, [each.blend for each in every])
-        return arriving if self.lamps is None else SceneLight(arriving, self.lamps.radiance(every, changed))
+        appearances = self.appearances(given)
+        blends = [each.blend for each in self._gathered(appearances)]
+        pairs = zip(self.surfaces, light.direct, blends, strict=True)
+        direct = tuple(own.system.shade(lit, blend) for own, lit, blend in pairs)
+        reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends)
+        lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
+        return Arriving(direct, reflected, lamp)
 
     @promoted
     def view(self, eye: Float[Array | np.ndarray, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
-        """What depends on the eye and the materials, for all parts.
+        """What depends on the eye and the materials, for all groups.
 
         Raises:
             TypeError: `materials` is not a dictionary; a material is of a kind that its part does not take; or the
@@ -174,40 +210,144 @@ class RelitScene(System):
                 `jaxprt.relit.channels.appearance`.
         """
         eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
-        materials = scene_lamps.split(self.lamps, materials)[0]
-        every = self._all(materials)
-        counts = [len(part.mesh.position) for part in self.scene.parts]
-        surfaces = self._surfaces(materials)
-        if self.points is not None:
-            counts = list(map(len, self.points))
-            rows = zip(self.scene.parts, self.shading, every, self.points, strict=True)
-            every = [at_points(part, shading, own, points) for part, shading, own, points in rows]
-        blends, lit = [each.blend for each in every], None
-        if self.lamps is not None:
-            lit = self.lamps.view(eye, blends, self.points, tracing.traced(self.mesh, surfaces, eye, self.points))
-        view, reflected = tracing.split(self.mesh, surfaces, self._placed.view(eye, blends), eye, blends, self.points)
-        if all(each.emitted is None for each in every):
-            return SceneView(view, None, lit, reflected)
-        emitted = [
-            jnp.zeros((count, 3), self.mesh.position.dtype) if each.emitted is None else each.emitted
-            for count, each in zip(counts, every, strict=True)
-        ]
-        return SceneView(view, jnp.concatenate(emitted), lit, reflected)
+        given = scene_lamps.split(self.lamps, materials)[0]
+        appearances = self.appearances(given)
+        stage, every = self._stage(given, appearances), self._gathered(appearances)
+        views, emitted, asked = [], [], []
+        for number, (surface, own) in enumerate(zip(stage.surfaces, every, strict=True)):
+            points, place = self._points(number)
+            blend = own.blend if place is None or own.blend is None else jax.tree.map(place.carry, own.blend)
+            sharp = None
+            if stage.is_sharp(number):
+                sharp = stage.sharp_at(number, points)
+                if place is None:
+                    with compile_time(self.mesh, eye):
+                        sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)
+                asked.append(tracing.Asked(number, points, place, blend, sharp))
+            views.append(view_of(surface, eye, blend, place, sharp))
+            glow = own.emitted
+            emitted.append(glow if glow is None or place is None else place.carry(glow))
+        reflected = tracing.trace(stage, asked, eye, keep=True) if asked else None
+        return SceneView(tuple(views), tuple(emitted), stage, reflected)
 
     @promoted
-    def combine(self, light: PyTree, view: SceneView) -> Float[Array, "v c"]:
+    def combine(self, light: Arriving | SceneLight, view: SceneView) -> Float[Array, "v c"]:
         """Radiance of all vertices, including emission."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
-        lamp = None
-        if self.lamps is not None and view.lit is not None:
-            require.kind("the light", light, SceneLight, source="RelitScene.shade")
-            light, lamp = light.arriving, light.lamp
-        color = self._placed.combine(light, view.part)
-        if self.lamps is not None and lamp is not None and view.lit is not None:
-            color = color + self.lamps.combine(lamp, view.lit)
-        if view.reflected is not None:
-            color = color + tracing.read(view.reflected, self._surfaces(None), light, lamp, self.points)
-        return color if view.emitted is None else color + view.emitted
+        if isinstance(light, SceneLight) and self.bounces is None and self.lamps is None:
+            light = Arriving(light.direct, None, None)  # Materials do not change it.
+        require.kind("the light", light, Arriving, source="RelitScene.shade")
+        assert isinstance(light, Arriving)
+        traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
+        colors = []
+        for number, (surface, seen, emitted) in enumerate(zip(self.surfaces, view.group, view.emitted, strict=True)):
+            surface = surface.sampled(max(view.stage.samples[part] for part in self.place.parts[number]))
+            color = combine(surface, light.at(number), seen, self._points(number)[1], emitted)
+            colors.append(color + next(traced) if view.stage.is_sharp(number) else color)
+        return groups.ordered(tuple(colors), self._order())
+
+    def _points(self, number: int) -> tuple[Points, Points | None]:
+        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group."""
+        parts = self.place.parts[number]
+        if self.points is None:
+            vertex = self.place.column(number, [self.place.first[p] + np.arange(self.place.counts[p]) for p in parts])
+            return material_table.at_vertices(vertex.astype(np.int32)), None
+        own = [self.points[part] for part in parts]
+        xp = np if known(own) else jnp
+        corner = [each.corner + self.place.start[part] for each, part in zip(own, parts, strict=True)]
+        in_scene = [each.corner + self.place.first[part] for each, part in zip(own, parts, strict=True)]
+        weight = xp.concatenate([each.weight for each in own], 1)
+        slopes: list[Any] = [each.slope for each in own]
+        slope = None if any(each is None for each in slopes) else xp.concatenate(slopes, 2)
+        pairs = (xp.concatenate(each, 1) for each in (in_scene, corner))
+        scene, group = (Points(jnp.asarray(each), jnp.asarray(weight), slope) for each in pairs)
+        return scene, group
+
+    def _real(self, number: int) -> Float[np.ndarray, " v"]:
+        """1 at vertices of a group, 0 in padding."""
+        count = sum(self.place.counts[part] for part in self.place.parts[number])
+        return (np.arange(self.place.size[number]) < count).astype(self.mesh.position.dtype)
+
+    def _order(self) -> Any:
+        """Index of each vertex or point among those of all groups."""
+        if self.points is None:
+            return self.place.order()
+        counts = [len(each) for each in self.points]
+        size = [sum(counts[part] for part in own) for own in self.place.parts]
+        return Place(tuple(counts), self.place.parts, tuple(size)).order()
+
+    def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
+        """The appearance of each group: the precomputed one, or with other materials of some parts."""
+        names = [part.name for part in self.scene.parts]
+        every, result = self._all(appearances), []
+        for number, own in enumerate(self.place.parts):
+            changed = any(names[part] in appearances for part in own)
+            result.append(self.place.gathered(number, every) if changed else self.appearance[number])
+        return result
+
+    def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
+        """The scene with given materials, as pictures and reflections take it."""
+        given, names = dict(materials or {}), [part.name for part in self.scene.parts]
+        new = {name: each for name, each in given.items() if _is_model(each)}
+        table, rough = self._tables(new)
+        fixed = [name in given and name not in new for name in names]
+        every = [appearances.get(name, Appearance(None)) for name in names]
+        kept = [self._given(number, fixed, every) for number in range(len(self.surfaces))]
+        traits = [self._trait(*each) for each in zip(range(len(names)), every, strict=True)]
+        bend, samples, sharp = (tuple(each) for each in zip(*traits, strict=True))
+        surfaces = [self._surface(number, sharp) for number in range(len(self.surfaces))]
+        lamp = tuple(-1 if self.lamps is None else self.lamps.number(part) for part in range(len(names)))
+        bends = groups.spread(bend, self.place.counts, len(self.drawn.position), self.mesh.position.dtype)
+        return Stage(
+            self.mesh, self.drawn, tuple(surfaces), table, rough, tuple(kept), bends, self.place, samples, sharp, lamp
+        )
+
+    def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:
+        """The materials of all parts with some new ones; and their roughness alone, if JAX traces only the rest."""
+        if not new:
+            return self.table, None
+        before = [part.material for part in self.scene.parts]
+        every = [new.get(part.name, part.material) for part in self.scene.parts]
+        table = put(material_table.with_materials(self.table, every, before))
+        if known(table):
+            return table, None
+        with compile_time():
+            plain = [channels.rough(material) for material in every]
+            if not known(plain, self.table):
+                return table, None
+            return table, put(material_table.with_materials(self.table, plain, before))
+
+    def _trait(self, part: int, new: Appearance) -> tuple[Any, int, bool]:
+        """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced."""
+        shading, number = self.shading[part], self.place.group[part]
+        if new.blend is None or shading.table is None or not known(new):
+            return self.curvature[part], self.samples[part], self.sharp[part]
+        now = dataclasses.replace(shading, blend=new.blend)
+        return traits(now, self.surfaces[number].system, self.lobes[number])
+
+    def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
+        """A group, with rays for its reflections if any of its parts is sharp."""
+        surface, lobes = self.surfaces[number], self.lobes[number]
+        if surface.reflecting is None or lobes is None or not self.rays:
+            return surface
+        if not any(sharp[part] for part in self.place.parts[number]):
+            return surface
+        part = surface.reflecting
+        ray = SharpPart(part.position, part.frame, part.brdf, lobes, self.rays, sent=part.sent)
+        return dataclasses.replace(surface, reflecting=ray)
+
+    def _given(self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]) -> Given | None:
+        """Materials that users give at the vertices of some parts of a group; None without."""
+        own = self.place.parts[number]
+        if not any(fixed[part] for part in own) or self.surfaces[number].scale is None:
+            return None
+        names = {part: appearances[part] if fixed[part] else self._own(part) for part in own}
+        whole = self.place.gathered(number, [names.get(part, Appearance(None)) for part in range(len(fixed))])
+        dtype = self.mesh.position.dtype
+        flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in own])
+        emitted = np.zeros((self.place.size[number], 3), dtype) if whole.emitted is None else whole.emitted
+        assert whole.blend is not None
+        return put(Given(whole.blend, emitted, flag))
 
     @promoted
     def radiance(
@@ -298,43 +438,18 @@ class RelitScene(System):
         camera = self.camera if camera is None else camera
         require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
-        materials, changed = scene_lamps.split(self.lamps, materials)
-        surfaces = self._surfaces(materials)
-        lamp = None if self.lamps is None else self.lamps.radiance([each.appearance for each in surfaces], changed)
-        return pictures.make(self.mesh, self.system, surfaces, camera, lamp=lamp, **options)
-
-    def _surfaces(self, materials: Mapping[str, Any] | None) -> list[Surface]:
-        """One `Surface` for each part."""
-        given = self.appearances(materials)
-        with tracing.now(self.curvature):
-            curvature = list(self.curvature)
-        surfaces, first = [], 0
-        for number, (part, shading, system) in enumerate(
-            zip(self.scene.parts, self.shading, self.direct.part, strict=True)
-        ):
-            own = given.get(part.name, Appearance(shading.blend, shading.emitted))
-            material = (materials or {}).get(part.name, self.mipmapped[number])
-            material = own if isinstance(material, Blend) else material
-            reflecting = None if self.bounces is None else self.bounces.part[number]
-            lit = None if self.lamps is None else self.lamps.part[number]
-            lamp = None if self.lamps is None else self.lamps.number(number)
-            lobes = self.lobes[number]
-            if reflecting is not None and lobes is not None and self.rays:
-                own_of = reflecting.position, reflecting.frame, reflecting.brdf
-                reflecting = SharpPart(*own_of, lobes, self.rays, sent=reflecting.sent)
-            surfaces.append(
-                Surface(part, first, shading, system, reflecting, lit, own, material, curvature[number], lamp)
-            )
-            first += len(part.mesh.position)
-        return surfaces
+        given = scene_lamps.split(self.lamps, materials)[0]
+        if given is not None and not isinstance(given, Mapping):
+            self.appearances(given)  # raises the error
+        appearances = self.appearances(given)
+        stage = self._stage(given, appearances)
+        arriving = _Lit(self, materials, appearances)
+        return pictures.make(stage, arriving, camera.local(self.mesh.origin), **options)
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
         tracing.check_rays(rays)
-        made = object.__new__(RelitScene)  # Works inside jax.jit too, where __init__ could not measure the curvature.
-        for field in dataclasses.fields(self):
-            object.__setattr__(made, field.name, rays if field.name == "rays" else getattr(self, field.name))
-        return made
+        return self._replaced(rays=rays)
 
     @promoted
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
@@ -355,9 +470,7 @@ class RelitScene(System):
             ValueError: There are no lights, lights of different sizes, or a light that is not finite.
         """
         lights = measuring.lights_of(self.scene) if environments is None else environments
-        near = self.centered()
-        alone = RelitScene(near.scene, self.direct, self.shading)
-        return measuring.measure(alone.picture, near.camera, self.direct, self.system, near.scene, self.shading, lights)
+        return measuring.measure(self.centered(), lights)
 
     @promoted
     def appearances(self, materials: Mapping[str, Any] | None) -> dict[str, Appearance]:
@@ -380,23 +493,29 @@ class RelitScene(System):
             raise TypeError(
                 f"the materials must be a dictionary from names of parts to materials, got {type(materials).__name__}"
             )
-        known = {part.name: (part, each) for part, each in zip(self.scene.parts, self.shading, strict=True)}
-        unknown = [name for name in materials if name not in known]
+        names = [part.name for part in self.scene.parts]
+        unknown = [name for name in materials if name not in names]
         if unknown:
-            raise ValueError(f"materials must be for the parts {list(known)}, got one for {unknown[0]!r}")
+            raise ValueError(f"materials must be for the parts {names}, got one for {unknown[0]!r}")
         result = {}
+        table, rough = self._tables({name: each for name, each in materials.items() if _is_model(each)})
         for name, given in materials.items():
-            part, shading = known[name]
+            number = names.index(name)
+            part, shading = self.scene.parts[number], self.shading[number]
             if shading.blend is None:
                 raise TypeError(
                     f"the material of part {name!r} is a BRDF, which cannot be replaced: precompute the scene with "
-                    "another one, with a TexturedMaterial, or a BlinnPhong with roughness=(low, high)"
+                    "another one, with a TexturedMaterial, or a BlinnPhong"
                 )
             kinds, source = (TexturedMaterial, BlinnPhong, Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", given, *kinds, source=source)
-            if isinstance(given, TexturedMaterial | BlinnPhong):
-                given = appearance(part, shading, given)
+            if _is_model(given):
+                first = int(self.place.first[number])
+                vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
+                look = groups.look_at(table, rough, material_table.at_vertices(vertex))
+                given = appearance(part, shading, given, look=look)
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
+            _check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
                 raise ValueError(
                     f"part {name!r} was precomputed without emission, so light that it emits would not reach other "
@@ -419,19 +538,71 @@ class RelitScene(System):
     @property
     def vertices(self) -> int:
         """Number of vertices, or of points if the scene was moved to points by `at`."""
-        return self._placed.vertices
-
-    @property
-    def _placed(self) -> System:
-        return self.system if self.points is None else self.system.at(self.points)
+        return sum(self.place.counts) if self.points is None else sum(map(len, self.points))
 
     @property
     def shared_light(self) -> tuple | None:
-        """What `light` depends on besides the environment; see `System.shared_light`."""
-        return self.system.shared_light
+        """Key of the light without bounces; None with them. See `System.shared_light`."""
+        keys = tuple(own.system.shared_light for own in self.surfaces)
+        return None if None in keys or self.bounces is not None else (RelitScene, *keys)
 
-    def _all(self, materials: Mapping[str, Any] | None) -> list[Appearance]:
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the systems of all groups, bounces and lamps: transport and BRDFs. Shared arrays count once."""
+        held = self.surfaces, self.bounces, self.lobes
+        return sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves(held)}.values())
+
+    def part_system(self, part: int) -> System:
+        """The system of direct light of the vertices of one part, without padding, in NumPy."""
+        first = int(self.place.start[part])
+        return axes.taken(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
+
+    def _own(self, part: int) -> Appearance:
+        """The material that a part was precomputed with."""
+        return Appearance(self.shading[part].blend, self.shading[part].emitted)
+
+    def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""
-        given = self.appearances(materials)
-        pairs = zip(self.scene.parts, self.shading, strict=True)
-        return [given.get(part.name, Appearance(each.blend, each.emitted)) for part, each in pairs]
+        return [appearances.get(part.name, self._own(number)) for number, part in enumerate(self.scene.parts)]
+
+
+def _is_model(material: Any) -> bool:
+    """Whether a material is a model that is evaluated at vertices and points."""
+    return isinstance(material, TexturedMaterial | BlinnPhong)
+
+
+def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
+    """Refuses weights of other vertices or channels, and other parameters, than a part has."""
+    own = shading.blend
+    assert own is not None
+    if blend is None or len(blend.parameter) != len(own.parameter):
+        got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
+        raise ValueError(f"the material of part {name!r} must have {len(own.parameter)} parameters, got {got}")
+    blend.check(len(own.weight), own.weight.shape[1])
+
+
+class _Lit(eqx.Module):
+    """The light that arrives at a scene with given materials, as a function of the environment."""
+
+    scene: RelitScene
+    materials: Any
+    appearances: dict[str, Appearance]
+
+    def __call__(self, environment: Environment) -> Arriving:
+        lights = scene_lamps.split(self.scene.lamps, self.materials)[1]
+        return self.scene.shade(self.scene.light(environment), {**self.appearances, **lights})
+
+
+def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[float, int, bool]:
+    """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced.
+
+    Args:
+        shading: The part with its material.
+        system: The system of its group.
+        lobes: The BRDF of the group as lobes; None if nothing is traced.
+    """
+    samples = 1
+    if isinstance(system, BrightTexels):
+        # Powers of two, so that few programs are compiled for parts of different roughness.
+        samples = 1 << (samples_of(shading, system.visibility.size) - 1).bit_length()
+    return interpolation.curvature(shading, system), samples, reflection.is_sharp(shading, lobes)

@@ -1,147 +1,148 @@
-"""Shading of parts of scenes: radiance at points and vertices from direct light, bounces and lamps together."""
+"""Shading of rows of points: radiance from direct light, reflected light and lamps together.
+
+`view` computes all that does not depend on the light, and `lit` the rest. Both are one program for each kind of group.
+"""
 
 from functools import partial, reduce
-from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxprt.compile import jit
-from jaxprt.relit.channels import Appearance, Shading, at_points
-from jaxprt.scene import Part
+from jaxprt.compile import jit, kept
+from jaxprt.relit.groups import Given, Surface, material
+from jaxprt.scene.material_table import Look
 from jaxprt.scene.points import Points
-from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.lobe import widened
-from jaxprt.systems.protocol import Blend, System
+from jaxprt.systems.protocol import Blend
 
 
-class Surface(eqx.Module):
-    """A part of a scene with everything that its shading requires.
+class Viewed(eqx.Module):
+    """Points of a group with all that does not depend on the light.
 
     Attributes:
-        part: The part.
-        first: Index of its first vertex in the mesh of all parts.
-        shading: Mesh, BRDF and channel weights of the part.
-        system: The system of direct light from the environment.
-        reflecting: How it reflects light from other surfaces; None without bounces.
-        lit: How it reflects light from lamps; None without lamps.
-        appearance: Its material at the vertices.
-        material: Source of its material at points: a `TexturedMaterial` or `BlinnPhong`, an `Appearance` at the
-            vertices, or None for the part's own material.
-        curvature: How fast its radiance varies with direction, from `interpolation.curvature`.
-        lamp: Index of the lamp that the part is; None if it does not emit.
-        glows: Whether its emission is visible. It is not for reflection rays, which add lamps separately.
+        points: The points on the group.
+        seen: The view of each system of the group: direct light, reflected light and lamps.
+        emitted: Radiance that the points emit.
     """
 
-    part: Part
-    first: int = eqx.field(static=True)
-    shading: Shading
-    system: System
-    reflecting: ReflectingPart | None
-    lit: LitByLamps | None
-    appearance: Appearance
-    material: Any
-    curvature: Float[Array, ""]
-    lamp: int | None = eqx.field(static=True, default=None)
-    glows: bool = eqx.field(static=True, default=True)
+    points: Points
+    seen: tuple[PyTree, PyTree, PyTree]
+    emitted: Float[Array, "p 3"]
 
 
-@partial(jit, static_argnames="at_pixels")
-def look(
-    surface: Surface, points: Points, eye: Array, *, at_pixels: bool, variance: Float[Array, " p"] | None = None
-) -> tuple[Points, Appearance, PyTree]:
-    """Some points of a part, the material there, and the view of each system of the part (None unless `at_pixels`).
-
-    `variance`, in squared radians, widens the lobes of each point; see `jaxprt.systems.lobe.widened`.
-    """
-    appearance = at_points(surface.part, surface.shading, surface.material, points)
-    return points, appearance, _view(surface, eye, points, appearance.blend, variance) if at_pixels else None
-
-
-@jit
-def lit(
+@partial(kept, static=("glows",))
+def view(
     surface: Surface,
-    arriving: tuple[PyTree, PyTree, PyTree],
-    vertices: Float[Array, "k v c"] | None,
-    viewed: tuple[Points, Appearance, PyTree],
-) -> Float[Array, "p c"]:
-    """Colors of some points of a part, from the arriving light or, if given, from the radiance of the vertices.
+    points: Points,
+    look: Look,
+    eye: Float[Array, "*p 3"],
+    *,
+    given: Given | None = None,
+    sharp: Float[Array, " p"] | None = None,
+    variance: Float[Array, " p"] | None = None,
+    glows: bool = True,
+) -> Viewed:
+    """All of the points' radiance that does not depend on the light.
 
     Args:
-        surface: The part.
-        arriving: Direct light, reflected light, and radiance of each lamp.
-        vertices: Radiance of each channel at the vertices, from `at_vertices`; None to shade at the points.
-        viewed: Result of `look`.
+        surface: The group.
+        points: Points on the group.
+        look: The materials at the points.
+        eye: Position of the viewer: one, or one for each point.
+        given: Materials that users give at vertices.
+        sharp: 1 at points whose narrow lobes are traced by rays, 0 at others; None where no lobe is.
+        variance: Variance in squared radians by which lobes are widened, at points that reflection rays hit; see
+            `jaxprt.systems.lobe.widened`.
+        glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
     """
-    points, appearance, view = viewed
-    if vertices is None:
-        color = _combine(surface, arriving, view, points)
-    elif appearance.blend is None:
-        color = points.carry(vertices[0])
-    else:
-        weight = jnp.moveaxis(appearance.blend.weight, 1, 0)
-        color = reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True)))
-    return color if appearance.emitted is None or not surface.glows else color + appearance.emitted
+    blend, emitted = material(surface, points, look, given)
+    seen = view_of(surface, eye, blend, points, sharp, variance=variance)
+    return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted))
 
 
-@partial(jit, static_argnames="at_pixels")
-def shaded(
-    surface, arriving, vertices, points: Points, eye, *, at_pixels: bool, variance: Array | None = None
-) -> Array:
-    """Colors of some points of a part. Intermediate results are recomputed for derivatives instead of stored."""
+@kept
+def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewed) -> Float[Array, "p c"]:
+    """Colors of some points from the light that arrives at their group.
 
-    def both(surface, arriving, vertices, eye):
-        viewed = look(surface, points, eye, at_pixels=at_pixels, variance=variance)
-        return lit(surface, arriving, vertices, viewed)
-
-    return jax.checkpoint(both)(surface, arriving, vertices, eye)
+    Args:
+        surface: The group.
+        arriving: Direct light, reflected light, and radiance of each lamp.
+        viewed: The result of `view`.
+    """
+    return combine(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
 
 
 @jit
-def at_vertices(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], eye: Array) -> Float[Array, "k v c"]:
-    """Radiance of the vertices of a part, separately for each channel of its BRDF."""
-    blend = surface.appearance.blend
+def carried(
+    surface: Surface, vertices: Float[Array, "k v c"], points: Points, look: Look, given: Given | None
+) -> Float[Array, "p c"]:
+    """Colors of some points, interpolated from the radiance of each channel at the vertices."""
+    blend, emitted = material(surface, points, look, given)
     if blend is None:
-        return _combine(surface, arriving, _view(surface, eye, None, None), None)[None]
-    rows = []
-    for channel in range(blend.weight.shape[1]):
-        one = jnp.zeros_like(blend.weight[..., :1]).at[:, channel].set(1)
-        rows.append(_combine(surface, arriving, _view(surface, eye, None, Blend(one, blend.parameter)), None))
-    return jnp.stack(rows)
+        return points.carry(vertices[0]) + emitted
+    weight = jnp.moveaxis(blend.weight, 1, 0)
+    return reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True))) + emitted
 
 
-def _view(
-    surface: Surface, eye: Array, points: Points | None, blend: Blend | None, variance: Array | None = None
+@jit
+def view_of(
+    surface: Surface,
+    eye: Float[Array, "*p 3"],
+    blend: Blend | None,
+    points: Points | None,
+    sharp: Array | None,
+    *,
+    variance: Array | None = None,
 ) -> tuple[PyTree, PyTree, PyTree]:
-    """The view of each system of a part: direct light, reflected light and lamps; at points or at the vertices."""
-    system = surface.system if points is None else surface.system.at(points)
-    reflecting, lit = surface.reflecting, surface.lit
-    traced = jnp.ones(len(points)) if isinstance(reflecting, SharpPart) and points is not None else None
-    reflected = None if reflecting is None else reflecting.view(eye, blend, points)
+    """The view of all systems of a group at its vertices, or at points on it.
+
+    Args:
+        surface: The group.
+        eye: Position of the viewer: one, or one for each vertex or point.
+        blend: Weights of the channels there.
+        points: The points; None for the vertices.
+        sharp: 1 where narrow lobes are traced by rays, 0 elsewhere; None for a group without rays.
+        variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
+    """
+    system, reflecting = surface.system if points is None else surface.system.at(points), surface.reflecting
+    reflected = None
+    if isinstance(reflecting, SharpPart):
+        reflected = reflecting.view(eye, blend, points, sharp)
+    elif reflecting is not None:
+        reflected = reflecting.view(eye, blend, points)
+    lit = None if surface.lit is None else surface.lit.view(eye, blend, points, sharp)
     if variance is not None and widened.can_widen(system):
-        direct = widened.view(system, eye, blend, variance)
-    else:
-        direct = system.view(eye, blend)
-    return direct, reflected, None if lit is None else lit.view(eye, blend, points, traced)
+        return widened.view(system, eye, blend, variance), reflected, lit
+    return system.view(eye, blend), reflected, lit
 
 
-def _combine(
+@jit
+def combine(
     surface: Surface,
     arriving: tuple[PyTree, PyTree, PyTree],
-    view: tuple[PyTree, PyTree, PyTree],
+    seen: tuple[PyTree, PyTree, PyTree],
     points: Points | None,
-) -> Array:
-    """Radiance of a part from all its systems."""
+    emitted: Float[Array, "_ 3"] | None,
+) -> Float[Array, "_ c"]:
+    """Radiance of a group's vertices, or of points on it.
+
+    Args:
+        surface: The group.
+        arriving: Direct light, reflected light, and radiance of each lamp.
+        seen: The result of `view_of`.
+        points: The points; None for the vertices.
+        emitted: Radiance that they emit; None without.
+    """
     system = surface.system if points is None else surface.system.at(points)
-    if isinstance(view[0], widened.WidenedView):
+    if isinstance(seen[0], widened.WidenedView):
         assert widened.can_widen(system)
-        color = widened.combine(system, arriving[0], view[0])
+        color = widened.combine(system, arriving[0], seen[0])
     else:
-        color = system.combine(arriving[0], view[0])
+        color = system.combine(arriving[0], seen[0])
     if surface.reflecting is not None:
-        color = color + surface.reflecting.combine(arriving[1], view[1], points)
-    return color if surface.lit is None else color + surface.lit.combine(arriving[2], view[2])
+        color = color + surface.reflecting.combine(arriving[1], seen[1], points)
+    if surface.lit is not None:
+        color = color + surface.lit.combine(arriving[2], seen[2])
+    return color if emitted is None else color + emitted

@@ -10,7 +10,6 @@ therefore differentiable in the light and in the colors of all materials. Deriva
 roughness raise an error.
 """
 
-import contextlib
 import dataclasses
 from collections.abc import Sequence
 from functools import reduce
@@ -20,39 +19,39 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.brdf import Lambert
-from jaxprt.compile import jit, make_room
-from jaxprt.relit.casting import caster
-from jaxprt.relit.surface import Surface, at_vertices, lit, look, shaded
+from jaxprt.compile import jit, known, put
+from jaxprt.relit import canvas
+from jaxprt.relit.casting import Caster, caster
+from jaxprt.relit.groups import Arriving, Stage, Surface
+from jaxprt.relit.surface import Viewed, lit, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
 
-CHUNK = 1 << 13  # number of hits that are shaded together
 _MOST_RAYS = 1 << 12  # of each vertex or point
-_FEWEST = 1 << 10
 
 
 class Asked(eqx.Module):
-    """Vertices or points of a part from which rays start.
+    """Vertices or points of a group from which rays start.
 
     Attributes:
-        number: Index of the part.
+        number: Index of the group.
+        points: The points in the scene.
+        own: The points on the group; None for all its vertices.
         blend: Material weights of the vertices or points.
-        points: The points; None for all vertices.
-        seen: 1 where the eye may see the vertex or point, 0 elsewhere; None for 1 everywhere.
+        seen: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
     """
 
     number: int = eqx.field(static=True)
+    points: Points
+    own: Points | None
     blend: Blend | None
-    points: Points | None
-    seen: Float[Array, " v"] | None = None
+    seen: Float[Array, " v"] | None
 
 
 class Carried(eqx.Module):
@@ -64,27 +63,29 @@ class Carried(eqx.Module):
         lamp: Factor of the radiance of each lamp; None without lamps.
     """
 
-    slot: Int[Array, "j v"]
+    slot: Int[Array | np.ndarray, "j v"]
     weight: Float[Array, "j v c"]
     lamp: Float[Array, "n v c"] | None
 
 
 class HitRow(eqx.Module):
-    """Hits on one part that are shaded together.
+    """Hits on one group that are shaded together.
 
     Attributes:
-        number: Index of the part.
-        points: The hits as points on the part.
+        number: Index of the group.
+        points: The hits as points of the scene.
+        own: The hits as points on the group.
         eye: Origin of the ray of each hit.
         variance: Variance of the directions into which a cone around each ray is reflected, in squared radians.
-        kept: What `look` returns for the hits; None if it is recomputed for each light.
+        kept: What does not depend on the light; None if it is computed anew for each light.
     """
 
     number: int = eqx.field(static=True)
     points: Points
+    own: Points
     eye: Float[Array, "h 3"]
     variance: Float[Array, " h"]
-    kept: PyTree
+    kept: Viewed | None
 
 
 class Reflections(eqx.Module):
@@ -98,197 +99,84 @@ class Reflections(eqx.Module):
     own: tuple[Carried, ...]
     hit: tuple[HitRow, ...]
 
-    def radiance(
-        self,
-        surfaces: Sequence[Surface],
-        arriving: tuple[Sequence[PyTree], Sequence[PyTree]],
-        lamp: Float[Array, "n 3"] | None,
-    ) -> list[Float[Array, "_ c"]]:
+    def radiance(self, stage: Stage, arriving: Arriving) -> list[Float[Array, "_ c"]]:
         """The reflected radiance that rays add at each vertex or point, one array for each `Asked`.
 
         Args:
-            surfaces: All parts, from `flattened`.
-            arriving: Direct light and reflected light of each part.
-            lamp: Radiance of each lamp; None without lamps.
+            stage: The scene and its materials.
+            arriving: The light that arrives at it.
         """
-        rows, vertices = [], {}
-        for each in self.hit:
-            make_room()
-            surface, number = surfaces[each.number], each.number
-            light = arriving[0][number], arriving[1][number], lamp
-            matte = _is_matte(surface)
-            if matte and number not in vertices:
-                vertices[number] = at_vertices(surface, light, each.eye[0])
-            own = vertices.get(number)
-            if each.kept is None:
-                rows.append(
-                    shaded(surface, light, own, each.points, each.eye, at_pixels=not matte, variance=each.variance)
-                )
-            else:
-                rows.append(lit(surface, light, own, each.kept))
-        return _read(self.own, rows, lamp)
+        rows = []
+        for row in self.hit:
+            seen = _viewed(stage, row) if row.kept is None else row.kept
+            rows.append(lit(plain(stage.surfaces[row.number]), arriving.at(row.number), seen))
+        return _read(self.own, rows, arriving.lamp)
 
 
-def known(*value: Any) -> bool:
-    """Whether no array is traced by JAX."""
-    return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
+def plain(surface: Surface) -> Surface:
+    """The surface as rays see it: it reflects by harmonics alone."""
+    part = surface.reflecting
+    return dataclasses.replace(surface, reflecting=part.plain) if isinstance(part, SharpPart) else surface
 
 
-def now(*value: Any) -> contextlib.AbstractContextManager:
-    """A context in which operations on known arrays are executed at once, even inside `jax.jit`."""
-    return jax.ensure_compile_time_eval() if known(*value) else contextlib.nullcontext()
+def _viewed(stage: Stage, row: HitRow) -> Viewed:
+    """What does not depend on the light, at the hits of a row."""
+    look, given = stage.look(row.points), stage.given[row.number]
+    options = {"given": given, "variance": row.variance, "glows": False}
+    return view(plain(stage.surfaces[row.number]), row.own, look, row.eye, **options)
 
 
-def trace(
-    mesh: Mesh, surfaces: Sequence[Surface], asked: Sequence[Asked], eye: Float[Array, "3"], *, keep: bool
-) -> Reflections:
+def trace(stage: Stage, asked: Sequence[Asked], eye: Float[Array, "3"], *, keep: bool) -> Reflections:
     """Casts the reflection rays of some vertices or points.
 
     Args:
-        mesh: The mesh of all parts.
-        surfaces: All parts. The parts from which rays start have a `SharpPart`.
-        asked: Vertices or points from which rays start.
+        stage: The scene and its materials.
+        asked: Vertices or points from which rays start, of groups with a `SharpPart`.
         eye: Position of the viewer.
         keep: Whether to store what depends on the view of the hits, for many lights.
 
     Raises:
         ValueError: The eye, the roughness, the points or the scene is traced by JAX.
     """
-    plain = [flattened(each) for each in surfaces]
+    _check(stage.whole, asked[0], stage.surfaces[asked[0].number].reflecting, eye)
+    cast = caster(stage.whole)
     found, rays = [], []
     for each in asked:
-        surface = surfaces[each.number]
-        assert isinstance(surface.reflecting, SharpPart)
+        sharp = stage.surfaces[each.number].reflecting
+        assert isinstance(sharp, SharpPart)
         parameter = () if each.blend is None else each.blend.parameter
-        _check(mesh, surface.reflecting, each.points, eye, parameter)
+        _check(stage.whole, each, sharp, eye)
         with jax.ensure_compile_time_eval():
-            rays.append(surface.reflecting.rays(eye, parameter, each.points, each.seen))
-            met = caster(mesh).cast(rays[-1], surface.first, each.points)
-            found.append((*met, caster(mesh).spread(rays[-1], *met)))
-    slots, hit = _rows(mesh, plain, found, keep=keep)
+            rays.append(sharp.rays(eye, parameter, each.own, each.seen))
+            met = cast.cast(rays[-1], each.points, at_vertices=each.own is None)
+            found.append((*met, cast.spread(rays[-1], *met)))
+    slots, hit = _rows(stage, cast, found, keep=keep)
     own = []
-    for each, ray, slot, triangle in zip(asked, rays, slots, found, strict=True):
-        part = surfaces[each.number].reflecting
-        assert isinstance(part, SharpPart)
-        weight = part.weights(ray, eye, each.blend, each.points, each.seen)
-        met = caster(mesh).part[triangle[0]] if (triangle[0] >= 0).any() else np.zeros_like(triangle[0])
-        lamp = _lamps(surfaces, each, np.where(triangle[0] >= 0, met, -1), weight, ray.concentration)
-        own.append(Carried(jnp.asarray(slot), weight, lamp))
+    for each, ray, slot, (triangle, *_) in zip(asked, rays, slots, found, strict=True):
+        sharp = stage.surfaces[each.number].reflecting
+        assert isinstance(sharp, SharpPart)
+        weight = sharp.weights(ray, eye, each.blend, each.own, each.seen)
+        part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
+        own.append(Carried(slot, weight, _lamps(stage, each, part, weight, ray.concentration)))
     return Reflections(tuple(own), hit)
 
 
 def _lamps(
-    surfaces: Sequence[Surface], asked: Asked, met: Int[np.ndarray, "j v"], weight: Array, concentration: Array
+    stage: Stage, asked: Asked, part: Int[np.ndarray, "j v"], weight: Array, concentration: Array
 ) -> Float[Array, "n v c"] | None:
     """Factor of the radiance of each lamp at each vertex or point, given the part that each ray hits (-1 for none)."""
-    lit = surfaces[asked.number].lit
+    lit = stage.surfaces[asked.number].lit
     if lit is None:
         return None
-    emitting = {each.lamp: number for number, each in enumerate(surfaces) if each.lamp is not None}
-    part = np.array([emitting.get(lamp, -2) for lamp in range(lit.transport.lamps)])
-    return _seen_lamps(lit.chord(asked.points), jnp.asarray(met == part[:, None, None]), weight, concentration)
+    lamp = np.where(part >= 0, np.asarray(stage.lamp)[part], -1)
+    met = lamp == np.arange(lit.transport.lamps)[:, None, None]
+    return _seen_lamps(lit.chord(asked.own), put(met), weight, concentration)
 
 
 @jit
 def _seen_lamps(chord: Array, met: Array, weight: Array, concentration: Array) -> Float[Array, "n v c"]:
     share = beside(concentration, chord[:, None]) * met
     return jnp.einsum("njv,jvc->nvc", share, weight, precision="highest")
-
-
-def split(
-    mesh: Mesh,
-    surfaces: Sequence[Surface],
-    view: PyTree,
-    eye: Float[Array, "3"],
-    blends: Sequence[Blend | None],
-    points: Sequence[Points] | None,
-) -> tuple[PyTree, Reflections | None]:
-    """Separates traced reflections from the view of the systems. The rays are None if no part is sharp.
-
-    Args:
-        mesh: The mesh of all parts.
-        surfaces: All parts.
-        view: Views of direct light and of bounces, part by part.
-        eye: Position of the viewer.
-        blends: Material weights of the vertices or points of each part.
-        points: Points on each part; None for the vertices.
-
-    Returns:
-        The view without what rays represent, and the rays.
-    """
-    sharp = _sharp(surfaces)
-    if not sharp:
-        return view, None
-    places = points or [None] * len(surfaces)
-    faces = _faces(mesh, surfaces, eye, points)
-    rows, asked = list(view[1]), []
-    for number in sharp:
-        asked.append(Asked(number, blends[number], places[number], faces[number]))
-        own = surfaces[number].reflecting
-        assert isinstance(own, SharpPart)
-        rows[number] = rows[number] - own.carried(eye, blends[number], places[number], faces[number])
-    return (view[0], tuple(rows)), trace(mesh, surfaces, asked, eye, keep=True)
-
-
-def traced(
-    mesh: Mesh, surfaces: Sequence[Surface], eye: Float[Array, "3"], points: Sequence[Points] | None
-) -> list[Float[Array, " _"] | None]:
-    """Fraction of narrow lobes that rays represent at the vertices or points of each part; None without rays.
-
-    Args:
-        mesh: The mesh of all parts.
-        surfaces: All parts.
-        eye: Position of the viewer.
-        points: Points on each part; None for the vertices.
-    """
-    sharp = _sharp(surfaces)
-    if not sharp:
-        return [None] * len(surfaces)
-    faces = [jnp.ones(len(each)) for each in points] if points else _faces(mesh, surfaces, eye, points)
-    return [each if number in sharp else None for number, each in enumerate(faces)]
-
-
-def _faces(mesh: Mesh, surfaces: Sequence[Surface], eye: Array, points: Sequence[Points] | None) -> list[Any]:
-    """1 for each vertex of each part that the eye may see, 0 for others; None for each part if there are points."""
-    if points is not None:
-        return [None] * len(surfaces)
-    with now(mesh, eye):
-        return jnp.split(facing(mesh, eye), [each.first for each in surfaces[1:]])
-
-
-def read(
-    reflected: Reflections,
-    surfaces: Sequence[Surface],
-    arriving: tuple[Sequence[PyTree], Sequence[PyTree]],
-    lamp: Float[Array, "n 3"] | None,
-    points: Sequence[Points] | None,
-) -> Float[Array, "v c"]:
-    """The reflected radiance that rays add at all vertices or points.
-
-    Args:
-        reflected: The traced reflections.
-        surfaces: All parts.
-        arriving: Direct light and reflected light of each part.
-        lamp: Radiance of each lamp; None without lamps.
-        points: Points on each part; None for the vertices.
-    """
-    rows = reflected.radiance([flattened(each) for each in surfaces], arriving, lamp)
-    counts = [len(each.part.mesh.position) for each in surfaces] if points is None else list(map(len, points))
-    own = dict(zip(_sharp(surfaces), rows, strict=True))
-    none = jnp.zeros((1, rows[0].shape[1]), rows[0].dtype)
-    every = [own.get(number, jnp.broadcast_to(none, (count, none.shape[1]))) for number, count in enumerate(counts)]
-    return jnp.concatenate(every)
-
-
-def _sharp(surfaces: Sequence[Surface]) -> list[int]:
-    """Indices of the parts from which rays start."""
-    return [number for number, each in enumerate(surfaces) if isinstance(each.reflecting, SharpPart)]
-
-
-def flattened(surface: Surface) -> Surface:
-    """The part as rays see it: it reflects by harmonics alone, and its emission is hidden."""
-    part = surface.reflecting
-    return dataclasses.replace(surface, reflecting=part.plain if isinstance(part, SharpPart) else part, glows=False)
 
 
 @jit
@@ -301,8 +189,9 @@ def facing(mesh: Mesh, eye: Float[Array, "3"]) -> Float[Array, " v"]:
     return jnp.zeros_like(mesh.position[:, 0]).at[mesh.face].max(seen[:, None])
 
 
-def _check(mesh: Mesh, part: SharpPart, points: Points | None, eye: Any, parameter: Any) -> None:
-    names = {"the eye": eye, "the roughness": parameter, "the scene": (mesh, part), "the points": points}
+def _check(mesh: Mesh, asked: Asked, part: Any, eye: Any) -> None:
+    parameter = () if asked.blend is None else asked.blend.parameter
+    names = {"the eye": eye, "the roughness": parameter, "the scene": (mesh, part), "the points": asked.points}
     wrong = [name for name, value in names.items() if not known(value)]
     if wrong:
         raise ValueError(
@@ -312,57 +201,55 @@ def _check(mesh: Mesh, part: SharpPart, points: Points | None, eye: Any, paramet
         )
 
 
-def _rows(mesh: Mesh, surfaces: Sequence[Surface], found: Sequence[tuple], *, keep: bool):
-    """Slots of all rays; and the hits of each part in rows of few lengths, so that views share compiled programs."""
-    cast = caster(mesh)
+def _rows(stage: Stage, cast: Caster, found: Sequence[tuple], *, keep: bool) -> tuple[list[Any], tuple[HitRow, ...]]:
+    """Slots of all rays, and the hits of each group in rows of one length."""
     shape = [each[0].shape for each in found]
     triangle = np.concatenate([np.zeros(0, int), *(each[0].ravel() for each in found)])
     weight = np.concatenate([np.zeros((0, 3), np.float32), *(each[1].reshape(-1, 3) for each in found)])
     start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(each[2], (len(each[0]), 1)) for each in found)])
     variance = np.concatenate([np.zeros(0, np.float32), *(each[3].ravel() for each in found)])
-    part = np.where(triangle >= 0, cast.part[triangle], -1)
+    part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
+    group = np.where(part >= 0, stage.place.group[part], -1)
     slot, rows, total = np.full(len(triangle), -1, np.int32), [], 0
-    for number, surface in enumerate(surfaces):
-        index = np.flatnonzero(part == number)
+    for number in range(len(stage.surfaces)):
+        index = np.flatnonzero(group == number)
         if not len(index):
             continue
         slot[index] = total + np.arange(len(index))
-        length = CHUNK if len(index) > CHUNK else max(_FEWEST, 1 << (len(index) - 1).bit_length())
-        count = -(-len(index) // length)
-        total += count * length
+        count = -(-len(index) // canvas.ROW)
+        total += count * canvas.ROW
         # Padding repeats the last hit.
-        index = np.pad(index, (0, count * length - len(index)), mode="edge").reshape(count, length)
+        index = np.pad(index, (0, count * canvas.ROW - len(index)), mode="edge").reshape(count, canvas.ROW)
         for each in index:
-            points = Points(jnp.asarray(cast.face[triangle[each]].T - surface.first), jnp.asarray(weight[each].T))
-            eye, wide = jnp.asarray(start[each]), jnp.asarray(variance[each])
-            matte = _is_matte(surface)
-            kept = look(surface, points, eye, at_pixels=not matte, variance=wide) if keep else None
-            rows.append(HitRow(number, points, eye, wide, kept))
+            corner = cast.face[triangle[each]].T.astype(np.int32)
+            places = corner, corner - stage.shift[corner[0]]
+            still = np.zeros((2, 3, canvas.ROW), weight.dtype)
+            points, own = (put(Points(place, weight[each].T.copy(), still)) for place in places)
+            eye, wide = put((start[each], variance[each]))
+            row = HitRow(number, points, own, eye, wide, None)
+            rows.append(dataclasses.replace(row, kept=_viewed(stage, row)) if keep else row)
     slot = np.where(slot < 0, total, slot)
     ends = np.cumsum([np.prod(each) for each in shape])[:-1] if shape else []
     return [each.reshape(size) for each, size in zip(np.split(slot, ends), shape, strict=True)], tuple(rows)
 
 
-def _is_matte(surface: Surface) -> bool:
-    """Whether a part looks the same from everywhere, so that the radiance of its vertices serves all rays."""
-    return isinstance(surface.shading.brdf, Lambert)
-
-
-@jit
 def _read(own: Sequence[Carried], rows: Sequence[Array], lamp: Array | None) -> list[Array]:
     """The weighted sum over rays of the radiance that they read."""
     colors = max([1, *(each.shape[1] for each in rows)])
+    host = known(rows, own)
+    xp = np if host else jnp  # The number of hits depends on the view.
     dtype = jnp.result_type(float) if not rows else rows[0].dtype
-    flat = [jnp.broadcast_to(each, (len(each), colors)) for each in rows]
-    color = jnp.concatenate([*flat, jnp.zeros((1, colors), dtype)])
-    result = []
-    for each in own:
-        pairs = zip(each.slot, each.weight, strict=True)
-        read = reduce(jnp.add, (color.at[slot].get(mode="promise_in_bounds") * weight for slot, weight in pairs))
-        if lamp is not None and each.lamp is not None:
-            read = read + jnp.einsum("nc,nvc->vc", lamp, each.lamp, precision="highest")
-        result.append(read)
-    return result
+    flat = [xp.broadcast_to(xp.asarray(each), (len(each), colors)) for each in rows]
+    color = xp.concatenate([*flat, xp.zeros((1, colors), dtype)])
+    return [_weighed(color[xp.asarray(each.slot)], each.weight, lamp, each.lamp) for each in own]
+
+
+@jit
+def _weighed(read: Array, weight: Array, lamp: Array | None, share: Array | None) -> Float[Array, "v c"]:
+    result = reduce(jnp.add, (color * each for color, each in zip(read, weight, strict=True)))
+    if lamp is None or share is None:
+        return result
+    return result + jnp.einsum("nc,nvc->vc", lamp, share, precision="highest")
 
 
 def check_rays(rays: Any) -> None:

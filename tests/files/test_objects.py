@@ -86,6 +86,8 @@ def value(hint, random, name=""):
         return plain[hint]
     if hint in (prt.System, prt.systems.protocol.VertexSystem):
         hint = prt.harmonic.DiffuseSystem  # Any system will do.
+    if hint is prt.systems.standard.StandardTable:
+        return prt.systems.standard.METALLIC_ROUGHNESS
     if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
         return filled(hint, random)
     return {"coordinates": hemisphere.polar_coordinates, "chart": navigation._log_roughness}.get(

@@ -119,12 +119,15 @@ def test_another_material_has_its_own_weights_whatever_the_scale(name, close):
     close(blended(shading, shown.blend, wi, wo), expected, tolerance=2e-5)
 
 
-def test_channels_that_no_vertex_needs_are_left_out():
+def test_materials_with_the_standard_tables_have_all_channels_and_others_those_that_they_need():
     terms = {name: of_part(patch(textured(*each))).term for name, each in MATERIALS.items()}
-    assert terms["smooth"] == (1, 2)
-    assert terms["color"] == terms["metallic"] == terms["ior"] == (0, 1, 2)
-    assert terms["specular"] == terms["tint"] == (0, 1, 2, 3)
+    assert all(terms[name] == (0, 1, 2, 3) for name in ("smooth", "color", "metallic", "ior", "specular", "tint"))
+    assert terms["roughness"] == (0, 1, 2)  # anisotropic
     assert terms["diffuse"] == (3,)
+    alone = {name: of_part(patch(textured(*each)), takes=lambda table: False).term for name, each in MATERIALS.items()}
+    assert alone["smooth"] == (1, 2)
+    assert alone["color"] == alone["metallic"] == alone["ior"] == (0, 1, 2)
+    assert alone["specular"] == alone["tint"] == (0, 1, 2, 3)
 
 
 def test_what_is_ideally_diffuse_is_a_white_lambert_brdf_without_knots():
@@ -148,7 +151,7 @@ def test_what_emits_nothing_has_none():
 
 def test_weights_of_channels_are_about_one_except_for_rare_ones():
     """A fit of all channels together is then about what is seen."""
-    shading = of_part(patch(textured(*MATERIALS["metallic"])))
+    shading = of_part(patch(textured(*MATERIALS["metallic"])), takes=lambda table: False)
     mean = np.mean(np.asarray(shading.blend.weight), (0, 2))
     assert np.all((mean > 1e-3) & (mean < 1.001))
     assert np.any(mean > 0.99)
@@ -157,7 +160,7 @@ def test_weights_of_channels_are_about_one_except_for_rare_ones():
 @pytest.mark.parametrize(("low", "high"), [(0.2, 1.0), (0.0, 0.5), (0.4, 0.41)])
 def test_knots_cover_the_roughness_in_steps_of_less_than_one_and_a_half(low, high):
     rough = jnp.linspace(low, high, COUNT).reshape(ROWS, COLUMNS, 1)
-    shading = of_part(patch(textured({}, {"roughness": rough})))
+    shading = of_part(patch(textured({"anisotropy": 0.2}, {"roughness": rough})))
     (knot,) = shading.knot
     (parameter,) = shading.blend.parameter
     np.testing.assert_allclose(np.exp(knot[[0, -1]]), [max(low, 1e-3**0.5), high], rtol=1e-6)
@@ -166,29 +169,21 @@ def test_knots_cover_the_roughness_in_steps_of_less_than_one_and_a_half(low, hig
     assert np.diff(knot).max() <= np.log(1.5) + 1e-6
 
 
-def test_a_part_may_be_made_ready_for_more_roughness_than_it_has():
+def test_a_part_with_the_standard_tables_takes_any_roughness():
     part = patch(TexturedMaterial(roughness=0.3, metallic=0.5))
-    shading = of_part(part, roughness=(0.1, 0.6))
-    (knot,) = shading.knot
-    np.testing.assert_allclose(np.exp(knot[[0, -1]]), (0.1, 0.6), rtol=1e-6)
+    shading = of_part(part)
     np.testing.assert_allclose(shading.blend.parameter[0], np.log(0.3), rtol=1e-6)
-    other = appearance(part, shading, TexturedMaterial(roughness=0.1, metallic=0.5)).blend
-    np.testing.assert_allclose(other.parameter[0], np.log(0.1), rtol=1e-6)
     wi, wo = pairs()
-    right = evaluated(at_vertices({"roughness": 0.1, "metallic": 0.5}, {}), wi, wo)
-    np.testing.assert_allclose(blended(shading, other, wi, wo), right, rtol=2e-4, atol=1e-5)
-    with pytest.raises(ValueError, match=r"roughness from 0.100 to 0.600, got a material from 0.700"):
-        appearance(part, shading, TexturedMaterial(roughness=0.7, metallic=0.5))
-
-
-def test_a_part_made_ready_from_no_roughness_on_takes_all_below_its_smoothest_table():
-    part = patch(TexturedMaterial(roughness=0.3, metallic=1.0))
-    shading = of_part(part, roughness=(0.0, 0.3))
-    appearance(part, shading, TexturedMaterial(roughness=0.0, metallic=1.0))
+    for roughness in (0.0, 0.1, 1.0):
+        other = appearance(part, shading, TexturedMaterial(roughness=roughness, metallic=0.5)).blend
+        np.testing.assert_allclose(other.parameter[0], np.log(max(roughness, 1e-3**0.5)), atol=1e-6)
+        right = evaluated(at_vertices({"roughness": max(roughness, 1e-3**0.5), "metallic": 0.5}, {}), wi, wo)
+        np.testing.assert_allclose(blended(shading, other, wi, wo), right, rtol=2e-4, atol=1e-5)
 
 
 def test_roughness_of_one_value_needs_no_knots():
-    shading = of_part(patch(textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})))
+    even = textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})
+    shading = of_part(patch(even), takes=lambda table: False)
     assert shading.knot == shading.blend.parameter == ()
     assert isinstance(shading.brdf, Channels)
     np.testing.assert_allclose(shading.brdf.model[0].roughness, 0.4, rtol=1e-6)

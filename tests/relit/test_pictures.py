@@ -1,12 +1,15 @@
 """Pictures of scenes: radiance and textures at pixels, against exact pixels, closed forms and the vertices."""
 
+import contextlib
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import monitoring
 
 import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
@@ -33,8 +36,7 @@ def small(coarse, bound):
     with pytest.MonkeyPatch.context() as patch:
         bound(patch, lobe.tabulate, resolution=12)
         bound(patch, bounces.precompute, edge=2, size=8, components=8, modes=8)
-        patch.setattr(canvas, "CHUNK", 64)
-        patch.setattr(canvas, "_FEWEST", 16)
+        patch.setattr(canvas, "ROW", 64)
         yield
 
 
@@ -130,7 +132,7 @@ def test_a_kept_view_gives_the_picture_of_every_light(bounced, close):
     view = ready.picture_view(CAMERA)
     for seed in (1, 2):
         close(view.picture(light(seed)), ready.picture(light(seed), CAMERA), tolerance=1e-5)
-    assert {each.at_pixels for each in view.part} == {True, False}
+    assert {row.number for row in view.rows} == {0, 1}
 
 
 def test_bounces_are_in_the_picture():
@@ -329,17 +331,67 @@ def test_pictures_of_regions_are_shaded_where_their_pixels_are():
         np.testing.assert_allclose(picture, expected, atol=1e-4)
 
 
-def test_moving_the_camera_compiles_nothing_anew(caplog):
-    ready = relit()
-    count = set()
-    for k in range(3):
-        camera = dataclasses.replace(CAMERA, eye=CAMERA.eye * (1 + 0.02 * k))
-        if k == 2:
-            jax.config.update("jax_log_compiles", True)
-        count.add(int((ready.picture_view(camera).canvas.pixels.triangle >= 0).sum()))
-    jax.config.update("jax_log_compiles", False)
-    assert len(count) == 3
-    assert not [each for each in caplog.messages if "Compiling" in each]
+@contextlib.contextmanager
+def compiled() -> Iterator[list[str]]:
+    """The programs that are compiled, or loaded from a cache, in a block."""
+    events: list[str] = []
+
+    def listen(event: str, *_, **more) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(str(more))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        monitoring.unregister_event_duration_listener(listen)
+
+
+def balls(parts: int = 2, *, seed: int = 0) -> Scene:
+    """A scene of several parts of one kind and a matte ground, of sizes that do not depend on the seed."""
+    random = np.random.default_rng(seed)
+    sphere, flat = builtin.sphere(rings=5, sectors=8), scene().parts[0]
+    made = [flat]
+    for number in range(parts):
+        position = 0.3 * np.asarray(sphere.position) + random.uniform(-1, 1, 3) + [0, 1.2, 0]
+        own = TexturedMaterial(random.uniform(0.2, 0.9, 3), metallic=number % 2, roughness=random.uniform(0.5, 0.9))
+        made.append(Part(f"ball {seed} {number}", make_mesh(position, sphere.face, normal=sphere.normal), own))
+    return Scene(made)
+
+
+def made(scene: Scene) -> RelitScene:
+    return prt.precompute(scene, system=Lobes(texels=8), size=SIZE, progress=False)
+
+
+def test_new_cameras_lights_materials_and_scenes_of_the_same_sizes_compile_nothing():
+    ready, another = made(balls()), balls(seed=1)
+    eyes = [np.asarray(CAMERA.eye) * np.float32(1 + 0.1 * k) for k in range(1, 4)]
+    red = TexturedMaterial((0.8, 0.1, 0.1), metallic=0.0, roughness=0.7)
+    ready.picture(light(), CAMERA)
+    ready.picture(light(), CAMERA, materials={"ball 0 0": red})
+    with compiled() as events:
+        points = set()
+        for k, eye in enumerate(eyes):
+            camera = dataclasses.replace(CAMERA, eye=eye)
+            ready.picture(light(k), camera)
+            points.add(int(np.sum(ready.picture_view(camera).pixels.triangle >= 0)))
+        assert len(points) == 3
+        blue = TexturedMaterial((0.1, 0.1, 0.8), metallic=1.0, roughness=0.6)
+        ready.picture(light(), CAMERA, materials={"ball 0 0": blue, "ball 0 1": red})
+        made(another).picture(light(2), CAMERA)
+    assert not events
+
+
+def test_the_number_of_programs_does_not_depend_on_the_number_of_parts():
+    counts = []
+    for parts in (3, 30):
+        scene = balls(parts)
+        jax.clear_caches()
+        with compiled() as events:
+            made(scene).picture(light(), CAMERA)
+        counts.append(len(events))
+    assert counts[1] <= counts[0] + 2
+    assert counts[1] <= 55  # with some small ones of the test's own cubemaps
 
 
 @pytest.mark.usefixtures("unchecked")

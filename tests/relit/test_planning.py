@@ -87,30 +87,32 @@ def test_the_error_asked_for_holds_from_other_views_and_under_another_light(scen
 
 def test_the_report_has_the_error_of_every_part(scene, sky, planned, ready):
     found = ready.report([sky, Environment(jnp.ones((6, 8, 8, 3)))])
-    assert [(each.name, each.vertices) for each in found.part] == [(each.name, each.vertices) for each in planned.part]
-    for each, part in zip(found.part, planned.part, strict=True):
+    alone = {name: group for group in planned.group for name in group.names}
+    assert [(each.name, each.vertices) for each in found.part] == [(n, alone[n].vertices) for n in planned.names]
+    for each in found.part:
+        part = alone[each.name]
         assert len(each.errors) == len(each.vertex_errors) == 2
         assert 0 < each.vertex_errors[0] < 2 * part.chosen.error + 0.01
         assert each.errors[0] < 2 * (part.chosen.error + part.mesh_error) + 0.05
     assert 0 < found.uncertainty[0] < found.errors[0] < 1
-    assert found.nbytes == prt.memory(ready.system)
+    assert found.nbytes == ready.nbytes
     assert str(found).count("off by") == 4
 
 
 def test_bytes_are_those_of_what_is_made(planned, ready):
-    assert planned.nbytes == pytest.approx(prt.memory(ready.system), rel=0.2)
+    assert planned.nbytes == pytest.approx(ready.nbytes, rel=0.2)
     assert planned.seconds > 0
 
 
 def test_of_what_meets_the_error_at_the_rate_the_smallest_is_chosen(planned):
-    for part in planned.part:
-        good = [each for each in part.considered if each.error * planning.MARGIN <= ASKED]
-        assert part.chosen.nbytes == min(each.nbytes for each in good)
+    for group in planned.group:
+        good = [each for each in group.considered if each.error * planning.MARGIN <= ASKED]
+        assert group.chosen.nbytes == min(each.nbytes for each in good)
 
 
 def test_what_is_matte_is_lit_by_transfer_vectors(planned, ready):
     assert isinstance(planned.recipes["ground"], Harmonics)
-    assert isinstance(ready.direct.part[1], prt.harmonic.DiffuseSystem)
+    assert isinstance(ready.part_system(1), prt.harmonic.DiffuseSystem)
 
 
 def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_path):
@@ -127,8 +129,8 @@ def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_pa
 def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
     part = prt.Scene([scene["ground"]])
     found = prt.plan(part, environments=[sky], error=ASKED, rate=1e9, progress=False)
-    good = [each for each in found.part[0].considered if each.error * planning.MARGIN <= ASKED]
-    assert found.part[0].chosen.seconds == min(each.seconds for each in good)
+    good = [each for each in found.group[0].considered if each.error * planning.MARGIN <= ASKED]
+    assert found.group[0].chosen.seconds == min(each.seconds for each in good)
     assert "slower than the 1e+09 frames per second asked for" in str(found)
 
 
@@ -148,8 +150,8 @@ def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky,
         ready = prt.precompute(part, **options)
     found = prt.files.load(tmp_path / "plan")
     assert found.asked == 1e-6
-    assert found.part[0].chosen.error == min(each.error for each in found.part[0].considered)
-    assert ready.direct.part[0].vertices == len(scene["ground"].mesh.position)
+    assert found.group[0].chosen.error == min(each.error for each in found.group[0].considered)
+    assert ready.part_system(0).vertices == len(scene["ground"].mesh.position)
     prt.precompute(part, **options)  # The kept plan serves again,
     with pytest.raises(ValueError, match="error must be at least"):  # but not one who insists.
         prt.precompute(part, error=1e-6, **options)
@@ -243,12 +245,12 @@ def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_
         prt.plan(ground, **options)
     monkeypatch.setattr(sampling.Sample, "measure", counted)
     found = prt.plan(ground, **options)
-    assert [each.recipe for each in found.part[0].considered] == measured
+    assert [each.recipe for each in found.group[0].considered] == measured
     assert len(measured) > 1
     assert str(prt.plan(ground, **options)) == str(found)
-    assert len(measured) == len(found.part[0].considered)
+    assert len(measured) == len(found.group[0].considered)
     prt.plan(ground, **options | {"environments": [Environment(2 * sky.radiance)]})
-    assert len(measured) == 2 * len(found.part[0].considered)
+    assert len(measured) == 2 * len(found.group[0].considered)
 
 
 def test_bounces_are_planned_by_what_they_bring(planned):
@@ -303,5 +305,5 @@ def test_a_brdf_that_is_not_finite_has_no_plan(scene, sky):
 
 
 def test_lobes_are_left_out_where_less_than_they_need_is_enough(planned):
-    considered = next(part.considered for part in planned.part if part.name == "ground")
+    considered = next(group.considered for group in planned.group if "ground" in group.names)
     assert not any(isinstance(each.recipe, Lobes) for each in considered)

@@ -84,7 +84,7 @@ def light(seed: int = 3) -> Environment:
 
 
 RECIPES = {
-    "lobe": Lobes(lobes=4, texels=8),
+    "lobe": Lobes(texels=8),
     "harmonic": Harmonics(degree=3),
     "separable": Terms(terms=4, keep=384, resolution=16),
     "clusters": Clusters(terms=4, components=16, resolution=16, keep=384, texels=4),
@@ -257,15 +257,12 @@ def reflecting():
 
 
 def test_bounces_are_added_to_direct_light(reflecting):
-    blends = [each.blend for each in reflecting.shading]
-    direct, reflected = (
-        prt.radiance(each, light(), eye=EYE, materials=blends) for each in (reflecting.direct, reflecting.bounces)
-    )
-    whole = reflecting.radiance(light(), eye=EYE)
-    np.testing.assert_allclose(whole, direct + reflected, rtol=1e-4, atol=1e-5)
+    direct, whole = (each.radiance(light(), eye=EYE) for each in (reflecting.direct, reflecting))
+    reflected = whole - direct
+    assert float(jnp.min(reflected)) > -1e-3
     np.testing.assert_allclose(direct, relit("harmonic").radiance(light(), eye=EYE), rtol=1e-4, atol=1e-5)
     assert 0.02 < np.linalg.norm(reflected) / np.linalg.norm(direct) < 0.5
-    assert prt.memory(reflecting) > prt.memory(reflecting.direct)
+    assert reflecting.nbytes > reflecting.direct.nbytes
 
 
 def test_lights_of_small_faces_have_bounces(monkeypatch):
@@ -300,8 +297,10 @@ def test_a_second_bounce_off_a_material_of_channels_is_kept():
         for count in (1, 2)
     )
     assert twice.bounces.tensor.second is not None
-    blends = [each.blend for each in once.shading]
-    first, both = (prt.radiance(each.bounces, light(), eye=EYE, materials=blends)[:, 0].sum() for each in (once, twice))
+    direct, first, both = (
+        each.radiance(light(), eye=EYE)[:, 0].sum() for each in (once.without_bounces(), once, twice)
+    )
+    first, both = first - direct, both - direct
     assert 1.03 < both / first < 1.5
 
 
@@ -309,7 +308,7 @@ def test_two_bounces_go_on_from_the_store_of_one(tmp_path, monkeypatch):
     def reflected(count):
         options = {"system": RECIPES["harmonic"], "size": SIZE, "path": tmp_path / "store", "progress": False}
         ready = prt.precompute(scene(), bounces=count, **options)
-        return prt.radiance(ready.bounces, light(), eye=EYE, materials=[each.blend for each in ready.shading])
+        return ready.radiance(light(), eye=EYE) - ready.direct.radiance(light(), eye=EYE)
 
     once = reflected(1)
     stage, done = visibility.blocks.compute, []
@@ -346,7 +345,7 @@ def test_a_saved_scene_relights_bit_for_bit(tmp_path):
 def test_memory_counts_every_array_once():
     ready = relit("lobe")
     arrays = {id(each): each.nbytes for each in jax.tree.leaves(ready)}
-    assert prt.memory(ready) == sum(arrays.values()) > prt.memory(ready.system) > 0
+    assert prt.memory(ready) == sum(arrays.values()) > ready.nbytes > 0
 
 
 def test_pictures_show_the_radiance_before_the_light():
@@ -359,8 +358,9 @@ def test_pictures_show_the_radiance_before_the_light():
 
 
 def test_the_camera_is_the_scenes_first_or_one_that_sees_all():
-    system = relit("harmonic").direct, relit("harmonic").shading
-    with_camera = RelitScene(scene(cameras=[CAMERA, orbit(mesh("ball"))]), *system)
+    ready = relit("harmonic")
+    made_of = ready.shading, ready.place, [surface.system for surface in ready.surfaces]
+    with_camera = RelitScene(scene(cameras=[CAMERA, orbit(mesh("ball"))]), *made_of)
     np.testing.assert_array_equal(with_camera.picture(light()), relit("harmonic").picture(light(), CAMERA))
     around = relit("harmonic").camera
     half, away = around.field_of_view / 2, np.asarray(scene().mesh.position - around.eye)
@@ -431,11 +431,6 @@ def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for size in (0, 12, -8):
         with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
             prt.precompute(scene(), system="harmonic", size=size)
-    for rough in ((0.5, 0.1), (-0.1, 0.2), (0.1, 1.2), (0.1,), (float("nan"), 1.0), 0.5):
-        with pytest.raises(ValueError, match="roughness must be two numbers from 0 to 1, the smaller one first, got"):
-            prt.precompute(scene(), system="harmonic", roughness=rough)
-    with pytest.raises(ValueError, match="roughness must be given together with a system"):
-        prt.precompute(scene(), roughness=(0.1, 0.5))
     with pytest.raises(ValueError, match=r"bounces must be at least 0, .* got -1"):
         prt.precompute(scene(), system="harmonic", bounces=-1)
     for count, error in ((1.5, TypeError), (True, TypeError), ("2", ValueError)):
@@ -456,10 +451,12 @@ MATERIALS = {
         "'floor' must be of class TexturedMaterial or BlinnPhong or Appearance or Blend, which",
     ),
     "brdf": ({"ball": wood()}, TypeError, "the material of part 'ball' is a BRDF, which cannot be replaced"),
-    "rougher": ({"floor": wood(roughness=1.0)}, ValueError, "part 'floor' was precomputed for roughness from 0."),
-    "term": ({"floor": wood(specular=0.5)}, ValueError, "part 'floor' was precomputed without the terms"),
-    "shape": ({"floor": prt.Blend(jnp.ones((3, 3, 3)))}, ValueError, "[36 vertices, 3 channels, c], got [3, 3, 3]"),
-    "parameter": ({"floor": prt.Blend(jnp.ones((36, 3, 3)))}, ValueError, "needs 1 parameters"),
+    "shape": (
+        {"floor": prt.Blend(jnp.ones((3, 3, 3)), (jnp.zeros(3),))},
+        ValueError,
+        "[36 vertices, 4 channels, c], got [3, 3, 3]",
+    ),
+    "parameter": ({"floor": prt.Blend(jnp.ones((36, 4, 3)))}, ValueError, "must have 1 parameters, got 0 parameters"),
 }
 
 
@@ -471,7 +468,16 @@ def test_materials_that_a_scene_cannot_have_are_refused(name):
         relit("lobe").radiance(light(), eye=EYE, materials=materials)
 
 
-def test_a_gradient_in_a_roughness_that_was_not_precomputed_says_so():
+@pytest.mark.parametrize("name", ["lobe", "harmonic"])
+def test_a_part_takes_any_metallic_roughness_material(name, close):
+    """Other terms and roughness than the part was precomputed with; the system is that of the new material."""
+    for new in (wood(roughness=1.0), wood(rough=False, roughness=0.2, specular=0.3), TexturedMaterial(0.8)):
+        again = prt.precompute(scene(new), system=RECIPES[name], size=SIZE, progress=False)
+        color = relit(name).radiance(light(), eye=EYE, materials={"floor": new})
+        close(color, again.radiance(light(), eye=EYE), tolerance=1e-5)
+
+
+def test_radiance_has_a_gradient_in_the_roughness_of_a_part():
     ready = relit("lobe")
     floor = ready.scene["floor"].material
 
@@ -479,8 +485,9 @@ def test_a_gradient_in_a_roughness_that_was_not_precomputed_says_so():
         changed = {"floor": eqx.tree_at(lambda each: each.roughness, floor, roughness)}
         return jnp.sum(ready.radiance(light(), eye=EYE, materials=changed))
 
-    with pytest.raises(ValueError, match=r"'floor' was precomputed for roughness from .* got a material from 0\."):
-        jax.grad(total)(jnp.asarray(1.0))
+    slope = jax.grad(total)(jnp.asarray(0.7))
+    step = (total(0.703) - total(0.697)) / 0.006
+    np.testing.assert_allclose(slope, step, rtol=0.05)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -1,0 +1,433 @@
+"""The vertices of a scene as a few groups of arrays: one for all parts whose materials are of one kind.
+
+A program depends on the kind of a group and on padded sizes, and not on parts, names or views. Parts stand one after
+another in their group, and where each part stands is known on the host.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxprt.compile import compile_time, jit, known, put, shared_size
+from jaxprt.relit import channels
+from jaxprt.relit.channels import Appearance, Shading
+from jaxprt.scene import Environment, Mesh
+from jaxprt.scene import origin as origins
+from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
+from jaxprt.scene.points import Points
+from jaxprt.systems.bounces import GroupBounces, ReflectingPart
+from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.bright_texels import BrightTexels
+from jaxprt.systems.harmonic import DiffuseSystem
+from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.protocol import Blend, System
+
+_FEWEST = 64  # vertices of a group
+
+
+class Surface(eqx.Module):
+    """The vertices of a group, with everything that their shading requires.
+
+    Attributes:
+        system: The system of direct light from the environment.
+        reflecting: How they reflect light from other surfaces; None without bounces.
+        lit: How they reflect light from lamps; None without lamps.
+        scale: Factor of each channel of the BRDF; None for a BRDF that cannot change.
+        term: Indices of the channels among the coefficients of a `Look`.
+        varies: Whether the system takes the roughness of each point.
+    """
+
+    system: System
+    reflecting: ReflectingPart | None
+    lit: LitByLamps | None
+    scale: Float[Array, " k"] | None
+    term: tuple[int, ...] = eqx.field(static=True)
+    varies: bool = eqx.field(static=True)
+
+    def blend(self, look: Look) -> Blend | None:
+        """Weights of the channels at points with given materials."""
+        if self.scale is None:
+            return None
+        return channels.blend(look, self.term, self.scale, varies=self.varies)
+
+    @property
+    def matte(self) -> bool:
+        """Whether the surface is ideally diffuse."""
+        own = self.system.system if isinstance(self.system, BrightTexels) else self.system
+        return isinstance(own, DiffuseSystem)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the BRDF whose weights may vary."""
+        return 1 if self.scale is None else len(self.term)
+
+    def sampled(self, samples: int) -> "Surface":
+        """The surface with another number of sample points along the edge of each bright texel."""
+        if not isinstance(self.system, BrightTexels) or self.system.samples == samples:
+            return self
+        return dataclasses.replace(self, system=dataclasses.replace(self.system, samples=samples))
+
+
+class Given(eqx.Module):
+    """Materials that users give at the vertices of some parts of a group, in place of evaluated ones.
+
+    Attributes:
+        blend: Weights of the channels at all vertices of the group.
+        emitted: Radiance that they emit.
+        flag: 1 at vertices of these parts, 0 at others.
+    """
+
+    blend: Blend
+    emitted: Float[Array | np.ndarray, "v 3"]
+    flag: Float[Array | np.ndarray, " v"]
+
+
+class Place(eqx.Module):
+    """Where the vertices of all parts stand, on the host.
+
+    Attributes:
+        counts: Number of vertices of each part.
+        parts: Indices of the parts of each group.
+        size: Number of vertices of each group, with padding.
+    """
+
+    counts: tuple[int, ...] = eqx.field(static=True)
+    parts: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    size: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, counts: Sequence[int], parts: Sequence[Sequence[int]], joins: Sequence[bool]) -> "Place":
+        """The places of parts with given numbers of vertices. Groups whose recipe does not join parts have no padding.
+
+        Args:
+            counts: Number of vertices of each part.
+            parts: Indices of the parts of each group.
+            joins: Whether the recipe of each group joins parts.
+        """
+        exact = [sum(counts[number] for number in own) for own in parts]
+        pairs = zip(exact, joins, strict=True)
+        size = [max(shared_size(count), _FEWEST) if padded else count for count, padded in pairs]
+        return cls(tuple(counts), tuple(tuple(own) for own in parts), tuple(size))
+
+    @property
+    def group(self) -> Int[np.ndarray, " n"]:
+        """Group of each part."""
+        result = np.empty(len(self.counts), np.int32)
+        for number, own in enumerate(self.parts):
+            result[list(own)] = number
+        return result
+
+    @property
+    def first(self) -> Int[np.ndarray, " n"]:
+        """Index of the first vertex of each part in the scene."""
+        return np.cumsum([0, *self.counts])[:-1].astype(np.int32)
+
+    @property
+    def start(self) -> Int[np.ndarray, " n"]:
+        """Index of the first vertex of each part in its group."""
+        result = np.empty(len(self.counts), np.int32)
+        for own in self.parts:
+            result[list(own)] = np.cumsum([0, *(self.counts[number] for number in own)])[:-1]
+        return result
+
+    @property
+    def shift(self) -> Int[np.ndarray, " n"]:
+        """Index of a vertex of each part in the scene, minus its index in its group."""
+        return self.first - self.start
+
+    def order(self) -> Int[np.ndarray, " v"]:
+        """Index of each vertex of the scene among the vertices of all groups."""
+        begin = np.cumsum([0, *self.size])[self.group] + self.start
+        return np.concatenate([first + np.arange(n) for first, n in zip(begin, self.counts, strict=True)])
+
+    def column(self, number: int, rows: Sequence[Any]) -> Any:
+        """One array of a group from those of its parts. Padding repeats the last row."""
+        xp = np if known(rows) else jnp
+        whole = xp.concatenate([xp.asarray(row) for row in rows])
+        room = [(0, self.size[number] - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
+        return xp.pad(whole, room, mode="edge")
+
+    def gathered(self, number: int, appearances: Sequence[Appearance]) -> Appearance:
+        """The appearance of a group from those of all parts."""
+        own = [appearances[part] for part in self.parts[number]]
+        emitted = None
+        if any(each.emitted is not None for each in own):
+            none = [np.zeros((self.counts[part], 3), jnp.result_type(float)) for part in self.parts[number]]
+            pairs = zip(own, none, strict=True)
+            emitted = self.column(number, [zero if each.emitted is None else each.emitted for each, zero in pairs])
+        if own[0].blend is None:
+            return Appearance(None, emitted)
+        blends = [each.blend for each in own if each.blend is not None]
+        colors = max(blend.weight.shape[2] for blend in blends)
+        wide = [_colored(blend.weight, colors) for blend in blends]
+        parameter = zip(*(blend.parameter for blend in blends), strict=True)
+        each = tuple(self.column(number, rows) for rows in parameter)
+        return Appearance(Blend(self.column(number, wide), each), emitted)
+
+
+def _colored(weight: Any, colors: int) -> Any:
+    """Weights repeated to a number of colors."""
+    if weight.shape[2] == colors:
+        return weight
+    return (np if known(weight) else jnp).broadcast_to(weight, (*weight.shape[:2], colors))
+
+
+class SceneLight(eqx.Module):
+    """A light, before materials are known.
+
+    Attributes:
+        direct: The light in the form of the system of each group.
+        transferred: The light after bounces; None without.
+    """
+
+    direct: tuple[PyTree, ...]
+    transferred: PyTree
+
+
+class Arriving(eqx.Module):
+    """The light that arrives at a scene.
+
+    Attributes:
+        direct: Direct light, in the form of the system of each group.
+        reflected: Reflected light at the vertices of each group; None without bounces.
+        lamp: Radiance of each lamp; for a point light, its intensity. None without lamps.
+    """
+
+    direct: tuple[PyTree, ...]
+    reflected: tuple[PyTree, ...] | None
+    lamp: Float[Array, "n 3"] | None
+
+    def at(self, number: int) -> tuple[PyTree, PyTree, PyTree]:
+        """Direct light, reflected light and the lamps of a group."""
+        return self.direct[number], None if self.reflected is None else self.reflected[number], self.lamp
+
+
+class Stage(eqx.Module):
+    """A scene with its materials at present, as pictures and reflections take it.
+
+    Attributes:
+        whole: The mesh of all parts, whose regions are the parts.
+        mesh: The same mesh, padded to shared sizes with faces without area.
+        surfaces: One `Surface` for each group.
+        table: The materials of all parts.
+        rough: The roughness of all parts alone, where JAX traces other parameters; None where the table is known.
+        given: For each group, materials that users give at vertices; None without.
+        bend: Curvature of the radiance of each vertex, from `interpolation.curvature`.
+        place: Where the vertices of the parts stand.
+        samples: Number of sample points along the edge of each bright texel, for each part.
+        sharp: Whether narrow lobes of each part are traced by rays.
+        lamp: Index of the lamp that each part is; -1 for a part that does not emit.
+    """
+
+    whole: Mesh
+    mesh: Mesh
+    surfaces: tuple[Surface, ...]
+    table: MaterialTable
+    rough: MaterialTable | None
+    given: tuple[Given | None, ...]
+    bend: Float[Array, " v"]
+    place: Place
+    samples: tuple[int, ...] = eqx.field(static=True)
+    sharp: tuple[bool, ...] = eqx.field(static=True)
+    lamp: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def face(self) -> Int[Array | np.ndarray, "f 3"]:
+        """Triangles of the mesh, in NumPy unless JAX traces them."""
+        return np.asarray(self.mesh.face) if known(self.mesh.face) else self.mesh.face
+
+    @property
+    def part(self) -> Int[np.ndarray, " v"]:
+        """Part of each vertex."""
+        return np.repeat(np.arange(len(self.place.counts)), self.place.counts)
+
+    @property
+    def shift(self) -> Int[np.ndarray, " v"]:
+        """Index of each vertex, minus its index in its group."""
+        return self.place.shift[self.part]
+
+    @property
+    def matte(self) -> tuple[bool, ...]:
+        """Whether each group is ideally diffuse."""
+        return tuple(surface.matte for surface in self.surfaces)
+
+    @property
+    def sharp_groups(self) -> list[int]:
+        """Indices of the groups from which reflection rays start."""
+        return [number for number in range(len(self.surfaces)) if self.is_sharp(number)]
+
+    def is_sharp(self, number: int) -> bool:
+        """Whether reflection rays start from parts of a group."""
+        return isinstance(self.surfaces[number].reflecting, SharpPart)
+
+    def sharp_at(self, number: int, points: Points) -> Float[Array, " p"] | None:
+        """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""
+        if not self.is_sharp(number):
+            return None
+        flag = np.asarray(self.sharp, jnp.result_type(float))[self.part]
+        if known(points):
+            return put(flag[np.asarray(points.corner)[0]])
+        return jnp.asarray(flag)[points.corner[0]]
+
+    def look(self, points: Points) -> Look:
+        """The materials at points of the scene. Their roughness is known if it is for all parts."""
+        return look_at(self.table, self.rough, points)
+
+    def blend(self, number: int, points: Points, own: Points) -> Blend | None:
+        """Weights of the channels of a group's BRDF at points of the scene, which are `own` on the group."""
+        look = self.look(points)
+        with compile_time(look, own, self.given[number], self.surfaces[number].scale):
+            return material(self.surfaces[number], own, look, self.given[number])[0]
+
+    def vertices(self, parts: Sequence[int]) -> Iterator[tuple[Int[np.ndarray, " p"], Points, Points]]:
+        """Vertices of some parts of one group in rows: their indices in the group, and as points of scene and group.
+
+        The last row repeats its last vertex.
+        """
+        pairs = [(self.place.first[part], self.place.start[part], np.arange(self.place.counts[part])) for part in parts]
+        scene, group = (np.concatenate([pair[i] + pair[2] for pair in pairs]).astype(np.int32) for i in (0, 1))
+        for first in range(0, len(scene), ROW):
+            row = np.minimum(np.arange(first, first + ROW), len(scene) - 1)
+            yield group[row], at_vertices(scene[row]), at_vertices(group[row])
+
+    def alone(self, number: int, look: Look, channel: int) -> Look:
+        """The materials with weight 1 of one channel of a group's BRDF, and 0 of the others."""
+        surface = self.surfaces[number]
+        if surface.scale is None:
+            return look._replace(emitted=0 * look.emitted)
+        coefficient = np.zeros((1, *look.coefficient.shape[1:]), look.coefficient.dtype)
+        coefficient[0, surface.term[channel]] = np.asarray(surface.scale)[channel]
+        wide = jnp.broadcast_to(jnp.asarray(coefficient), look.coefficient.shape)
+        return look._replace(coefficient=wide, emitted=0 * look.emitted)
+
+
+def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:
+    """Projects an environment for the systems of all groups. Systems with the same `shared_light` share one result."""
+    made: dict[Any, PyTree] = {}
+    result = []
+    for own in surfaces:
+        key = own.system.shared_light
+        lit = own.system.light(environment) if key is None or key not in made else made[key]
+        if key is not None:
+            made[key] = lit
+        result.append(lit)
+    return SceneLight(tuple(result), None if bounces is None else bounces.light(environment))
+
+
+def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]]:
+    """Indices of the parts of each group: parts with one BRDF and one recipe, if the recipe joins parts."""
+    result: list[list[int]] = []
+    for number, (shading, recipe) in enumerate(zip(shadings, recipes, strict=True)):
+        for own in result:
+            if recipe.joins and recipes[own[0]] == recipe and alike(shadings[own[0]], shading):
+                own.append(number)
+                break
+        else:
+            result.append([number])
+    return result
+
+
+def alike(one: Shading, other: Shading) -> bool:
+    """Whether two parts have one BRDF, apart from the weights of its channels, and tables for the same roughness."""
+    if one.table is not None or other.table is not None:
+        return one.table is other.table
+    if (one.blend is None) != (other.blend is None) or one.term != other.term or len(one.knot) != len(other.knot):
+        return False
+    leaves, kind = zip(*(jax.tree.flatten((each.brdf, each.knot)) for each in (one, other)), strict=True)
+    if kind[0] != kind[1] or not all(eqx.is_array(leaf) for own in leaves for leaf in own):
+        return False
+    return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in zip(*leaves, strict=True))
+
+
+def joined(shadings: Sequence[Shading]) -> Shading:
+    """The `Shading` of several parts of one kind, without mesh; its weights are those of all their vertices."""
+    first = shadings[0]
+    if first.blend is None or len(shadings) == 1:
+        return first
+    blends = [shading.blend for shading in shadings if shading.blend is not None]
+    parameter = tuple(np.concatenate(rows) for rows in zip(*(blend.parameter for blend in blends), strict=True))
+    blend = Blend(np.concatenate([blend.weight for blend in blends]), parameter)
+    return dataclasses.replace(first, blend=blend)
+
+
+def surface(shading: Shading, system: System, reflecting: ReflectingPart | None, lit: LitByLamps | None) -> Surface:
+    """The group of parts of which one is given."""
+    scale = (
+        None
+        if shading.scale is None or shading.blend is None
+        else jax.device_put(np.asarray(shading.scale, jnp.result_type(float)))
+    )
+    return Surface(system, reflecting, lit, scale, shading.term, bool(shading.knot))
+
+
+def spread(values: Sequence[Any], counts: Sequence[int], size: int, dtype: Any) -> Any:
+    """A value of each part at all its vertices, padded."""
+    part = np.repeat(np.arange(len(counts)), counts)
+    part = np.pad(part, (0, max(size - len(part), 0)), mode="edge")
+    if known(values):
+        return put(np.asarray([float(each) for each in values], dtype)[part])
+    return jnp.stack([jnp.asarray(each, dtype) for each in values])[part]
+
+
+def padded(mesh: Mesh) -> Mesh:
+    """A mesh relative to its origin, padded to shared sizes: vertices repeat the last one, and faces have no area."""
+    if not known(mesh):
+        return mesh
+    count = shared_size(len(mesh.position)) - len(mesh.position)
+    fields = {name: getattr(mesh, name) for name in ("position", "normal", "tangent", "region")}
+    rows = {
+        name: np.pad(value, [(0, count)] + [(0, 0)] * (value.ndim - 1), mode="edge") for name, value in fields.items()
+    }
+    face = np.pad(mesh.face, ((0, shared_size(len(mesh.face)) - len(mesh.face)), (0, 0)))
+    return put(dataclasses.replace(mesh, **rows, face=face, texture=None, origin=origins.ZERO))
+
+
+@jit
+def ordered(colors: tuple[Float[Array, "_ _"], ...], order: Int[Array, " v"]) -> Float[Array, "v c"]:
+    """Colors of all vertices in the order of the scene, from those of the groups."""
+    most = max(each.shape[1] for each in colors)
+    return jnp.concatenate([jnp.broadcast_to(each, (len(each), most)) for each in colors])[order]
+
+
+def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -> Look:
+    """The materials at points.
+
+    Args:
+        table: The materials.
+        rough: Their roughness alone, if JAX traces other parameters, so that roughness is known; else None.
+        points: Points of the scene.
+    """
+    with compile_time(table, points):
+        look = table.at(points)
+    if rough is None:
+        return look
+    with compile_time(rough, points):
+        return look._replace(log_roughness=rough.at(points).log_roughness)
+
+
+@jit
+def material(
+    surface: Surface, points: Points, look: Look, given: Given | None
+) -> tuple[Blend | None, Float[Array, "p 3"]]:
+    """Weights of the channels at points of a group, and the radiance that they emit.
+
+    Args:
+        surface: The group.
+        points: The points.
+        look: The materials at the points.
+        given: Materials that users give at vertices.
+    """
+    blend = surface.blend(look)
+    if given is None or blend is None:
+        return blend, jnp.asarray(look.emitted)
+    own = points.carry(given.flag) > 0.5  # All corners belong to one part.
+    weight = jnp.where(own[:, None, None], points.carry(given.blend.weight), blend.weight)
+    pairs = zip(given.blend.parameter, blend.parameter, strict=True)
+    parameter = tuple(jnp.where(own, points.carry(one), other) for one, other in pairs)
+    return Blend(weight, parameter), jnp.where(own[:, None], points.carry(given.emitted), look.emitted)
