@@ -83,17 +83,20 @@ def described(found: Plan) -> dict[str, Any]:
 
     return {
         "asked": {"error": found.asked, "rate": found.rate, "light_size": found.size},
-        "parts": [
+        "groups": [
             {
-                "name": each.name,
+                "parts": list(each.names),
                 "vertices": each.vertices,
                 "mesh_error": float(each.mesh_error),
-                "reflected": [float(share) for share in found.reflected[:, number]],
                 "chosen": candidate(each.chosen),
                 "considered": [candidate(one) for one in each.considered],
             }
-            for number, each in enumerate(found.part)
+            for each in found.group
         ],
+        "reflected": {
+            name: [float(share) for share in shares]
+            for name, shares in zip(found.names, found.reflected.T, strict=True)
+        },
         "bounces": found.bounces,
         "error": float(found.error),
         "seconds": float(found.seconds),

@@ -20,8 +20,7 @@ from jaxprt.scene import Environment, Scene
 from jaxprt.view import serve
 from jaxprt.view.address import parse
 
-ROUGHNESS = (0.25, 0.8)  # range of materials' roughness; smoother materials take more time per look
-LOBES = 6
+LOBES = 8  # the smallest number whose tables are shipped; fewer lobes take less time per look
 _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads still compute
 
 
@@ -153,12 +152,11 @@ def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Envi
 def prepared(
     scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None
 ) -> RelitScene:
-    """The scene, precomputed by one recipe, for materials of any roughness in a range."""
+    """The scene, precomputed by one recipe."""
     return precompute(
         scene,
         system=recipe,
         bounces=bounces,
-        roughness=ROUGHNESS,
         size=next(iter(lights.values())).radiance.shape[-2],
         path=path,
         progress=sys.stderr.isatty(),

@@ -21,7 +21,7 @@ from jaxprt.relit import regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
 from jaxprt.relit.pictures import PictureView
-from jaxprt.relit.recipes import Known, Recipe, Target
+from jaxprt.relit.recipes import Known, Piece, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
@@ -158,8 +158,8 @@ def _made(view: View, output: Path, **options: Any) -> Made:
         ready = relit.precompute(view.scene, path=output, **options)
     except ValueError as error:
         raise ValueError(f"{error}; on the command line, name another --output" if found else str(error)) from error
-    direct = relit.RelitScene(ready.scene, ready.direct, ready.shading)
-    cost = {"seconds": timeit.default_timer() - start, "bytes": protocol.memory(ready)}
+    direct = ready.direct
+    cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
     return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
@@ -329,7 +329,7 @@ def sample(view: View, count: int) -> np.ndarray:
 
 def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[dict[str, Any]]:
     """Errors of one system at several sizes, on some vertices of the first part."""
-    shading = of_part(view.scene.parts[0])
+    shading = of_part(view.scene.parts[0], takes=lambda table: False)
     size = next(iter(view.lights.values())).radiance.shape[-2]
     target = Target(view.scene.mesh, size=size, vertex=vertex, progress=False)
     blend = None if shading.blend is None else jax.tree.map(lambda each: each[vertex], shading.blend)
@@ -362,7 +362,7 @@ def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> 
 
 def _separable(shading: Shading, target: Target):
     """Systems with several numbers of terms and kept coefficients."""
-    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, target)
+    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, [Piece(shading.mesh, target)])
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
         if terms <= full.brdf.terms:
             short = full.transport.truncate(keep, terms=terms)
@@ -374,7 +374,7 @@ def _harmonic(shading: Shading, target: Target):
     degree = max(TABLE_DEGREES)
     options = {"degree": degree, **target.traced(), "progress": False}
     full = harmonic.precompute(shading.mesh, **options)
-    brdf = harmonic.tabulate(shading.brdf, degree=degree, knot=shading.knot)
+    brdf = harmonic_table(shading, degree=degree)
     for degree, laplacian in itertools.product(TABLE_DEGREES, TABLE_LAPLACIAN):
         terms = (degree + 1) ** 2
         short = TransferMatrix(full.matrix[..., :terms, :terms], full.position, full.frame)
@@ -387,8 +387,9 @@ def _lobe(shading: Shading, target: Target):
     options = {"size": target.size, **target.traced(), "progress": False}
     seen = visibility.precompute(shading.mesh, **options)
     target = Target(target.occluder, size=target.size, vertex=target.vertex, known=Known(seen), progress=False)
+    pieces = [Piece(shading.mesh, target)]
     for lobes, texels in itertools.product(TABLE_LOBES, TABLE_TEXELS):
-        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
+        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, pieces)
 
 
 TABLES: dict[str, Callable] = {"separable": _separable, "harmonic": _harmonic, "lobe": _lobe}

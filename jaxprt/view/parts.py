@@ -9,11 +9,11 @@ from jaxtyping import Float
 
 from jaxprt.brdf import GGX, BlinnPhong
 from jaxprt.brdf.varying import Channels
-from jaxprt.relit.channels import Shading, ShininessFamily
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import TexturedMaterial
 from jaxprt.scene.material import Texture
-from jaxprt.systems import harmonic, lobe
+from jaxprt.systems import harmonic, lobe, standard
 from jaxprt.systems.lobe import pyramid, relight
 from jaxprt.view import matrices
 from jaxprt.view.reduced import (
@@ -29,7 +29,7 @@ from jaxprt.view.reduced import (
 )
 
 NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # for scenes without glossy parts
-_STARTS = ("first", "tableStart", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
+_STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
 _SHINY = [3, 4]  # terms by which the page's module represents `ShininessFamily`
 _SKY = 64  # most texels along the edge of a light's faces
 
@@ -41,10 +41,11 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
+    tables = _Tables()
     parts, stride = [], 0
-    arrays: list[list[np.ndarray]] = [[] for _ in range(7)]
+    arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
-        shading, table = reduced.shading[number], _table(part.name, system)
+        shading, (start, table) = reduced.shading[number], tables.add(part.name, system)
         weight, seen, described = _weights(shading, system), _means(system, level), _described(part.material, shading)
         own = None if bits is None else bits[number]
         bit = np.zeros((0, 0), np.uint8) if own is None else own
@@ -52,24 +53,55 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
         about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
         about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
-        parts.append(about | place)
+        parts.append(about | place | {"tableStart": start})
         weight = weight[:1] if described else weight
         stride = max(stride, seen.shape[1])
         rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
         normal = np.round(32767 * np.asarray(shading.mesh.normal))
-        kinds = "<i2", "i1", "u1", "<f4", "<f4", "i1", "u1"
-        for kept, array, kind in zip(arrays, (normal, rows[0], seen, table, weight, rows[1], bit), kinds, strict=True):
+        kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
+        for kept, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
             kept.append(array.astype(kind).reshape(-1))
         pairs = len(vector.T) * -(-(about["bands"] ** 2) // 2)
-        sizes = vector.shape[1], table.size // 4, weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
+        sizes = vector.shape[1], weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
         place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
     content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(reduced, level)}
     content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
     edge = 0 if bits is None else math.isqrt(8 * next(each.shape[1] for each in bits if each is not None) // 6)
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0}
     joined = [np.concatenate(each) for each in arrays]
+    joined.insert(3, tables.joined())
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     return content, [each.tobytes() for each in joined]
+
+
+class _Tables:
+    """The tables of a page. Parts with one BRDF share one table."""
+
+    def __init__(self):
+        """Starts without tables."""
+        self._made: dict[Any, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
+        self._end = 0
+
+    def add(self, name: str, system: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
+        """The table of a part's system, and where its texels start among those of all tables."""
+        key = _key(system)
+        if key not in self._made:
+            table = _table(name, system)
+            self._made[key] = self._end, table
+            self._end += table.size // 4
+        return self._made[key]
+
+    def joined(self) -> Float[np.ndarray, " n"]:
+        """The texels of all tables."""
+        return np.concatenate([table.astype("<f4").reshape(-1) for _, table in self._made.values()])
+
+
+def _key(system: Exported) -> Any:
+    """Equal for systems with equal tables."""
+    if isinstance(system, harmonic.DiffuseSystem):
+        return None
+    leaves, kind = jax.tree.flatten(system.brdf)
+    return kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
 
 
 def _about(system: Exported) -> dict[str, Any]:
@@ -133,7 +165,7 @@ def _family(shading: Shading) -> dict[str, list]:
     """Numbers of the BRDF terms of a part's channels in the page's module, and their factors; empty if unknown."""
     if shading.blend is None or shading.scale is None:
         return {"terms": [], "scale": []}
-    terms = _SHINY if isinstance(shading.brdf, ShininessFamily) else list(shading.term)
+    terms = _SHINY if shading.table is standard.BLINN_PHONG else list(shading.term)
     return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
 
 
@@ -190,7 +222,7 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
 
 def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
     """Parameters of a material that is the same at all vertices; None for other materials."""
-    if isinstance(material, BlinnPhong) and isinstance(shading.brdf, ShininessFamily):
+    if isinstance(material, BlinnPhong) and shading.table is standard.BLINN_PHONG:
         values = {
             name: np.broadcast_to(np.asarray(getattr(material, name), float), 3) for name in ("diffuse", "specular")
         }

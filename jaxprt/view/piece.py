@@ -27,6 +27,7 @@ from jaxprt.view.session import Session
 _MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _FIRST = 2  # finest scale of visibility that is stored as bytes
+_SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
 _VIEWS = 4  # views from which the error is measured
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{title}</title><link rel="icon" href="data:,">
@@ -184,7 +185,7 @@ def _page(
     size = light_size(reduced)
     blurring = parts.blurring(size) if size else parts.NO_SCALES
     free = [
-        part | {"free": part["free"] if "material" in own else None}
+        part | {"free": _free(part["free"]) if "material" in own else None}
         for part, own in zip(reply.content["parts"], content["parts"], strict=True)
     ]
     head = reply.content | {
@@ -207,6 +208,18 @@ def _page(
         for name in ("viewer", "piece")
     }
     return _PAGE.format(title=html.escape(title), data=data, **modules).encode()
+
+
+def _free(free: dict[str, Any]) -> dict[str, Any]:
+    """What users of the page can change of a part, of what they can change in the viewer."""
+    result = dict(free)
+    if "roughness" in free:
+        low, high = free["roughness_range"]
+        result["roughness_range"] = [max(low, min(_SMOOTHEST, free["roughness"])), high]
+    if "exponent" in free:
+        low, high = free["exponent_range"]
+        result["exponent_range"] = [low, min(high, max(2 / _SMOOTHEST**4 - 2, free["exponent"]))]
+    return result
 
 
 def _colored(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:

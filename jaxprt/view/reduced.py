@@ -1,17 +1,21 @@
 """Relit scenes at reduced resolution, as exported pages contain them."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from jaxprt.compile import put
 from jaxprt.relit.channels import Shading
+from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
-from jaxprt.systems import bright_texels, harmonic, lobe
+from jaxprt.systems import axes, bright_texels, harmonic, lobe
 from jaxprt.systems.lobe import pyramid
-from jaxprt.systems.protocol import Joined, System
+from jaxprt.systems.protocol import System
 from jaxprt.view import matrices
 
 _LIGHT = 32  # texels along a face's edge of the light that lobes are looked up in
@@ -47,6 +51,14 @@ class CoarseSystem(lobe.LobeSystem):
         return super().light(resized(environment, size=self.transport.size))
 
 
+class CentralTexels(bright_texels.BrightTexels):
+    """A system that samples bright texels at their centers, also for a BRDF that varies over a texel."""
+
+    def combine(self, light: bright_texels.BrightLight, view: bright_texels.BrightView) -> Float[Array, "v c"]:
+        """Radiance: that of the underlying system plus that of the bright texels."""
+        return bright_texels.BrightTexels.combine(dataclasses.replace(self, samples=1), light, view)
+
+
 class LobesAlone(eqx.Module):
     """The part of a BRDF that its lobes represent, in 1/sr.
 
@@ -70,7 +82,8 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
         texels: Whether the brightest texels of the light are summed one by one, on the parts that support it.
         degree: Highest degree of the transfer matrices; None keeps their degree.
     """
-    systems = systems_of(scene)
+    whole = [axes.mapped(each, lambda _, leaf: put(leaf)) for each in _systems(scene)]
+    systems = [_exported(part.name, each) for part, each in zip(scene.scene.parts, whole, strict=True)]
     vectors = [vectors_of(each) for each in systems]
     visible = [matrices.truncated(each, degree) for each in visibility_of(scene)]
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
@@ -91,9 +104,16 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
         made.append(CoarseSystem(seen, system.brdf))
     bits = bits_of(scene) if texels else None
     if bits is not None:
-        full = zip(made, scene.direct.part, scene.shading, bits, strict=True)
-        made = [each if own is None else _with_texels(each, system, shading) for each, system, shading, own in full]
-    return RelitScene(scene.scene, Joined(tuple(made)), scene.shading)
+        pairs = zip(made, whole, scene.shading, bits, strict=True)
+        made = [each if own is None else _with_texels(each, full, shading) for each, full, shading, own in pairs]
+    counts = [len(part.mesh.position) for part in scene.scene.parts]
+    alone = [[number] for number in range(len(counts))]
+    return RelitScene(scene.scene, scene.shading, Place.of(counts, alone, [False] * len(counts)), made)
+
+
+def _systems(scene: RelitScene) -> list[System]:
+    """The system of each part."""
+    return [scene.part_system(number) for number in range(len(scene.scene.parts))]
 
 
 def _with_texels(system: System, full: System, shading: Shading) -> System:
@@ -102,7 +122,7 @@ def _with_texels(system: System, full: System, shading: Shading) -> System:
     brdf = shading.brdf
     if isinstance(system, lobe.LobeSystem) and shading.blend is None:
         brdf = LobesAlone(system.brdf)
-    return bright_texels.BrightTexels(system, full.visibility, brdf, count=texels_of(full.visibility.size))
+    return CentralTexels(system, full.visibility, brdf, count=texels_of(full.visibility.size))
 
 
 def texels_of(size: int) -> int:
@@ -112,7 +132,7 @@ def texels_of(size: int) -> int:
 
 def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"] | None] | None:
     """Visibility of single texels for each part, None for parts without; None if a lobe part or every part lacks it."""
-    result = [_bits(each) for each in scene.direct.part]
+    result = [_bits(each) for each in _systems(scene)]
     lobes = [isinstance(each, lobe.LobeSystem) for each in systems_of(scene)]
     missing = [each is None for each in result]
     if all(missing) or any(np.logical_and(missing, lobes)):
@@ -147,20 +167,21 @@ def resized(light: Environment, *, size: int) -> Environment:
 
 def systems_of(scene: RelitScene) -> list[Exported]:
     """The systems of the parts without single texels. Refuses systems that an exported page does not support."""
-    result: list[Exported] = []
-    for part, system in zip(scene.scene.parts, scene.direct.part, strict=True):
-        own = system.system if isinstance(system, bright_texels.BrightTexels) else system
-        if not isinstance(own, Exported):
-            raise ValueError(
-                f"part {part.name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be "
-                f"exported, got {type(own).__name__}"
-            )
-        if isinstance(own, harmonic.HarmonicSystem):
-            matrices.check(part.name, own)
-        if isinstance(own, lobe.LobeSystem):
-            _check(part.name, own.brdf)
-        result.append(own)
-    return result
+    return [_exported(part.name, each) for part, each in zip(scene.scene.parts, _systems(scene), strict=True)]
+
+
+def _exported(name: str, system: System) -> Exported:
+    own = system.system if isinstance(system, bright_texels.BrightTexels) else system
+    if not isinstance(own, Exported):
+        raise ValueError(
+            f"part {name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got "
+            f"{type(own).__name__}"
+        )
+    if isinstance(own, harmonic.HarmonicSystem):
+        matrices.check(name, own)
+    if isinstance(own, lobe.LobeSystem):
+        _check(name, own.brdf)
+    return own
 
 
 def _check(name: str, brdf: lobe.LobeBrdf) -> None:

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxprt.brdf import BlinnPhong, Lambert
+from jaxprt.brdf import BlinnPhong
 from jaxprt.compile import Between
-from jaxprt.relit.channels import Appearance, Shading, exponent_range, roughness_range
+from jaxprt.relit.channels import Appearance, Shading, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import background, rotate
 from jaxprt.sphere import cubemap
+from jaxprt.systems import standard
 from jaxprt.view.messages import Lamp, Look
 
 _KEPT = 4  # cached results of each stage
@@ -43,9 +44,8 @@ class Stages:
         self.systems = systems
         self.name, self.lights = list(environments), list(environments.values())
         # Scenes without bounces; and without lamps too, to compare with exact pictures.
-        given = {name: (each.scene, each.direct, each.shading) for name, each in systems.items()}
-        self._bare = {name: RelitScene(*each, lamps=systems[name].lamps) for name, each in given.items()}
-        self._direct = {name: RelitScene(*each) for name, each in given.items()}
+        self._bare = {name: each.without_bounces() for name, each in systems.items()}
+        self._direct = {name: each.direct for name, each in systems.items()}
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
         self._lock = threading.Lock()
 
@@ -199,21 +199,20 @@ def camera(look: Look, width: int, height: int) -> Camera:
 def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     """Parameters of a part's material that the viewer can change, with their values; None for a fixed BRDF."""
     if isinstance(material, BlinnPhong) and shading.blend is not None:
-        least, most = exponent_range(shading)
         specular = np.broadcast_to(np.asarray(material.specular, float), (3,))
         return {
             "diffuse": np.broadcast_to(np.asarray(material.diffuse, float), (3,)).tolist(),
             "exponent": float(material.exponent),
-            "exponent_range": [max(least, 1.0), max(most, 2.0)],  # of which the viewer takes logarithms
+            "exponent_range": [1.0, standard.BLINN_PHONG.most_exponent],  # of which the viewer takes logarithms
             "f0": float(specular.max()),
             "specular": (specular / max(specular.max(), 1e-6)).tolist(),
         }
     if not isinstance(material, TexturedMaterial):
         return None
     free: dict[str, Any] = {"diffuse": np.asarray(material.base_color).tolist()}
-    if isinstance(shading.brdf, Lambert):
+    if shading.matte:
         return free
-    low, high = (float(each) for each in roughness_range(shading))
+    low, high = roughness_range(shading)
     tint = np.asarray(material.specular_color)
     if high > low and material.roughness_texture is None:
         free |= {"roughness": float(material.roughness), "roughness_range": [low, high]}

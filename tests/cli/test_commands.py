@@ -59,7 +59,8 @@ def test_a_plan_is_printed_and_kept_and_relights(place, monkeypatch, capsys):
     monkeypatch.setattr(planned, "plan", None)  # Nothing is planned again.
     assert main("plan", *given, *kept, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    chosen = told["parts"][0]["chosen"]["recipe"]
+    assert told["groups"][0]["parts"] == list(told["reflected"]) == ["mesh"]
+    chosen = told["groups"][0]["chosen"]["recipe"]
     assert f"* {100 * told['error']:6.1f} %" in table
     assert chosen["system"] == "Harmonics"
     assert main("plan", *given, "--error", "0.4", "--output", place / "kept") == 2

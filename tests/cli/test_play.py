@@ -25,7 +25,6 @@ def small(coarse, bound, monkeypatch):
     for name in ("tabulate",):
         bound(monkeypatch, getattr(prt.lobe, name), resolution=8)
     bound(monkeypatch, play.precompute, size=8)
-    monkeypatch.setattr(play, "ROUGHNESS", (0.5, 0.6))
 
 
 @pytest.fixture

@@ -40,9 +40,9 @@ def systems():
     parts = [Part("ball", builtin.sphere(rings=8, sectors=16), glossy), Part("ground", ground, matte)]
     eye = Camera([2.0, 1.5, 4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.7, 64, 64)
     scene = Scene(parts, cameras=[eye])
-    options = {"roughness": (0.4, 0.8), "size": SIZE, "progress": False}
+    options = {"size": SIZE, "progress": False}
     return {
-        "lobes": prt.precompute(scene, system=prt.relit.Lobes(2, texels=2), bounces=1, **options),
+        "lobes": prt.precompute(scene, system=prt.relit.Lobes(8, texels=2), bounces=1, **options),
         "harmonics": prt.precompute(scene, system=prt.relit.Harmonics(2), **options),
     }
 
