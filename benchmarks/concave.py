@@ -28,9 +28,11 @@ from jaxprt.brdf import Lambert, MetallicRoughness
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import Shading, of_part
+from jaxprt.relit.groups import Place
 from jaxprt.relit.recipes import Target
 from jaxprt.scene import Camera, Environment, Mesh, Part, TexturedMaterial, builtin, interiors
 from jaxprt.scene.mesh import make_mesh, split
+from jaxprt.systems.bounces import GroupBounces
 
 EDGE, SAMPLES = 128, 1024
 DEPTHS = (3, 4, 8)
@@ -123,9 +125,11 @@ def measure(
     if scene.judged is not None:
         own = jnp.asarray(scene.judged[:, None], jnp.float32)
         chosen["floor"] = np.asarray(image.render(scene.mesh, own, scene.camera, background=None)) > 0.99
+    sizes = [len(each.mesh.position) for each in scene.shadings]
+    place = Place.of(sizes, [[number] for number in range(len(sizes))], [False] * len(sizes))  # a group for each part
     for count in counts:
         start = time.perf_counter()
-        system = reflection.make(scene.shadings, count, Target(scene.mesh, size=16, progress=False))
+        system = reflection.make(scene.shadings, place, count, Target(scene.mesh, size=16, progress=False))
         seconds = time.perf_counter() - start
         blends = [each.blend for each in scene.shadings]
         frame = harness.measure(lambda: _radiance(system, scene, blends), repeats=2 if quick else 10)  # noqa: B023
@@ -147,8 +151,14 @@ def measure(
             write(pictures / f"{scene.name}_{count}.png", row, mean)
 
 
-def _radiance(system: prt.System, scene: Scene, blends: list) -> jax.Array:
-    return jax.block_until_ready(prt.radiance(system, scene.light, eye=scene.camera.eye, materials=blends))
+def _radiance(system: GroupBounces, scene: Scene, blends: list) -> jax.Array:
+    """Reflected radiance of all vertices, part after part."""
+    arriving = system.shade(system.light(scene.light), blends)
+    eye, colors = jnp.asarray(scene.camera.eye), []
+    for part, lit, blend in zip(system.group, arriving, blends, strict=True):
+        color = part.combine(lit, part.view(eye, blend))
+        colors.append(jnp.broadcast_to(color, (len(color), 3)))
+    return jax.block_until_ready(jnp.concatenate(colors))
 
 
 def kept(scene: Scene, samples: int, store: pathlib.Path | None) -> dict[int, np.ndarray]:

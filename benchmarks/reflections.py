@@ -22,7 +22,6 @@ import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -110,11 +109,10 @@ def measure(name: str, quick: bool, store: pathlib.Path | None, pictures: pathli
     scene = scene_of(name, quick)
     lights = lights_of(quick)
     path = store and store / f"reflections_{name}"
-    recipe = Lobes(lobes=2, texels=2) if quick else Lobes(lobes=8)
+    recipe = Lobes(lobes=8, texels=2) if quick else Lobes(lobes=8)
     low = (0.4, 0.5) if quick else RANGE
     size = lights[0].radiance.shape[-2]
-    whole = precompute(scene, system=recipe, bounces=BOUNCES, roughness=low, size=size, path=path, progress=False)
-    jax.clear_caches()  # Linux lets a process have 65,530 mappings; the programs of the room's pictures take most.
+    whole = precompute(scene, system=recipe, bounces=BOUNCES, size=size, path=path, progress=False)
     common = {"benchmark": "reflections", "scene": name, "vertices": whole.vertices, "bytes": memory(whole)}
     keep = store and store / f"mitsuba_{name}"
     random = np.random.default_rng(5)
@@ -173,7 +171,7 @@ def judged(
     whole: RelitScene, triples: list[Triple], sizes: Sizes, folder: pathlib.Path | None, keep: pathlib.Path | None
 ) -> dict:
     """Medians over some triples."""
-    direct = RelitScene(whole.scene, whole.direct, whole.shading)
+    direct = whole.direct
     first = triples[0]
     timing = harness.measure(
         lambda: whole.picture(first.light, first.camera, materials=first.materials, samples=FINAL), repeats=3

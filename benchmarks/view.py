@@ -75,11 +75,8 @@ class Page:
 def hands(bounces: int, *, quick: bool) -> Iterator[dict[str, Any]]:
     """Looks in which one thing is new."""
     size, repeats = (8, 3) if quick else (64, 15)
-    recipe = prt.relit.Lobes(1, texels=2) if quick else prt.relit.Lobes(6)
-    free = (0.25, 0.35) if quick else (0.25, 0.8)
-    made = prt.precompute(
-        embedded(playable=True), system=recipe, roughness=free, bounces=bounces, size=size, progress=False
-    )
+    recipe = prt.relit.Lobes(8, texels=2) if quick else prt.relit.Lobes(8)
+    made = prt.precompute(embedded(playable=True), system=recipe, bounces=bounces, size=size, progress=False)
     lights = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     server = view.serve(made, environments=lights)
     page = Page(server.url)

@@ -26,7 +26,7 @@ _ROOT = "document.querySelector('#viewer').shadowRoot"
 
 
 def relit(folder: str) -> prt.RelitScene:
-    """Chess pieces of red plastic on a board, by six lobes, for all roughness from .25 to .8."""
+    """Chess pieces of red plastic on a board, by eight lobes."""
     pieces, light, dark = prt.scene.mesh.split(builtin.chess())
     plastic = prt.scene.TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
     squares = [
@@ -35,7 +35,7 @@ def relit(folder: str) -> prt.RelitScene:
     ]
     parts = zip(("pieces", "light squares", "dark squares"), (pieces, light, dark), (plastic, *squares), strict=True)
     scene = prt.Scene([prt.Part(*each) for each in parts])
-    return prt.precompute(scene, system=prt.relit.Lobes(6), roughness=(0.25, 0.8), path=folder)
+    return prt.precompute(scene, system=prt.relit.Lobes(8), path=folder)
 
 
 def settle(page: Page, *, rest: bool = False) -> None:

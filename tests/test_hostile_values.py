@@ -254,7 +254,7 @@ def _precompute(**given: Any) -> None:
         raise _CheckedError
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prt.relit.build, "_checked", stop)
+        patch.setattr(prt.relit.build, "shaded", stop)
         try:
             prt.precompute(**given)
         except _CheckedError:
@@ -277,7 +277,6 @@ def scene_verbs() -> dict[str, Verb]:
             rate=30.0,
             bounces=None,
             rays=8,
-            roughness=None,
             path=None,
             executor=None,
             **common,
@@ -296,9 +295,15 @@ def scene_verbs() -> dict[str, Verb]:
         "refine": Verb(
             prt.refine, keep=("progress",), scene=here, error=0.5, vertices=12, environments=None, progress=False
         ),
-        "radiance": Verb(prt.radiance, system=ready.direct.part[0], environment=environment(), eye=EYE, materials=None),
+        "radiance": Verb(
+            prt.radiance,
+            system=ready.part_system(0),
+            environment=environment(),
+            eye=EYE,
+            materials=ready.shading[0].blend,
+        ),
         "memory": Verb(prt.memory, system=ready),
-        "total": Verb(lambda system: prt.total(system, system), system=ready.direct.part[0]),
+        "total": Verb(lambda system: prt.total(system, system), system=ready.part_system(0)),
         "shard": Verb(prt.shard, value=ready, devices=jax.devices()[:1]),
         "load_environment": Verb(prt.load_environment, path="missing.hdr"),
         "environment_from_image": Verb(
