@@ -37,14 +37,15 @@ class Row(eqx.Module):
         number: Index of the group.
         samples: Number of sample points along the edge of each bright texel.
         interpolated: Whether radiance is interpolated between vertices, and not computed at the points.
-        index: Indices of the points among all points of the picture; -1 is padding.
+        index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
+            rows of the group.
         kept: What does not depend on the light; None if it is computed anew for each light.
     """
 
     number: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     interpolated: bool = eqx.field(static=True)
-    index: Int[Array | np.ndarray, " p"]
+    index: Int[Array | np.ndarray, "*m p"]
     kept: Viewed | None
 
 
@@ -121,7 +122,7 @@ class PictureView(eqx.Module):
             picture = canvas.drawn(picture, self.pixels, index, color)
         return picture if self.fold == 1 else _folded(picture, fold=self.fold)
 
-    def _color(self, row: Row, arriving: Arriving, vertices: dict[int, Array]) -> Float[Array, "p c"]:
+    def _color(self, row: Row, arriving: Arriving, vertices: dict[int, Array]) -> Float[Array, "*m p c"]:
         """Colors of the points of a row."""
         surface, stage = self.stage.surfaces[row.number].sampled(row.samples), self.stage
         if isinstance(row.index, Tracer):
@@ -131,21 +132,25 @@ class PictureView(eqx.Module):
             return carried(surface, vertices[row.number], own, stage.look(points), stage.given[row.number])
         if row.kept is not None:
             return lit(surface, arriving.at(row.number), row.kept)
-        shade = partial(self._shaded, surface, row)
+        shade = partial(self._shaded, surface, row.number, row.index)
         return (shade if known(arriving, stage, self.camera) else jax.checkpoint(shade))(arriving)
 
-    def _shaded(self, surface: Surface, row: Row, arriving: Arriving) -> Float[Array, "p c"]:
-        points, own = self._points(row.index)
-        seen = _seen(self.stage, surface, row.number, points, own, self.camera)
-        return lit(surface, arriving.at(row.number), seen)
+    def _shaded(self, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
+        points, own = self._points(index)
+        seen = _seen(self.stage, surface, number, points, own, self.camera)
+        return lit(surface, arriving.at(number), seen)
 
-    def _color_of_some(self, row: Row, arriving: Arriving) -> Float[Array, "p c"]:
+    def _color_of_some(self, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
         """`_color` inside of `jax.jit`, where most rows may be padding alone."""
         surface = self.stage.surfaces[row.number].sampled(row.samples)
-        shape = jax.eval_shape(lambda: self._shaded(surface, row, arriving))
+        shape = jax.eval_shape(lambda: self._shaded(surface, row.number, row.index[0], arriving))
         none = jnp.zeros(shape.shape, shape.dtype)
-        shade = jax.checkpoint(partial(self._shaded, surface, row))
-        return jax.lax.cond(jnp.any(row.index >= 0), shade, lambda _: none, arriving)
+
+        def some(index: Array) -> Array:
+            shade = jax.checkpoint(partial(self._shaded, surface, row.number, index))
+            return jax.lax.cond(jnp.any(index >= 0), shade, lambda _: none, arriving)
+
+        return jax.lax.map(some, row.index)
 
     def _points(self, index: Any) -> tuple[Points, Points]:
         return canvas.points_of(self.pixels, self.stage.face, self.stage.shift, index)
@@ -193,7 +198,8 @@ def make(
     made, asked = [], []
     for row in rows:
         surface = stage.surfaces[row.number].sampled(row.samples)
-        points, own = canvas.points_of(pixels, stage.face, stage.shift, row.index)
+        index = row.index if row.index.ndim == 1 else row.index[0]
+        points, own = canvas.points_of(pixels, stage.face, stage.shift, index)
         if keep and not row.interpolated and not isinstance(row.index, Tracer):
             row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
         if stage.is_sharp(row.number):
@@ -263,8 +269,7 @@ def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
     owner = jnp.where(pixels.triangle >= 0, jnp.asarray(stage.part)[first], -1)
     for number, own in enumerate(stage.place.parts):
         samples = max(stage.samples[part] for part in own)
-        for index in canvas.rows_of(jnp.isin(owner, jnp.asarray(own))):
-            yield Row(number, samples, False, index, None)
+        yield Row(number, samples, False, canvas.rows_of(jnp.isin(owner, jnp.asarray(own))), None)
 
 
 def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]) -> Iterator[Row]:
