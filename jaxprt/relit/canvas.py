@@ -21,13 +21,17 @@ from jaxprt.scene.points import Points
 ROW = 1 << 12  # number of points that are shaded together
 
 
-def rows_of(chosen: Array | np.ndarray) -> Int[Array | np.ndarray, "m p"]:
-    """Indices of the chosen points in rows of one length; -1 is padding."""
+def rows_of(chosen: Array | np.ndarray, owner: Int[np.ndarray, " n"] | None = None) -> Int[Array | np.ndarray, "m p"]:
+    """Indices of the chosen points in rows of one length; -1 is padding.
+
+    Where the owner of each point is known, points of one owner stand together: what a row needs is then less.
+    """
     if isinstance(chosen, Tracer):
         count = len(chosen)
         index: Any = jnp.nonzero(chosen, size=count, fill_value=-1)[0]
     else:
         index = np.flatnonzero(np.asarray(chosen))
+        index = index if owner is None else index[np.argsort(owner[index], kind="stable")]
         count = len(index)
     rows = -(-count // ROW)
     pad = jnp.pad if isinstance(index, Tracer) else np.pad
@@ -53,7 +57,8 @@ def points_of(
     weight = xp.where(xp.sum(weight, 1, keepdims=True) > 0, weight, xp.asarray([1.0, 0.0, 0.0], weight.dtype)).T
     slope = xp.moveaxis(slope, 0, -1)
     of_group = corner - xp.asarray(shift)[corner]
-    return put(Points(corner, weight, slope)), put(Points(of_group, weight, slope))
+    corner, of_group, weight, slope = put((corner, of_group, weight, slope))
+    return Points(corner, weight, slope), Points(of_group, weight, slope)
 
 
 @partial(jit, static_argnames="colors")

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -198,13 +198,15 @@ def make(
     made, asked = [], []
     for row in rows:
         surface = stage.surfaces[row.number].sampled(row.samples)
-        index = row.index if row.index.ndim == 1 else row.index[0]
-        points, own = canvas.points_of(pixels, stage.face, stage.shift, index)
-        if keep and not row.interpolated and not isinstance(row.index, Tracer):
-            row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
-        if stage.is_sharp(row.number):
-            blend = stage.blend(row.number, points, own)
-            asked.append(tracing.Asked(row.number, points, own, blend, stage.sharp_at(row.number, points)))
+        kept = keep and not row.interpolated and not isinstance(row.index, Tracer)
+        if kept or stage.is_sharp(row.number):
+            index = row.index if row.index.ndim == 1 else row.index[0]
+            points, own = canvas.points_of(pixels, stage.face, stage.shift, index)
+            if kept:
+                row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
+            if stage.is_sharp(row.number):
+                blend = stage.blend(row.number, points, own)
+                asked.append(tracing.Asked(row.number, points, own, blend, stage.sharp_at(row.number, points)))
         made.append(row)
     reflected = tracing.trace(stage, asked, jnp.asarray(camera.eye), keep=keep) if asked else None
     ray = raster.ray_direction(camera)
@@ -276,12 +278,12 @@ def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]
     """The points in rows by group, number of samples, and whether radiance is interpolated."""
     for number, own in enumerate(stage.place.parts):
         between = interpolated[number]
-        for index in canvas.rows_of(np.isin(owner, between)):
+        for index in canvas.rows_of(np.isin(owner, between), owner):
             yield Row(number, 1, True, index, None)
         rest = [part for part in own if part not in between]
         for samples in sorted({stage.samples[part] for part in rest}):
             same = [part for part in rest if stage.samples[part] == samples]
-            for index in canvas.rows_of(np.isin(owner, same)):
+            for index in canvas.rows_of(np.isin(owner, same), owner):
                 yield Row(number, samples, False, index, None)
 
 
@@ -306,4 +308,15 @@ def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera:
     wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
     square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
     good = np.asarray(may) & (square <= _ERROR**2 * seen)
-    return tuple(tuple(part for part in own if good[part]) for own in place.parts)
+    chosen = (tuple(part for part in own if good[part]) for own in place.parts)
+    return tuple(
+        own
+        if number * _rows_for(place.counts, own) < _rows_for(seen, whole) - _rows_for(seen, set(whole) - set(own))
+        else ()
+        for number, own, whole in zip(channels, chosen, place.parts, strict=True)
+    )
+
+
+def _rows_for(count: Sequence[int] | np.ndarray, parts: Iterable[int]) -> int:
+    """Number of rows that some parts fill with their vertices or points."""
+    return -(-sum(int(count[part]) for part in parts) // canvas.ROW)

@@ -255,20 +255,22 @@ def _bilinear(coordinate: Array, height: Array, width: Array, wrap: Array) -> li
         return jnp.where(mode == clamp, jnp.clip(place, 0, 1), place - period * jnp.floor(place / period))
 
     def inside(index: Array, size: Array, mode: Array) -> Array:
-        turned = index % jnp.where(mode == mirror, 2 * size, size)
+        """The texel that an index of at most one period further shows. Comparisons are faster than remainders."""
+        period = jnp.where(mode == mirror, 2 * size, size)
+        turned = jnp.where(index < 0, index + period, jnp.where(index >= period, index - period, index))
         turned = jnp.where(mode == mirror, jnp.minimum(turned, 2 * size - 1 - turned), turned)
-        return jnp.where(mode == clamp, jnp.clip(index, 0, size - 1), turned)
+        return jnp.clip(jnp.where(mode == clamp, index, turned), 0, size - 1)
 
     x = reduced(coordinate[:, 0], wrap[:, 0]) * width - 0.5
     y = (1 - reduced(coordinate[:, 1], wrap[:, 1])) * height - 0.5
     column, row = jnp.floor(x), jnp.floor(y)
     right, down = x - column, y - row
-    result = []
-    for below, v in ((0, 1 - down), (1, down)):
-        line = inside(row.astype(jnp.int32) + below, height, wrap[:, 1])
-        for beside, u in ((0, 1 - right), (1, right)):
-            result.append(((line, inside(column.astype(jnp.int32) + beside, width, wrap[:, 0])), v * u))
-    return result
+    lines, columns = (
+        [inside(first.astype(jnp.int32) + step, size, wrap[:, axis]) for step in (0, 1)]
+        for first, size, axis in ((row, height, 1), (column, width, 0))
+    )
+    weights = [(1 - down, down), (1 - right, right)]
+    return [((lines[i], columns[j]), weights[0][i] * weights[1][j]) for i in (0, 1) for j in (0, 1)]
 
 
 def of_parts(parts: Sequence[Part]) -> MaterialTable:

@@ -2,14 +2,28 @@
 
 import itertools
 import math
+from functools import partial
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxprt.compile import isolated
 
 _TINY = 1e-12
 
 
-def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> Float[Array, "r v"]:
+class Entry(NamedTuple):
+    """Entries of a table of lobes, one for each view: means, logarithms of concentrations, weights, diffuse albedos."""
+
+    mean: Float[Array, "v 3 l"]
+    scale: Float[Array, "v l"]
+    weight: Float[Array, "v c l"]
+    diffuse: Float[Array, "v c"]
+
+
+def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> Entry:
     """Interpolates the rows of a table for views v with their own parameters: between knots first, then between nodes.
 
     Args:
@@ -18,33 +32,53 @@ def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) ->
         axis: For each axis of view nodes, the index of the lower node and the weight of the upper one, for each view.
         lobes: Number of lobes.
     """
-    sizes, nodes = row.shape[1 : 1 + len(knot)], row.shape[1 + len(knot) :]
-    flat = row.reshape(len(row), -1).T  # All rows of a node are read at once.
-
-    def read(index: Array, node: Array, left: list) -> Array:
-        """Rows at a node, interpolated over the parameters in `left`."""
-        if not left:
-            return flat.at[index * math.prod(nodes) + node].get(mode="promise_in_bounds")
-        size, (low, upper) = left[0]
-        first, second = (read(index * size + low + up, node, left[1:]) for up in (0, 1))
-        return _merged(first, second, upper, lobes=lobes)
-
-    total = jnp.zeros((), row.dtype)
+    sizes = row.shape[1:]
+    place, share = [], []
     for corner in itertools.product((0, 1), repeat=len(axis)):
-        node, weight = jnp.zeros((), jnp.int32), jnp.ones((), row.dtype)
-        for up, size, (low, upper) in zip(corner, nodes, axis, strict=True):
-            node, weight = node * size + low + up, weight * (upper if up else 1 - upper)
-        total = total + weight[:, None] * read(jnp.zeros((), jnp.int32), node, list(zip(sizes, knot, strict=True)))
-    return total.T
+        pairs = list(zip(corner, axis, strict=True))
+        share.append(math.prod((upper if up else 1 - upper for up, (_, upper) in pairs), start=jnp.ones((), row.dtype)))
+        for knots in itertools.product((0, 1), repeat=len(knot)):
+            index = jnp.zeros((), jnp.int32)
+            for up, size, (low, _) in zip((*knots, *corner), sizes, (*knot, *axis), strict=True):
+                index = index * size + low + up
+            place.append(index)
+    # All rows of a node are read at once, in a program of their own: XLA vectorizes CPU code only without gathers.
+    read = _read(row.reshape(len(row), -1).T, tuple(place))
+    return _between(read, tuple(upper for _, upper in knot), tuple(share), lobes=lobes)
 
 
-def _merged(first: Array, second: Array, upper: Array, *, lobes: int) -> Array:
-    """Rows interpolated between two knots by the formula of `jaxprt.systems.lobe.table.mean`."""
-    rows, upper = first.shape[1], upper[:, None]
-    count = (3 * lobes, 4 * lobes, rows - (rows - 4 * lobes) // (lobes + 1))
-    parts = [jnp.split(each, count, 1) for each in (first, second)]
-    strong = [jnp.sum(each[2].reshape(len(each[2]), -1, lobes), 1) for each in parts]
-    low, high = jnp.maximum((1 - upper) * strong[0], 0) + _TINY, jnp.maximum(upper * strong[1], 0) + _TINY
-    high = high / (low + high)
-    weight = jnp.tile(high, (1, 3)), high, upper, upper
-    return jnp.concatenate([a + (b - a) * each for a, b, each in zip(*parts, weight, strict=True)], 1)
+@partial(isolated, static=("lobes",))
+def _between(read: tuple[Array, ...], upper: tuple[Array, ...], share: tuple[Array, ...], *, lobes: int) -> Entry:
+    """Entries at all knots and nodes, interpolated: `upper` between knots, and in the given shares between nodes."""
+    every, count, total = [_entry(each, lobes=lobes) for each in read], 1 << len(upper), None
+    for number, part in enumerate(share):
+        own = every[number * count : (number + 1) * count]
+        for weight in reversed(upper):
+            own = [_merged(low, high, weight) for low, high in zip(own[::2], own[1::2], strict=True)]
+        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), own[0])
+        total = scaled if total is None else jax.tree.map(jnp.add, total, scaled)
+    assert total is not None
+    return total
+
+
+@isolated
+def _read(row: Float[Array, "q r"], place: tuple[Array, ...]) -> tuple[Array, ...]:
+    return tuple(row.at[index].get(mode="promise_in_bounds") for index in place)
+
+
+def _entry(row: Float[Array, "v r"], *, lobes: int) -> Entry:
+    """One entry from all its rows."""
+    colors = (row.shape[1] - 4 * lobes) // (lobes + 1)
+    mean, scale, weight, diffuse = jnp.split(row, (3 * lobes, 4 * lobes, (4 + colors) * lobes), 1)
+    return Entry(mean.reshape(-1, 3, lobes), scale, weight.reshape(-1, colors, lobes), diffuse)
+
+
+def _merged(low: Entry, high: Entry, upper: Float[Array, " v"]) -> Entry:
+    """Entries interpolated between two knots by the formula of `jaxprt.systems.lobe.table.mean`."""
+    strength = [
+        jnp.maximum(share[:, None] * jnp.sum(each.weight, 1), 0) + _TINY
+        for share, each in ((1 - upper, low), (upper, high))
+    ]
+    strong = strength[1] / (strength[0] + strength[1])
+    weight = strong[:, None], strong, upper[:, None, None], upper[:, None]
+    return Entry(*(a + (b - a) * each for a, b, each in zip(low, high, weight, strict=True)))

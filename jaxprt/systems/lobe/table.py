@@ -155,12 +155,12 @@ class LobeBrdf(eqx.Module):
             grid.neighbors(grid.place(knot, each), size=len(knot))
             for knot, each in zip(self.knot, parameter, strict=True)
         ]
-        value = (
-            knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
-            if place
-            else grid.read(jnp.concatenate(rows), axis)
-        )
-        mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
+        if place:
+            own = knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
+            mean, scale, strength, diffuse = (jnp.moveaxis(each, 0, -1) for each in own)
+        else:
+            value = grid.read(jnp.concatenate(rows), axis)
+            mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
         x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
             cosine, sine = jnp.where(pole, 1, wo[:, 0] / sin_o), jnp.where(pole, 0, wo[:, 1] / sin_o)
