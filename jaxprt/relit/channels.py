@@ -34,6 +34,7 @@ _EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
 _RARE = 0.02  # smallest scale of a channel, relative to the largest
 _NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # names of the terms of MetallicRoughness
 _BARE = (3,)  # the only term of a Lambertian material
+_MATTE = "; a specular of 1e-6 is enough for a Lambertian part that is to become glossy"
 
 
 class Shading(eqx.Module):
@@ -307,7 +308,7 @@ def _fits(name: str, shading: Shading, look: Look) -> Any:
         names = [_NAMES[k] for k in missing[needed]]
         raise ValueError(
             f"part {name!r} was precomputed without the terms that the new material needs ({', '.join(names)}): "
-            "precompute it with a material that has them"
+            f"precompute it with a material that has them{_MATTE if shading.matte else ''}"
         )
     fits = ~xp.any(look.coefficient[:, missing] != 0, (1, 2))
     if shading.matte:
