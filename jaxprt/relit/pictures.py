@@ -125,7 +125,7 @@ class PictureView(eqx.Module):
     def _color(self, row: Row, arriving: Arriving, vertices: dict[int, Array]) -> Float[Array, "*m p c"]:
         """Colors of the points of a row."""
         surface, stage = self.stage.surfaces[row.number].sampled(row.samples), self.stage
-        if isinstance(row.index, Tracer):
+        if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
             return self._color_of_some(row, arriving)
         if row.interpolated:
             points, own = self._points(row.index)

@@ -173,6 +173,7 @@ def test_pictures_go_through_programs_and_have_gradients(close):
     close(turned[0], whole, tolerance=1e-4)
     bright = jax.jit(jax.grad(lambda eye: jnp.sum(picture(radiance, eye))))(CAMERA.eye)
     assert np.isfinite(bright).all()
+    close(jax.jit(lambda view, light: view.picture(light))(ready.picture_view(CAMERA), light()), whole, tolerance=1e-4)
 
 
 def test_scenes_laid_over_devices_give_the_same_pictures(close):
