@@ -21,7 +21,7 @@ from jaxprt.relit import regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
 from jaxprt.relit.pictures import PictureView
-from jaxprt.relit.recipes import Known, Piece, Recipe, Target, harmonic_table
+from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene
 from jaxprt.scene.environment import background
@@ -362,7 +362,7 @@ def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> 
 
 def _separable(shading: Shading, target: Target):
     """Systems with several numbers of terms and kept coefficients."""
-    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, [Piece(shading.mesh, target)])
+    full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, target)
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
         if terms <= full.brdf.terms:
             short = full.transport.truncate(keep, terms=terms)
@@ -387,9 +387,8 @@ def _lobe(shading: Shading, target: Target):
     options = {"size": target.size, **target.traced(), "progress": False}
     seen = visibility.precompute(shading.mesh, **options)
     target = Target(target.occluder, size=target.size, vertex=target.vertex, known=Known(seen), progress=False)
-    pieces = [Piece(shading.mesh, target)]
     for lobes, texels in itertools.product(TABLE_LOBES, TABLE_TEXELS):
-        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, pieces)
+        yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
 
 
 TABLES: dict[str, Callable] = {"separable": _separable, "harmonic": _harmonic, "lobe": _lobe}

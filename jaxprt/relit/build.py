@@ -16,12 +16,13 @@ from jaxprt.relit import channels, groups, lamps, reflection, tracing, warn
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
-from jaxprt.relit.recipes import SYSTEMS, Piece, Recipe, Target, check
+from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene
 from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import UnfinishedError
+from jaxprt.visibility.blocks import fingerprint
 
 _MOST = 1 << 13  # texels along the edge of a face
 
@@ -103,12 +104,12 @@ def precompute(
     warn.of_gain(near, shadings)
     warn.of_shells(near)
     warn.of_backs(scene, whole, default_camera(scene, whole))
-    names = [f"{number}_{_file_name(part.name)}" for number, part in enumerate(scene.parts)]
     options = {"size": size, "executor": executor, "progress": progress}
-    targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     counts = [len(part.mesh.position) for part in scene.parts]
     parts = groups.kinds(shadings, recipes)
     place = groups.Place.of(counts, parts, [recipes[own[0]].joins for own in parts])
+    names = [_file_name(own, scene) for own in place.parts]
+    targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
     lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
     reflected, lobes = None, None
@@ -139,11 +140,10 @@ def _systems(
 ) -> list[System]:
     """The system of each group."""
     systems, unfinished = [], []
-    for own, size in zip(place.parts, place.size, strict=True):
-        pieces = [Piece(shadings[part].mesh, targets[part]) for part in own]
+    for own, size, target in zip(place.parts, place.size, targets, strict=True):
+        recipe, shading = recipes[own[0]], groups.joined([shadings[part] for part in own])
         try:
-            recipe, joined = recipes[own[0]], groups.joined([shadings[part] for part in own])
-            systems.append(recipe.make(joined, pieces, vertices=size if recipe.joins else None))
+            systems.append(recipe.make(shading, target, vertices=size if recipe.joins else None))
         except UnfinishedError as others:  # Go on with the next group of the scene.
             unfinished.append(others)
     if unfinished:
@@ -216,6 +216,7 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
     return system
 
 
-def _file_name(name: str) -> str:
-    """A name for the files of a part: its letters and digits, at most 40."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)[:40]
+def _file_name(parts: Sequence[int], scene: Scene) -> str:
+    """A name for the files of a group: at most 40 letters and digits of its first part, and a key of several parts."""
+    name = "".join(letter if letter.isalnum() else "_" for letter in scene.parts[parts[0]].name)[:40]
+    return f"{parts[0]}_{name}" + (f"_{fingerprint(np.asarray(parts))[:8]}" if len(parts) > 1 else "")

@@ -6,6 +6,7 @@ another in their group, and where each part stands is known on the host.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
+from jaxprt.scene.mesh import join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
@@ -115,7 +117,7 @@ class Place(eqx.Module):
         size = [max(shared_size(count), _FEWEST) if padded else count for count, padded in pairs]
         return cls(tuple(counts), tuple(tuple(own) for own in parts), tuple(size))
 
-    @property
+    @cached_property
     def group(self) -> Int[np.ndarray, " n"]:
         """Group of each part."""
         result = np.empty(len(self.counts), np.int32)
@@ -123,12 +125,12 @@ class Place(eqx.Module):
             result[list(own)] = number
         return result
 
-    @property
+    @cached_property
     def first(self) -> Int[np.ndarray, " n"]:
         """Index of the first vertex of each part in the scene."""
         return np.cumsum([0, *self.counts])[:-1].astype(np.int32)
 
-    @property
+    @cached_property
     def start(self) -> Int[np.ndarray, " n"]:
         """Index of the first vertex of each part in its group."""
         result = np.empty(len(self.counts), np.int32)
@@ -136,7 +138,7 @@ class Place(eqx.Module):
             result[list(own)] = np.cumsum([0, *(self.counts[number] for number in own)])[:-1]
         return result
 
-    @property
+    @cached_property
     def shift(self) -> Int[np.ndarray, " n"]:
         """Index of a vertex of each part in the scene, minus its index in its group."""
         return self.first - self.start
@@ -345,9 +347,16 @@ def alike(one: Shading, other: Shading) -> bool:
     return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in zip(*leaves, strict=True))
 
 
+def joined_mesh(shadings: Sequence[Shading]) -> Mesh:
+    """The meshes of several parts as one mesh, whose regions are the parts."""
+    zero = [np.zeros(len(shading.mesh.position), np.int32) for shading in shadings]
+    pairs = zip(shadings, zero, strict=True)
+    return join([dataclasses.replace(shading.mesh, region=region) for shading, region in pairs])
+
+
 def joined(shadings: Sequence[Shading]) -> Shading:
-    """The `Shading` of several parts of one kind, without mesh; its weights are those of all their vertices."""
-    first = shadings[0]
+    """The `Shading` of several parts of one kind. The regions of its mesh are the parts."""
+    first = dataclasses.replace(shadings[0], mesh=joined_mesh(shadings))
     if first.blend is None or len(shadings) == 1:
         return first
     blends = [shading.blend for shading in shadings if shading.blend is not None]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf import Lambert
 from jaxprt.compile import known
 from jaxprt.relit.channels import Appearance, Shading
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, lobe_table
 from jaxprt.scene import PointLight, Scene
 from jaxprt.scene.mesh import areas
@@ -54,10 +54,6 @@ class SceneLamps(eqx.Module):
         rows += [changed.get(each.name, each).intensity for each in self.point_lights]
         return jax.device_put(np.stack(rows)) if known(rows) else jnp.stack(rows)
 
-    def number(self, part: int) -> int:
-        """Index of the lamp that a part is; -1 if the part does not emit."""
-        return self.emitting.index(part) if part in self.emitting else -1
-
 
 def _mean(area: Any, emitted: Any) -> Any:
     """Mean of emitted radiance over an area."""
@@ -82,7 +78,7 @@ def make(
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         place: Where the vertices of the parts stand in their groups.
         systems: The systems of the groups. If one has a table of lobes, it is used.
-        targets: For each part, what casts shadows, and where and how to compute.
+        targets: For each group, what casts shadows, and where and how to compute.
         point_lights: The point lights of the scene, in the coordinates of its file.
     """
     emitting = [number for number, each in enumerate(shadings) if each.emitted is not None]
@@ -90,12 +86,10 @@ def make(
         return None
     sources = [*(shadings[number].mesh for number in emitting), *scene.point_lights]
     groups = []
-    for own, size, system in zip(place.parts, place.size, systems, strict=True):
-        rows = [
-            lamps.precompute(shadings[part].mesh, sources, **targets[part].traced(), **targets[part].options("lamps"))
-            for part in own
-        ]
-        transport, shading = axes.joined(rows, size=size), shadings[own[0]]
+    for own, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
+        shading, mesh = shadings[own[0]], joined_mesh([shadings[part] for part in own])
+        options = target.traced() | target.options("lamps")
+        transport = axes.joined([lamps.precompute(mesh, sources, apart=True, **options)], size=size)
         if isinstance(shading.brdf, Lambert):
             groups.append(LitByLamps(transport, albedo=shading.brdf.albedo))
         else:

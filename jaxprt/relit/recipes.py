@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
@@ -21,7 +21,7 @@ from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.standard import StandardTable
-from jaxprt.visibility import StoredVisibility, UnfinishedError
+from jaxprt.visibility import StoredVisibility
 
 T = TypeVar("T")
 
@@ -90,19 +90,6 @@ class Target:
         return {"occluder": self.occluder, "vertex": self.vertex}
 
 
-@dataclasses.dataclass(frozen=True)
-class Piece:
-    """A mesh whose rays start together, and where and how to trace them.
-
-    Attributes:
-        mesh: The mesh of a part.
-        target: What casts shadows, and where and how to compute.
-    """
-
-    mesh: Mesh
-    target: Target
-
-
 @runtime_checkable
 class Recipe(Protocol):
     """The parameters of a system, and the method that precomputes it for parts of one kind.
@@ -117,25 +104,14 @@ class Recipe(Protocol):
         """Whether the system reads a standard table; otherwise parts have BRDFs of their own."""
         ...
 
-    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
-        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
+        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
         ...
 
 
-def _joined(pieces: Sequence[Piece], vertices: int | None, trace: Callable[[Piece], T]) -> T:
-    """The transport of all pieces. Those that other machines have not finished are reported together."""
-    made, unfinished = [], []
-    for piece in pieces:
-        try:
-            made.append(trace(piece))
-        except UnfinishedError as others:  # Go on with the next part of the scene.
-            unfinished.append(others)
-    if unfinished:
-        raise UnfinishedError("; ".join(map(str, unfinished)))
-    if len(made) == 1 and vertices is None:
-        return made[0]
-    count = sum(len(piece.mesh.position) for piece in pieces)
-    return axes.joined(made, size=count if vertices is None else vertices)
+def _padded(transport: T, vertices: int | None) -> T:
+    """Transport padded to a number of vertices."""
+    return transport if vertices is None else axes.joined([transport], size=vertices)
 
 
 class Lobes(eqx.Module):
@@ -156,9 +132,9 @@ class Lobes(eqx.Module):
         """Whether a table with this number of lobes is shipped."""
         return self.lobes in table.counts
 
-    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
-        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
-        transport = _joined(pieces, vertices, _pyramid)
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
+        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
+        transport = _padded(_pyramid(shading.mesh, target), vertices)
         if isinstance(shading.brdf, Lambert):
             vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
             matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
@@ -193,18 +169,14 @@ class Harmonics(eqx.Module):
         """Whether a table of this degree is shipped."""
         return self.degree <= standard.DEGREE
 
-    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
-        """Precomputes the system of the vertices of all pieces, padded to a number of vertices."""
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
+        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
         matte = isinstance(shading.brdf, Lambert)
         trace = harmonic.precompute_diffuse if matte else harmonic.precompute
         store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
-
-        def one(piece: Piece) -> Any:
-            size = min(piece.target.size, _HARMONIC_SIZE)
-            options = piece.target.traced() | piece.target.options(store)
-            return trace(piece.mesh, degree=self.degree, size=size, **options)
-
-        transport = _joined(pieces, vertices, one)
+        size, options = min(target.size, _HARMONIC_SIZE), target.traced() | target.options(store)
+        whole: Any = trace(shading.mesh, degree=self.degree, size=size, apart=True, **options)
+        transport = _padded(whole, vertices)
         if isinstance(shading.brdf, Lambert):
             return harmonic.DiffuseSystem(transport, shading.brdf.albedo)
         return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
@@ -234,15 +206,14 @@ class Terms(eqx.Module):
         """Never: one BRDF is factored."""
         return False
 
-    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
         check(self, shading)
-        mesh, target = pieces[0].mesh, pieces[0].target
         terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
         keep = min(self.keep, 6 * target.size**2)
         options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
-        return separable.SeparableSystem(separable.precompute(mesh, factored, **options), factored)
+        return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
 
 
 class Clusters(eqx.Module):
@@ -272,14 +243,13 @@ class Clusters(eqx.Module):
         """Never: one BRDF is factored."""
         return False
 
-    def make(self, shading: Shading, pieces: Sequence[Piece], *, vertices: int | None = None) -> System:
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
         check(self, shading)
-        mesh, target = pieces[0].mesh, pieces[0].target
         known = target.known
         if known is None:
             options = {**target.traced(), **target.options("visibility")}
-            known = Known(visibility.precompute(mesh, size=target.size, **options))
+            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
         visible = known.visible
         clusters, terms, sizes = self._sizes(shading, len(visible.position), visible.size)
         factored = known.factored(shading.brdf, terms, self.resolution)
@@ -312,12 +282,11 @@ SYSTEMS: dict[str, Recipe] = {
 }
 
 
-def _pyramid(piece: Piece) -> LobeTransport:
-    """The visibility pyramids of a piece."""
-    target = piece.target
+def _pyramid(mesh: Mesh, target: Target) -> LobeTransport:
+    """The visibility pyramids of a mesh."""
     if target.known is not None:
         return target.known.pyramid
-    return lobe.precompute(piece.mesh, size=target.size, **target.traced(), **target.options("lobe"))
+    return lobe.precompute(mesh, size=target.size, apart=True, **target.traced(), **target.options("lobe"))
 
 
 def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:

@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
-from jaxprt.scene import Environment, Mesh
-from jaxprt.scene.mesh import frames, join
+from jaxprt.scene import Environment
+from jaxprt.scene.mesh import frames
 from jaxprt.systems import bounces, harmonic
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
@@ -59,7 +57,7 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
     Returns:
         The system of reflected light alone.
     """
-    mesh, first = _joined(shadings), [shadings[own[0]] for own in place.parts]
+    mesh, first = joined_mesh(shadings), [shadings[own[0]] for own in place.parts]
     of_group = [paths.factored(shading) for shading in first]
     sent = [of_group[number] for number in place.group]
     weights = [paths.typical(*each) for each in zip(shadings, sent, strict=True)]
@@ -121,7 +119,7 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
     Returns:
         Relative L2 fraction for each number of bounces (rows) and part (columns).
     """
-    mesh, albedo = _joined(shadings), np.stack([paths.albedo(each) for each in shadings])
+    mesh, albedo = joined_mesh(shadings), np.stack([paths.albedo(each) for each in shadings])
     options = {"size": _REFLECTED, "progress": False}
     direct = harmonic.precompute_diffuse(mesh, degree=_DEGREE, size=_DIRECT, progress=False)
     each = [direct.vector]
@@ -149,9 +147,3 @@ def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int | str:
     """Smallest number of bounces that omits at most `error` of each part's radiance; "all" if two omit more."""
     enough = np.flatnonzero(np.all(reflected <= error, 1))
     return int(enough[0]) if enough.size else ALL
-
-
-def _joined(shadings: Sequence[Shading]) -> Mesh:
-    """The meshes of all parts as one mesh, whose regions are the parts."""
-    one = [eqx.tree_at(lambda mesh: mesh.region, each.mesh, jnp.zeros_like(each.mesh.region)) for each in shadings]
-    return join(one)

@@ -17,9 +17,9 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit import channels, groups
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import FEWEST, JUDGED, relative_error, seconds
-from jaxprt.relit.recipes import Known, Piece, Recipe, Target
+from jaxprt.relit.recipes import Known, Recipe, Target
 from jaxprt.scene import Environment, Mesh, Part
-from jaxprt.scene.mesh import frames, join
+from jaxprt.scene.mesh import frames
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import protocol, reference, separable
 from jaxprt.systems.bright_texels import BrightTexels
@@ -107,8 +107,8 @@ class Sample:
             environments: The lights.
             views: Positions of the viewers.
         """
-        mesh = join([_one_region(shading.mesh) for shading in shadings])
-        shading = dataclasses.replace(groups.joined(shadings), mesh=mesh)
+        shading = groups.joined(shadings)
+        mesh = shading.mesh
         count = len(mesh.position)
         clusters = max(1, round(count / MEMBERS))
         member = separable.members.cluster(mesh.position, mesh.normal, clusters=clusters)
@@ -146,7 +146,7 @@ class Sample:
     def measure(self, recipe: Recipe) -> Candidate:
         """Runs a recipe on the sample and measures its error and cost."""
         start = time.perf_counter()
-        system = recipe.make(self.shading, [Piece(self.shading.mesh, self.target)])
+        system = recipe.make(self.shading, self.target)
         seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
         wrong = max(self._error(system, *each) for each in zip(self.environments, self.exact, strict=True))
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
@@ -186,10 +186,6 @@ def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
         chosen = random.choice(len(corner), count, p=area / area.sum())
     weight = random.dirichlet(np.ones(3), count).astype(np.float32)
     return Points(jnp.asarray(corner[chosen].T), jnp.asarray(weight.T))
-
-
-def _one_region(mesh: Mesh) -> Mesh:
-    return eqx.tree_at(lambda each: each.region, mesh, np.zeros(len(mesh.position), np.int32))
 
 
 def _judged(

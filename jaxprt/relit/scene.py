@@ -143,7 +143,7 @@ class RelitScene(System):
         self.drawn = groups.padded(self.mesh)
         self.lobes = tuple(None for _ in systems) if lobes is None else tuple(lobes)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
-        own = [Appearance(each.blend, each.emitted) for each in shading]
+        own = [_own(each) for each in shading]
         self.appearance = tuple(jax.device_put(place.gathered(number, own)) for number in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
@@ -291,12 +291,13 @@ class RelitScene(System):
         new = {name: each for name, each in given.items() if _is_model(each)}
         table, rough = self._tables(new)
         fixed = [name in given and name not in new for name in names]
-        every = [appearances.get(name, Appearance(None)) for name in names]
+        own = Appearance(None)
+        every = [appearances.get(name, own) for name in names]
         kept = [self._given(number, fixed, every) for number in range(len(self.surfaces))]
-        traits = [self._trait(*each) for each in zip(range(len(names)), every, strict=True)]
-        bend, samples, sharp = (tuple(each) for each in zip(*traits, strict=True))
+        bend, samples, sharp = self._traits(every)
         surfaces = [self._surface(number, sharp) for number in range(len(self.surfaces))]
-        lamp = tuple(-1 if self.lamps is None else self.lamps.number(part) for part in range(len(names)))
+        emitting = {} if self.lamps is None else {part: lamp for lamp, part in enumerate(self.lamps.emitting)}
+        lamp = tuple(emitting.get(part, -1) for part in range(len(names)))
         bends = groups.spread(bend, self.place.counts, len(self.drawn.position), self.mesh.position.dtype)
         return Stage(
             self.mesh, self.drawn, tuple(surfaces), table, rough, tuple(kept), bends, self.place, samples, sharp, lamp
@@ -317,13 +318,16 @@ class RelitScene(System):
                 return table, None
             return table, put(material_table.with_materials(self.table, plain, before))
 
-    def _trait(self, part: int, new: Appearance) -> tuple[Any, int, bool]:
-        """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced."""
-        shading, number = self.shading[part], self.place.group[part]
-        if new.blend is None or shading.table is None or not known(new):
-            return self.curvature[part], self.samples[part], self.sharp[part]
-        now = dataclasses.replace(shading, blend=new.blend)
-        return traits(now, self.surfaces[number].system, self.lobes[number])
+    def _traits(self, every: Sequence[Appearance]) -> tuple[list, tuple[int, ...], tuple[bool, ...]]:
+        """Curvature of each part's radiance, samples of bright texels, and whether its reflections are traced."""
+        found = list(zip(self.curvature, self.samples, self.sharp, strict=True))
+        for part, (new, shading) in enumerate(zip(every, self.shading, strict=True)):
+            if new.blend is not None and shading.table is not None and known(new):
+                number = self.place.group[part]
+                now = dataclasses.replace(shading, blend=new.blend)
+                found[part] = traits(now, self.surfaces[number].system, self.lobes[number])
+        bend, samples, sharp = zip(*found, strict=True)
+        return list(bend), samples, sharp
 
     def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
         """A group, with rays for its reflections if any of its parts is sharp."""
@@ -341,7 +345,7 @@ class RelitScene(System):
         own = self.place.parts[number]
         if not any(fixed[part] for part in own) or self.surfaces[number].scale is None:
             return None
-        names = {part: appearances[part] if fixed[part] else self._own(part) for part in own}
+        names = {part: appearances[part] if fixed[part] else _own(self.shading[part]) for part in own}
         whole = self.place.gathered(number, [names.get(part, Appearance(None)) for part in range(len(fixed))])
         dtype = self.mesh.position.dtype
         flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in own])
@@ -557,13 +561,15 @@ class RelitScene(System):
         first = int(self.place.start[part])
         return axes.taken(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
 
-    def _own(self, part: int) -> Appearance:
-        """The material that a part was precomputed with."""
-        return Appearance(self.shading[part].blend, self.shading[part].emitted)
-
     def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""
-        return [appearances.get(part.name, self._own(number)) for number, part in enumerate(self.scene.parts)]
+        pairs = zip(self.scene.parts, self.shading, strict=True)
+        return [appearances.get(part.name) or _own(shading) for part, shading in pairs]
+
+
+def _own(shading: Shading) -> Appearance:
+    """The material that a part was precomputed with."""
+    return Appearance(shading.blend, shading.emitted)
 
 
 def _is_model(material: Any) -> bool:

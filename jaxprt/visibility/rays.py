@@ -141,8 +141,20 @@ class VisibilityJob(blocks.Job):
     mesh_near: Mapping[str, list[float]]
 
     @classmethod
-    def make(cls, mesh: Mesh, occluder: Mesh | None, vertex: np.ndarray | None, size: int, **more: Any):
-        """Makes a job for some vertices of a mesh, or all for None. If `occluder` is None, the mesh shadows itself."""
+    def make(
+        cls,
+        mesh: Mesh,
+        occluder: Mesh | None,
+        vertex: np.ndarray | None,
+        size: int,
+        *,
+        apart: bool = False,
+        **more: Any,
+    ):
+        """Makes a job for some vertices of a mesh, or all for None. If `occluder` is None, the mesh shadows itself.
+
+        With `apart`, rays start as `start_points` says.
+        """
         shadowing: Mesh = jax.tree.map(np.asarray, mesh if occluder is None else relative(occluder, mesh.origin))
         if mesh.origin != origins.ZERO:
             warnings.warn(
@@ -152,7 +164,8 @@ class VisibilityJob(blocks.Job):
                 stacklevel=4,
             )
         vertex = chosen(mesh, vertex)
-        start = start_points(mesh, Occluder(shadowing))[vertex]
+        rays = Occluder(shadowing)
+        start = start_points(mesh, rays, apart=apart)[vertex]
         normal, tangent = (np.asarray(each)[vertex] for each in (mesh.normal, mesh.tangent))
         frame = frames(normal, tangent).astype(np.float32)
         # The key depends on the inputs only: computed values are rounded differently on other processors.
@@ -160,7 +173,9 @@ class VisibilityJob(blocks.Job):
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
         rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
         near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}
-        return cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
+        job = cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
+        object.__setattr__(job, "rays", rays)  # the cached property
+        return job
 
     def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
         """The header of a system's job: the inputs, and the versions of the algorithms."""

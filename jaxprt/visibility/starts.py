@@ -15,7 +15,7 @@ _TURNS = 16  # steps that turn this direction off faces which it grazes
 
 
 def start_points(
-    mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None
+    mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None, apart: bool = False
 ) -> Float32[np.ndarray, "v 3"]:
     """Origins of the rays of each vertex, slightly off the surface.
 
@@ -30,6 +30,8 @@ def start_points(
         occluder: Geometry that casts shadows.
         offset: Distance of the origins from each face of the mesh; None computes it from the face's corners. A face
             that lies in a larger triangle of the occluder needs the offset of that triangle.
+        apart: Whether the regions of the mesh are separate surfaces. Faces at the same position in another region then
+            do not count as faces around a vertex.
 
     Raises:
         ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
@@ -37,7 +39,7 @@ def start_points(
     """
     check(mesh, "mesh")
     position, face = np.asarray(mesh.position, np.float32), np.asarray(mesh.face)
-    out, steepness = _outward(mesh)
+    out, steepness = _outward(mesh, apart)
     distance = offsets(position, np.arange(len(position))[:, None])  # of vertices without faces
     np.maximum.at(distance, face.ravel(), np.repeat(offsets(position, face) if offset is None else offset, 3))
     distance = (distance / np.maximum(steepness, _STEEPEST))[:, None].astype(np.float32)
@@ -64,12 +66,12 @@ def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
     return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
 
 
-def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _outward(mesh: Mesh, apart: bool) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors that point off the surface, to the side of each vertex's shading normal.
 
     They average the normals of all faces at the same position. Where vertices are split along a crease, faces across
-    the crease count too; otherwise a ray could start inside of them. Where the mean grazes a face, or is behind it, the
-    vector is turned off that face.
+    the crease count too; otherwise a ray could start inside of them. With `apart`, they count within a region. Where
+    the mean grazes a face, or is behind it, the vector is turned off that face.
 
     Returns:
         The vectors, and for each vertex the smallest cosine between its vector and the normals of the faces that count.
@@ -81,6 +83,8 @@ def _outward(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     )
     of_vertex = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
+    if apart:
+        _, place = np.unique(place + len(position) * np.asarray(mesh.region, np.int64), return_inverse=True)
     joint = _added(place, of_vertex, len(normal))[place]
     # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     shared = np.sum(joint * of_vertex, 1) > 1e-6 * np.sum(of_vertex * of_vertex, 1)

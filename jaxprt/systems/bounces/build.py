@@ -102,7 +102,7 @@ def precompute(
         "region": np.searchsorted(numbers, region),
         "member": member,
     }
-    sizes = {"components": min(components, member.shape[1]), "modes": min(modes, 6 * edge * edge)}
+    sizes: dict[str, Any] = {"components": min(components, member.shape[1]), "modes": min(modes, 6 * edge * edge)}
     job = jobs.TransferJob.make(mesh, None, None, size, **parts, **sizes)
     found = run.compute(job, "clusters", "bounce")
     contribution = _contributions(found["energy"], job.scale)

@@ -75,6 +75,7 @@ def precompute(
     size: int = 32,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
+    apart: bool = False,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -87,6 +88,7 @@ def precompute(
         size: Edge of the cubemap faces of visibility, in texels; a power of two.
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
         path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
@@ -103,7 +105,7 @@ def precompute(
     """
     check(degree, size)
     check_memory(len(visibility.rays.chosen(mesh, vertex)), degree, in_files=path is not None)
-    job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=False)
+    job = _Job.make(mesh, occluder, vertex, size, apart=apart, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)
     return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
@@ -117,6 +119,7 @@ def precompute_diffuse(
     size: int = 32,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
+    apart: bool = False,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -129,6 +132,7 @@ def precompute_diffuse(
         size: Edge of the cubemap faces of visibility, in texels; a power of two.
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
         path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
@@ -142,7 +146,7 @@ def precompute_diffuse(
     Reference: Sloan, Kautz, Snyder 2002, section 4.
     """
     check(degree, size)
-    job = _Job.make(mesh, occluder, vertex, size, degree=degree, diffuse=True)
+    job = _Job.make(mesh, occluder, vertex, size, apart=apart, degree=degree, diffuse=True)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     return TransferVector(jax.device_put(result["vector"]), visibility.rays.place(mesh, vertex))
 

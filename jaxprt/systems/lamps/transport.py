@@ -80,6 +80,7 @@ def precompute(
     pieces: int = 4,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
+    apart: bool = False,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -96,6 +97,7 @@ def precompute(
             relative to the lobes of the BRDF.
         occluder: Mesh that casts shadows, such as the whole scene with or without the lamps; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
         path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
@@ -118,7 +120,7 @@ def precompute(
     lamps = [_relative(lamp, mesh.origin) for lamp in lamps]
     coarse, fine = (_Samples.of(lamps, count, pieces) for count in (samples, _FINER * samples))
     lamp = [number for number, each in enumerate(lamps) for _ in range(pieces if isinstance(each, Mesh) else 1)]
-    job = _Job.make(mesh, occluder, vertex, 1, coarse=coarse, fine=fine)
+    job = _Job.make(mesh, occluder, vertex, 1, apart=apart, coarse=coarse, fine=fine)
     found = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="lamps")["moment"]
     solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(each.T)) for each in np.moveaxis(found, 2, 0))
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)

@@ -223,6 +223,7 @@ def precompute(
     size: int = 64,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
+    apart: bool = False,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
@@ -236,6 +237,7 @@ def precompute(
         size: Edge of the light's cubemap faces in texels; a power of two, at least 8.
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
+        apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
         path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
         progress: Whether to show a progress bar.
@@ -250,7 +252,7 @@ def precompute(
         RuntimeError: A worker of the executor died.
     """
     scales(size)
-    job = _Job.make(mesh, occluder, vertex, size)
+    job = _Job.make(mesh, occluder, vertex, size, apart=apart)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = visibility.rays.place(mesh, vertex)
     made, vector, frame = (jax.device_put(each) for each in (result["pyramid"], result["vector"], job.frame))
