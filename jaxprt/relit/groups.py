@@ -143,6 +143,10 @@ class Place(eqx.Module):
         """Index of a vertex of each part in the scene, minus its index in its group."""
         return self.first - self.start
 
+    def vertices(self, number: int) -> Int[np.ndarray, " v"]:
+        """Index in the scene of each vertex of a group, without padding."""
+        return np.concatenate([self.first[part] + np.arange(self.counts[part]) for part in self.parts[number]])
+
     def order(self) -> Int[np.ndarray, " v"]:
         """Index of each vertex of the scene among the vertices of all groups."""
         begin = np.cumsum([0, *self.size])[self.group] + self.start

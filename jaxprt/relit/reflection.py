@@ -1,10 +1,12 @@
 """Light that the parts of a scene reflect onto each other: estimates of its size, and its precomputation."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float
+import scipy
+from jaxtyping import Array, Float, Int
 
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
@@ -25,6 +27,7 @@ _EACH = 3  # number of bounces that are estimated one by one; further ones are e
 _EDGE = 8  # largest edge of the faces of light that is reflected
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # of the estimate: degree of harmonics, and edges of the faces of rays
 _SLOWEST = 0.95  # largest ratio of a bounce to the previous one
+_REGIONS = 16  # of the transfer tensor, whose time and memory are proportional to them; one more for each group
 _LOBES = 8  # number of lobes for sharp parts whose system has no table of lobes
 
 
@@ -48,6 +51,9 @@ def check(count: int | str | None) -> None:
 def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Target) -> GroupBounces:
     """Precomputes the light that all parts reflect onto each other and themselves.
 
+    In a scene of more than 16 parts, parts of a group with similar materials send light with their common mean
+    material. Patches add the differences between their colors, as for textures.
+
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         place: Where the vertices of the parts stand in their groups.
@@ -57,10 +63,13 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
     Returns:
         The system of reflected light alone.
     """
-    mesh, first = joined_mesh(shadings), [shadings[own[0]] for own in place.parts]
+    first = [shadings[own[0]] for own in place.parts]
     of_group = [paths.factored(shading) for shading in first]
-    sent = [of_group[number] for number in place.group]
-    weights = [paths.typical(*each) for each in zip(shadings, sent, strict=True)]
+    typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
+    region, own = _regions(place, typical)
+    mesh = dataclasses.replace(joined_mesh(shadings), region=np.repeat(region, place.counts))
+    sent = [of_group[place.group[parts[0]]] for parts in own]
+    weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in own]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(mesh, [each.brdf for each in sent], weights=weights, bounces=count, **options)
@@ -72,7 +81,39 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
         table = harmonic_table(shading, degree=DEGREE)
         position, axes = jax.device_put((position, place.column(number, frame)))
         groups.append(ReflectingPart(position, axes, table, sent=path.sent))
-    return GroupBounces.make(tensor, groups, place.parts)
+    return GroupBounces.make(tensor, groups, [place.vertices(number) for number in range(len(groups))])
+
+
+def _regions(place: Place, typical: Sequence[Array | None]) -> tuple[Int[np.ndarray, " n"], list[list[int]]]:
+    """Parts that send light to other surfaces with one mean material: region of each part, and parts of each region.
+
+    Parts whose material cannot change have one material in a group. Others have a region each, unless there are too
+    many; then those with the most similar weights share one.
+    """
+    region = np.full(len(place.counts), -1, np.int32)
+    for own in map(list, place.parts):
+        label = np.arange(len(own))
+        most = -(-_REGIONS * len(own) // len(region))
+        if typical[own[0]] is None:
+            label = np.zeros_like(label)
+        elif most < len(own):
+            rows = _alike([typical[part] for part in own]).reshape(len(own), -1)
+            label = scipy.cluster.hierarchy.fcluster(scipy.cluster.hierarchy.ward(rows), most, "maxclust") - 1
+        region[own] = np.max(region) + 1 + label
+    return region, [np.flatnonzero(region == number).tolist() for number in range(np.max(region) + 1)]
+
+
+def _mean(weights: Sequence[Array | None], counts: Sequence[int]) -> Float[Array, "p c"] | None:
+    """Mean of the weights of some parts over their vertices; None without weights."""
+    if weights[0] is None:
+        return None
+    rows = _alike(weights)
+    return jax.device_put(np.average(rows, axis=0, weights=list(counts)).astype(rows.dtype))
+
+
+def _alike(weights: Sequence[Array | None]) -> Float[np.ndarray, "n p c"]:
+    """Weights in one array; gray ones are repeated to the colors of the others."""
+    return np.stack(np.broadcast_arrays(*map(np.asarray, weights)))
 
 
 def lobes(shadings: Sequence[Shading], place: Place, systems: Sequence[System]) -> list[LobeBrdf | None]:

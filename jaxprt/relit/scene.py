@@ -250,7 +250,7 @@ class RelitScene(System):
         """The vertices of a group as points of the scene; or the scene's points on it, and these on the group."""
         parts = self.place.parts[number]
         if self.points is None:
-            vertex = self.place.column(number, [self.place.first[p] + np.arange(self.place.counts[p]) for p in parts])
+            vertex = self.place.column(number, [self.place.vertices(number)])
             return material_table.at_vertices(vertex.astype(np.int32)), None
         own = [self.points[part] for part in parts]
         xp = np if known(own) else jnp
@@ -278,6 +278,8 @@ class RelitScene(System):
 
     def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each group: the precomputed one, or with other materials of some parts."""
+        if not appearances:
+            return list(self.appearance)
         names = [part.name for part in self.scene.parts]
         every, result = self._all(appearances), []
         for number, own in enumerate(self.place.parts):

@@ -304,6 +304,24 @@ def test_a_second_bounce_off_a_material_of_channels_is_kept():
     assert 1.03 < both / first < 1.5
 
 
+def test_parts_beyond_the_number_of_regions_send_light_together_if_they_are_alike(monkeypatch):
+    red, blue = (TexturedMaterial(color, metallic=0.0, roughness=0.8) for color in ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8)))
+    parts = [Part(f"{n} {name}", mesh(name), each) for n, each in enumerate((red, blue)) for name in ("floor", "wall")]
+    other = [Part("ball", mesh("ball"), GLOSSY), Part("second ball", mesh("ball"), GLOSSY)]
+    made = {}
+    for count in (2, 16):
+        monkeypatch.setattr(reflection, "_REGIONS", count)
+        options = {"system": RECIPES["harmonic"], "bounces": 1, "size": SIZE, "progress": False}
+        made[count] = prt.precompute(Scene([*parts[::2], *other, *parts[1::2]]), **options)
+    few, many = (each.bounces.tensor for each in made.values())
+    assert (len(few.factor), len(many.factor)) == (3, 5)
+    few, many, direct = (
+        np.asarray(each.radiance(light(), eye=EYE)) for each in (*made.values(), made[16].without_bounces())
+    )
+    assert np.linalg.norm(many - direct) > 0.05 * np.linalg.norm(many)
+    assert np.linalg.norm(few - many) < 0.01 * np.linalg.norm(many)  # red and blue together: 0.1
+
+
 def test_two_bounces_go_on_from_the_store_of_one(tmp_path, monkeypatch):
     def reflected(count):
         options = {"system": RECIPES["harmonic"], "size": SIZE, "path": tmp_path / "store", "progress": False}

@@ -1,7 +1,8 @@
 """Light that the parts of a scene reflect onto each other, for groups of parts with one BRDF.
 
 Each group has one BRDF with channels that textures weight at its vertices, and all its parts send light with the same
-functions. The weights of these functions are those of each part's mean material.
+functions. The weights of these functions are those of each part's mean material. Here, several parts whose light has
+one mean material count as one part.
 """
 
 from collections.abc import Sequence
@@ -110,48 +111,47 @@ class GroupBounces(eqx.Module):
 
     @classmethod
     def make(
-        cls, tensor: TransferTensor, group: Sequence[ReflectingPart], parts: Sequence[Sequence[int]]
+        cls, tensor: TransferTensor, group: Sequence[ReflectingPart], vertices: Sequence[Int[np.ndarray, " _"]]
     ) -> "GroupBounces":
         """Joins the parts of each group.
 
         Args:
             tensor: The tensor, whose regions are the parts.
-            group: The vertices of each group, part after part, and then padding.
-            parts: Indices of the parts of each group.
+            group: The vertices of each group, and then padding.
+            vertices: Index in the scene of each vertex of a group, without padding.
 
         Raises:
             TypeError: `tensor` is not a `TransferTensor`.
             ValueError: The tensor is of sets, or of other parts or vertices.
         """
         require.kind("the tensor", tensor, TransferTensor, source="jaxprt.bounces.precompute")
-        region, numbers = np.asarray(tensor.region), [number for own in parts for number in own]
+        region, area = np.asarray(tensor.region), np.asarray(tensor.area)
+        own = [np.unique(region[vertex], return_inverse=True) for vertex in vertices]
+        numbers = np.concatenate([number for number, _ in own]).tolist()
         found = [each.ndim for each in tensor.factor]
         if found != [2] * len(numbers):
             raise ValueError(
                 f"the tensor must have one factored BRDF for each of {len(numbers)} parts, got {len(found)} BRDFs, "
                 f"{sum(each > 2 for each in found)} of them sets"
             )
-        members, area = [], np.asarray(tensor.area)
-        for own, at in zip(group, parts, strict=True):
-            vertex = np.concatenate([np.flatnonzero(region == number) for number in at])
-            room = len(own.position) - len(vertex)
+        members = []
+        for each, vertex, (number, part) in zip(group, vertices, own, strict=True):
+            room = len(each.position) - len(vertex)
             if room < 0:
-                raise ValueError(f"a group must have the tensor's {len(vertex)} vertices, got {len(own.position)}")
-            part = np.repeat(np.arange(len(at)), [np.sum(region == number) for number in at])
+                raise ValueError(f"a group must have the tensor's {len(vertex)} vertices, got {len(each.position)}")
             rows = (np.pad(row, (0, room), mode="edge").astype(np.int32) for row in (vertex, part))
             at_vertex, at_part, whole = jax.device_put((*rows, np.pad(area[vertex], (0, room)).astype(area.dtype)))
-            members.append(Members(at_vertex, at_part, whole, len(at)))
+            members.append(Members(at_vertex, at_part, whole, len(number)))
         size = [len(factor) for factor in tensor.factor]
         start = np.empty(len(size), int)  # of the functions of each part, among those of all groups
         start[numbers] = np.cumsum([0, *(size[number] for number in numbers)])[:-1]
         order = np.concatenate([start[number] + np.arange(size[number]) for number in range(len(size))])
         place, begin = np.empty(len(region), np.int32), 0
-        for own in members:
-            # In reverse order, so that a vertex keeps its first place and not that of padding.
-            place[np.asarray(own.vertex)[::-1]] = begin + np.arange(len(own.vertex))[::-1]
-            begin += len(own.vertex)
+        for each, vertex in zip(group, vertices, strict=True):
+            place[vertex] = begin + np.arange(len(vertex))
+            begin += len(each.position)
         kept = order[np.asarray(tensor.function)].astype(np.int32)
-        first = [own[0] for own in parts]
+        first = [number[0] for number, _ in own]
         strength = [None if tensor.patches is None else tensor.patches.strength[number] for number in first]
         factor, rows = tuple(tensor.factor[number] for number in first), jax.device_put((kept, place))
         return cls(tensor, tuple(group), tuple(members), factor, tuple(strength), *rows)

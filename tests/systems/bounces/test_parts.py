@@ -76,7 +76,7 @@ def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> Reflecte
     tables = [harmonic.tabulate(each, degree=3, error=0.5) for each in brdfs]
     parts = zip(own, tables, strict=True)
     groups = [ReflectingPart(mesh.position[at], frame[at], table) for at, table in parts]
-    return Reflected(GroupBounces.make(tensor, groups, [[number] for number in range(len(groups))]))
+    return Reflected(GroupBounces.make(tensor, groups, [np.flatnonzero(at) for at in own]))
 
 
 def test_parts_of_one_group_send_what_they_send_in_groups_of_their_own(close):
@@ -92,7 +92,7 @@ def test_parts_of_one_group_send_what_they_send_in_groups_of_their_own(close):
     rows = [np.concatenate([np.asarray(getattr(first[n], name)) for n in (2, 0)]) for name in ("position", "frame")]
     rows = [np.pad(each, [(0, 20)] + [(0, 0)] * (each.ndim - 1), mode="edge") for each in rows]
     both = ReflectingPart(*map(jnp.asarray, rows), first[0].brdf), first[1]
-    joined = Reflected(GroupBounces.make(alone.bounces.tensor, both, [[2, 0], [1]]))
+    joined = Reflected(GroupBounces.make(alone.bounces.tensor, both, [np.r_[72:144, 0:36], np.r_[36:72]]))
     wide = np.pad(np.concatenate([ends[2], ends[0]]), ((0, 20), (0, 0), (0, 0)), mode="edge")
     found = joined.radiance(SKY, [prt.Blend(wide), prt.Blend(ends[1])])
     close(np.concatenate([found[72:108], found[128:], found[:72]]), expected, tolerance=1e-5)
@@ -192,9 +192,9 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
         ReflectingPart(mesh.position, system.group[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
     with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2 BRDFs, 0 of them sets"):
-        GroupBounces.make(system.tensor, system.group[:1], [[0]])
+        GroupBounces.make(system.tensor, system.group[:1], [np.arange(count)])
     shorter = ReflectingPart(mesh.position[:3], system.group[0].frame[:3], system.group[0].brdf)
     with pytest.raises(ValueError, match=rf"must have the tensor's {count} vertices, got 3"):
-        GroupBounces.make(system.tensor, (system.group[0], shorter), [[0], [1]])
+        GroupBounces.make(system.tensor, (system.group[0], shorter), [np.arange(count), count + np.arange(count)])
     with pytest.raises(ValueError, match=rf"must have weights \[{count} vertices, 1 channels, c\]"):
         system.shade(system.light(SKY), [prt.Blend(jnp.ones((count, 2, 3))), None])
