@@ -1012,7 +1012,7 @@ def _entering(name: str) -> set[str]:
     [
         name
         for name in PURE
-        if name.startswith("relight.") and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
+        if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
     ],
 )
 def test_lights_eyes_and_weights_that_are_not_finite_are_refused_by_name(name):
