@@ -24,7 +24,7 @@ from jaxprt.systems.bounces import functions
 from jaxprt.systems.separable import SeparableBrdf
 
 DEGREE = 3  # degree of the harmonics that arrive
-_HITS = 64  # number of hits in a group: their responses should fit in the cache
+_HITS = 16  # number of hits in a group: few are padding, and their responses fit in the cache
 _GRAZING = 1e-3  # smallest cosine of a view: interpolated normals may face away where the surface does not
 
 

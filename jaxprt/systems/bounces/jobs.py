@@ -23,7 +23,7 @@ from jaxprt.systems.separable import SeparableBrdf
 # Versions of the algorithms that make the results. A release that changes results increments one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
 DEGREE = gather.DEGREE  # degree of the harmonics that arrive
-_GROUPS = 512  # groups of rays that are summed by one program
+_GROUPS = 128  # groups of rays that are summed by one program
 _AGAIN = 2  # edge of the light's faces for two bounces
 
 
