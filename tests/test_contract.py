@@ -1009,11 +1009,7 @@ def _entering(name: str) -> set[str]:
 # The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked when made.
 @pytest.mark.parametrize(
     "name",
-    [
-        name
-        for name in PURE
-        if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
-    ],
+    [name for name in PURE if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)],
 )
 def test_lights_eyes_and_weights_that_are_not_finite_are_refused_by_name(name):
     given = dict(inspect.signature(PUBLIC[name]).bind_partial(*(a := build(name)).position, **a.name).arguments)

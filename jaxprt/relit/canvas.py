@@ -21,7 +21,9 @@ from jaxprt.scene.points import Points
 ROW = 1 << 12  # number of points that are shaded together
 
 
-def rows_of(chosen: Array | np.ndarray, owner: Int[np.ndarray, " n"] | None = None) -> Int[Array | np.ndarray, "m p"]:
+def rows_of(
+    chosen: Array | np.ndarray, *, owner: Int[np.ndarray, " n"] | None = None
+) -> Int[Array | np.ndarray, "m p"]:
     """Indices of the chosen points in rows of one length; -1 is padding.
 
     Where the owner of each point is known, points of one owner stand together: what a row needs is then less.

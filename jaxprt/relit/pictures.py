@@ -278,12 +278,12 @@ def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]
     """The points in rows by group, number of samples, and whether radiance is interpolated."""
     for number, own in enumerate(stage.place.parts):
         between = interpolated[number]
-        for index in canvas.rows_of(np.isin(owner, between), owner):
+        for index in canvas.rows_of(np.isin(owner, between), owner=owner):
             yield Row(number, 1, True, index, None)
         rest = [part for part in own if part not in between]
         for samples in sorted({stage.samples[part] for part in rest}):
             same = [part for part in rest if stage.samples[part] == samples]
-            for index in canvas.rows_of(np.isin(owner, same), owner):
+            for index in canvas.rows_of(np.isin(owner, same), owner=owner):
                 yield Row(number, samples, False, index, None)
 
 

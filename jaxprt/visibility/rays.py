@@ -169,7 +169,8 @@ class VisibilityJob(blocks.Job):
         normal, tangent = (np.asarray(each)[vertex] for each in (mesh.normal, mesh.tangent))
         frame = frames(normal, tangent).astype(np.float32)
         # The key depends on the inputs only: computed values are rounded differently on other processors.
-        key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face)))
+        parts = (mesh.region,) if apart and np.ptp(mesh.region) else ()
+        key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face, *parts)))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
         rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
         near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}

@@ -22,6 +22,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import bounces, harmonic, lobe, separable, visibility
 from jaxprt.files.arrays import BlockStore, Layout
+from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.separable import precompute
 from jaxprt.visibility import Part, UnfinishedError
 
@@ -371,6 +372,7 @@ import os, signal, sys
 import numpy as np
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.files.arrays import BlockStore
+from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.separable import precompute
 import jaxprt as prt
 
@@ -477,7 +479,7 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
     path = tmp_path / "a.prt"
     relit(sphere, path=path)
     starts, frames = visibility.start_points, visibility.rays.frames
-    monkeypatch.setattr(visibility.rays, "start_points", lambda *each: rounded(starts(*each)))
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *each, **options: rounded(starts(*each, **options)))
     monkeypatch.setattr(visibility.rays, "frames", lambda *each: rounded(frames(*each)))
     monkeypatch.setattr(separable.wavelets, "compress", None)  # Nothing is computed again.
     other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
@@ -492,6 +494,20 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
         ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
     ):
         relit(sphere, path=path)
+
+
+def test_regions_that_touch_start_their_rays_apart_and_have_a_store_of_their_own(tmp_path):
+    floor = prt.scene.builtin.plane(cells=2)
+    wall = make_mesh(np.asarray(floor.position)[:, [0, 2, 1]] * [1, -1, 1] + [0, 1, -1], floor.face)
+    whole = join([floor, wall])
+    rays = visibility.Occluder(whole)
+    alone = [visibility.start_points(each, rays) for each in (floor, wall)]
+    np.testing.assert_array_equal(visibility.start_points(whole, rays, apart=True), np.concatenate(alone))
+    assert np.any(visibility.start_points(whole, rays) != np.concatenate(alone))
+    options = {"degree": 1, "size": 4, "path": tmp_path / "store", "progress": False}
+    harmonic.precompute_diffuse(whole, apart=True, **options)
+    with pytest.raises(ValueError, match="computed from other inputs"):
+        harmonic.precompute_diffuse(whole, **options)
 
 
 def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(sphere, monkeypatch):
@@ -513,7 +529,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     ]
     before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
     starts = visibility.start_points
-    monkeypatch.setattr(visibility.rays, "start_points", lambda *each: rounded(starts(*each)))
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *each, **options: rounded(starts(*each, **options)))
     turned = eqx.tree_at(lambda m: m.face, mesh, mesh.face[::-1])
     for job, (kind, fields) in zip(before, kinds, strict=True):
         again = kind.make(mesh, None, None, 8, **rounded(fields))
