@@ -10,8 +10,9 @@ The steps of a process are import, load (reading the scene and the first light, 
 (lobes, light of 6 x 64 x 64 texels), first picture (320 x 240 pixels, four samples), second light (reading it, and a
 picture), and seven views. Each step is one line. `seconds` are those of the clock, `processor_seconds` those that all
 threads of the process have used. `programs` are compiled or found in the folder, `found` of them there, in
-`compile_seconds`. Programs that are loaded without tracing them (`jaxprt.compile.kept`) do not count. `mappings` and `bytes` are the memory mappings of the process and its peak memory at the end of the
-step. `error` is the relative L2 difference of the stage's first picture from that of `cold`.
+`compile_seconds`. Programs that are loaded without tracing them (`jaxprt.compile.kept`) do not count. `mappings` and
+`bytes` are the memory mappings of the process and its peak memory at the end of the step. `error` is the relative L2
+difference of the stage's first picture from that of `cold`.
 
 `truck` and `duck` are files of JAXPRT_DATA. `chess` has three parts, `room` twelve, with two bounces. `hundred` has 100
 spheres of ten sizes of mesh as parts, and `one` has the same 100 spheres as a single part.
