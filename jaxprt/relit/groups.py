@@ -69,11 +69,12 @@ class Surface(eqx.Module):
         """Number of channels of the BRDF whose weights may vary."""
         return 1 if self.scale is None else len(self.term)
 
-    def sampled(self, samples: int) -> "Surface":
-        """The surface with another number of sample points along the edge of each bright texel."""
-        if not isinstance(self.system, BrightTexels) or self.system.samples == samples:
-            return self
-        return dataclasses.replace(self, system=dataclasses.replace(self.system, samples=samples))
+
+def sampled(surface: Surface, samples: int) -> Surface:
+    """The surface with another number of sample points along the edge of each bright texel."""
+    if not isinstance(surface.system, BrightTexels) or surface.system.samples == samples:
+        return surface
+    return dataclasses.replace(surface, system=dataclasses.replace(surface.system, samples=samples))
 
 
 class Given(eqx.Module):
@@ -217,6 +218,9 @@ class Arriving(eqx.Module):
 class Stage(eqx.Module):
     """A scene with its materials at present, as pictures and reflections take it.
 
+    What is done for each row of points is a function and not a method: Equinox flattens an object whenever one of its
+    methods is used.
+
     Attributes:
         whole: The mesh of all parts, whose regions are the parts.
         mesh: The same mesh, padded to shared sizes with faces without area.
@@ -266,28 +270,20 @@ class Stage(eqx.Module):
     @property
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
-        return [number for number in range(len(self.surfaces)) if self.is_sharp(number)]
-
-    def is_sharp(self, number: int) -> bool:
-        """Whether reflection rays start from parts of a group."""
-        return isinstance(self.surfaces[number].reflecting, SharpPart)
+        return [number for number, own in enumerate(self.surfaces) if isinstance(own.reflecting, SharpPart)]
 
     def sharp_at(self, number: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""
-        if not self.is_sharp(number):
+        if number not in self.sharp_groups:
             return None
         flag = np.asarray(self.sharp, jnp.result_type(float))[self.part]
         if known(points):
             return put(flag[np.asarray(points.corner)[0]])
         return jnp.asarray(flag)[points.corner[0]]
 
-    def look(self, points: Points) -> Look:
-        """The materials at points of the scene. Their roughness is known if it is for all parts."""
-        return look_at(self.table, self.rough, points)
-
     def blend(self, number: int, points: Points, own: Points) -> Blend | None:
         """Weights of the channels of a group's BRDF at points of the scene, which are `own` on the group."""
-        look = self.look(points)
+        look = look_at(self.table, self.rough, points)
         with compile_time(look, own, self.given[number], self.surfaces[number].scale):
             return material(self.surfaces[number], own, look, self.given[number])[0]
 

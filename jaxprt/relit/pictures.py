@@ -18,7 +18,7 @@ from jaxprt.compile import Between, compile_time, finished, jit, known, promoted
 from jaxprt.image import raster, rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import canvas, interpolation, tracing
-from jaxprt.relit.groups import Arriving, Stage, Surface
+from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.surface import Viewed, carried, lit, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
@@ -107,13 +107,14 @@ class PictureView(eqx.Module):
         if environment.radiance.ndim != 4:
             raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
         arriving = finished(self.arriving(environment), between)
-        vertices = self._vertices(arriving, between)
+        vertices = _vertices(self, arriving, between)
         traced = iter(()) if self.reflected is None else iter(self.reflected.radiance(self.stage, arriving))
-        colors = environment.radiance.shape[-1]
+        colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
+        saved = known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = self._color(row, arriving, vertices)
-            if self.stage.is_sharp(row.number):
+            color = _color(self, row, arriving, vertices, saved=saved)
+            if row.number in sharp:
                 color = color + next(traced)
             rows.append((row.index, finished(color, between)))
             colors = max(colors, color.shape[-1])
@@ -122,49 +123,60 @@ class PictureView(eqx.Module):
             picture = canvas.drawn(picture, self.pixels, index, color)
         return picture if self.fold == 1 else _folded(picture, fold=self.fold)
 
-    def _color(self, row: Row, arriving: Arriving, vertices: dict[int, Array]) -> Float[Array, "*m p c"]:
-        """Colors of the points of a row."""
-        surface, stage = self.stage.surfaces[row.number].sampled(row.samples), self.stage
-        if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
-            return self._color_of_some(row, arriving)
-        if row.interpolated:
-            points, own = self._points(row.index)
-            return carried(surface, vertices[row.number], own, stage.look(points), stage.given[row.number])
-        if row.kept is not None:
-            return lit(surface, arriving.at(row.number), row.kept)
-        shade = partial(self._shaded, surface, row.number, row.index)
-        return (shade if known(arriving, stage, self.camera) else jax.checkpoint(shade))(arriving)
 
-    def _shaded(self, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
-        points, own = self._points(index)
-        seen = _seen(self.stage, surface, number, points, own, self.camera)
-        return lit(surface, arriving.at(number), seen)
+def _color(
+    of: PictureView, row: Row, arriving: Arriving, vertices: dict[int, Array], *, saved: bool
+) -> Float[Array, "*m p c"]:
+    """Colors of the points of a row. Unless `saved`, derivatives compute again what depends on the view."""
+    surface, stage = sampled(of.stage.surfaces[row.number], row.samples), of.stage
+    if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
+        return _color_of_some(of, row, arriving)
+    if row.interpolated:
+        points, own = _points(of, row.index)
+        return carried(
+            surface, vertices[row.number], own, look_at(stage.table, stage.rough, points), stage.given[row.number]
+        )
+    if row.kept is not None:
+        return lit(surface, arriving.at(row.number), row.kept)
+    shade = partial(_shaded, of, surface, row.number, row.index)
+    return (shade if saved else jax.checkpoint(shade))(arriving)
 
-    def _color_of_some(self, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
-        """`_color` inside of `jax.jit`, where most rows may be padding alone."""
-        surface = self.stage.surfaces[row.number].sampled(row.samples)
-        shape = jax.eval_shape(lambda: self._shaded(surface, row.number, row.index[0], arriving))
-        none = jnp.zeros(shape.shape, shape.dtype)
 
-        def some(index: Array) -> Array:
-            shade = jax.checkpoint(partial(self._shaded, surface, row.number, index))
-            return jax.lax.cond(jnp.any(index >= 0), shade, lambda _: none, arriving)
+def _shaded(of: PictureView, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
+    points, own = _points(of, index)
+    seen = _seen(of.stage, surface, number, points, own, of.camera)
+    return lit(surface, arriving.at(number), seen)
 
-        return jax.lax.map(some, row.index)
 
-    def _points(self, index: Any) -> tuple[Points, Points]:
-        return canvas.points_of(self.pixels, self.stage.face, self.stage.shift, index)
+def _color_of_some(of: PictureView, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
+    """`_color` inside of `jax.jit`, where most rows may be padding alone."""
+    surface = sampled(of.stage.surfaces[row.number], row.samples)
+    shape = jax.eval_shape(lambda: _shaded(of, surface, row.number, row.index[0], arriving))
+    none = jnp.zeros(shape.shape, shape.dtype)
 
-    def _vertices(self, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
-        """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
-        colors: dict[int, np.ndarray] = {}
-        for row in self.vertices:
-            surface = self.stage.surfaces[row.number]
-            seen = _seen_alone(self.stage, row, self.camera) if row.kept is None else row.kept
-            color = np.asarray(finished(lit(surface, arriving.at(row.number), seen), between))
-            shape = (surface.channels, self.stage.place.size[row.number], color.shape[1])
-            colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
-        return {number: put(color) for number, color in colors.items()}
+    def some(index: Array) -> Array:
+        shade = jax.checkpoint(partial(_shaded, of, surface, row.number, index))
+        return jax.lax.cond(jnp.any(index >= 0), shade, lambda _: none, arriving)
+
+    return jax.lax.map(some, row.index)
+
+
+def _points(of: PictureView, index: Any) -> tuple[Points, Points]:
+    return canvas.points_of(of.pixels, of.stage.face, of.stage.shift, index)
+
+
+def _vertices(of: PictureView, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
+    """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
+    stage, found = of.stage, []
+    for row in of.vertices:
+        surface = stage.surfaces[row.number]
+        seen = _seen_alone(stage, row, of.camera) if row.kept is None else row.kept
+        found.append(finished(lit(surface, arriving.at(row.number), seen), between))
+    colors: dict[int, np.ndarray] = {}
+    for row, color in zip(of.vertices, map(np.asarray, found), strict=True):
+        shape = (stage.surfaces[row.number].channels, stage.place.size[row.number], color.shape[1])
+        colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
+    return {number: put(color) for number, color in colors.items()}
 
 
 def make(
@@ -195,16 +207,16 @@ def make(
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows, between_vertices = _placed(stage, camera, samples, between)
-    made, asked = [], []
+    made, asked, sharp = [], [], stage.sharp_groups
     for row in rows:
-        surface = stage.surfaces[row.number].sampled(row.samples)
+        surface = sampled(stage.surfaces[row.number], row.samples)
         kept = keep and not row.interpolated and not isinstance(row.index, Tracer)
-        if kept or stage.is_sharp(row.number):
+        if kept or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, own = canvas.points_of(pixels, stage.face, stage.shift, index)
             if kept:
                 row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
-            if stage.is_sharp(row.number):
+            if row.number in sharp:
                 blend = stage.blend(row.number, points, own)
                 asked.append(tracing.Asked(row.number, points, own, blend, stage.sharp_at(row.number, points)))
         made.append(row)
@@ -228,7 +240,7 @@ def _vertex_rows(
 def _seen_alone(stage: Stage, row: VertexRow, camera: Camera) -> Viewed:
     """What does not depend on the light, at vertices with one channel of the BRDF alone."""
     points, own = row.points
-    alone = stage.alone(row.number, stage.look(points), row.channel)
+    alone = stage.alone(row.number, look_at(stage.table, stage.rough, points), row.channel)
     return _seen(stage, stage.surfaces[row.number], row.number, points, own, camera, alone)
 
 
@@ -236,10 +248,10 @@ def _seen(
     stage: Stage, surface: Surface, number: int, points: Points, own: Points, camera: Camera, look: Look | None = None
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials, or others."""
-    look = stage.look(points) if look is None else look
+    look = look_at(stage.table, stage.rough, points) if look is None else look
     given, sharp = stage.given[number], stage.sharp_at(number, points)
     # The view does not depend on the samples of bright texels.
-    return view(surface.sampled(1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp)
+    return view(sampled(surface, 1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp)
 
 
 @partial(jit, static_argnames="fold")

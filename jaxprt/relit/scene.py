@@ -218,7 +218,7 @@ class RelitScene(System):
             points, place = self._points(number)
             blend = own.blend if place is None or own.blend is None else jax.tree.map(place.carry, own.blend)
             sharp = None
-            if stage.is_sharp(number):
+            if number in stage.sharp_groups:
                 sharp = stage.sharp_at(number, points)
                 if place is None:
                     with compile_time(self.mesh, eye):
@@ -241,9 +241,9 @@ class RelitScene(System):
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
         for number, (surface, seen, emitted) in enumerate(zip(self.surfaces, view.group, view.emitted, strict=True)):
-            surface = surface.sampled(max(view.stage.samples[part] for part in self.place.parts[number]))
+            surface = groups.sampled(surface, max(view.stage.samples[part] for part in self.place.parts[number]))
             color = combine(surface, light.at(number), seen, self._points(number)[1], emitted)
-            colors.append(color + next(traced) if view.stage.is_sharp(number) else color)
+            colors.append(color + next(traced) if number in view.stage.sharp_groups else color)
         return groups.ordered(tuple(colors), self._order())
 
     def _points(self, number: int) -> tuple[Points, Points | None]:

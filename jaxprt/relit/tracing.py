@@ -25,7 +25,7 @@ from jaxprt import require
 from jaxprt.compile import jit, known, put
 from jaxprt.relit import canvas
 from jaxprt.relit.casting import Caster, caster
-from jaxprt.relit.groups import Arriving, Stage, Surface
+from jaxprt.relit.groups import Arriving, Stage, Surface, look_at
 from jaxprt.relit.surface import Viewed, lit, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
@@ -121,7 +121,7 @@ def plain(surface: Surface) -> Surface:
 
 def _viewed(stage: Stage, row: HitRow) -> Viewed:
     """What does not depend on the light, at the hits of a row."""
-    look, given = stage.look(row.points), stage.given[row.number]
+    look, given = look_at(stage.table, stage.rough, row.points), stage.given[row.number]
     options = {"given": given, "variance": row.variance, "glows": False}
     return view(plain(stage.surfaces[row.number]), row.own, look, row.eye, **options)
 
