@@ -559,7 +559,9 @@ class RelitScene(System):
         return sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves(held)}.values())
 
     def part_system(self, part: int) -> System:
-        """The system of direct light of the vertices of one part, without padding, in NumPy."""
+        """The system of direct light of the vertices of one part, given its index, without padding, in NumPy."""
+        if part not in range(len(self.shading)):
+            raise ValueError(f"part must be the index of one of {len(self.shading)} parts, got {part!r}")
         first = int(self.place.start[part])
         return axes.taken(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
 

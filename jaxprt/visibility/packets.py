@@ -6,6 +6,7 @@ Embree's BVH. Traced as a packet they are faster and give identical results.
 
 import ctypes
 import weakref
+from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -139,8 +140,16 @@ def _call(typing, address, valid, scene, ray, arguments):
     return types.none(*[types.intp] * 5), generate
 
 
+def _cached(function: Callable) -> Callable:
+    """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
+    try:
+        return numba.njit(nogil=True, cache=True)(function)
+    except RuntimeError:
+        return numba.njit(nogil=True)(function)
+
+
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@numba.njit(nogil=True, cache=True)
+@_cached
 def _blocked(address, scene, arguments, origin, direction, point, way, found):
     # RTCRay16: twelve rows of sixteen values, aligned to 64 bytes.
     memory = np.empty(13 * 16 + 16, np.float32)

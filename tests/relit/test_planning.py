@@ -152,6 +152,8 @@ def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky,
     assert found.asked == 1e-6
     assert found.group[0].chosen.error == min(each.error for each in found.group[0].considered)
     assert ready.part_system(0).vertices == len(scene["ground"].mesh.position)
+    with pytest.raises(ValueError, match=r"part must be the index of one of \d+ parts, got -1"):
+        ready.part_system(-1)
     prt.precompute(part, **options)  # The kept plan serves again,
     with pytest.raises(ValueError, match="error must be at least"):  # but not one who insists.
         prt.precompute(part, error=1e-6, **options)
