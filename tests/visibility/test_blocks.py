@@ -368,7 +368,7 @@ def test_a_process_killed_at_any_moment_leaves_a_store_that_goes_on_to_the_same_
 
 
 KILLED = """
-import os, signal, sys
+import os, signal, sys, threading
 import numpy as np
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.files.arrays import BlockStore
@@ -377,13 +377,14 @@ from jaxprt.systems.separable import precompute
 import jaxprt as prt
 
 brdf = prt.separable.factor(prt.brdf.AshikhminShirley(), terms=2, resolution=8)
-write, calls = BlockStore.write, []
+write, calls, one = BlockStore.write, [], threading.Lock()
 
 def mortal(*arguments):
-    calls.append(0)
-    if len(calls) == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return write(*arguments)
+    with one:  # The first block is whole before the second one kills.
+        calls.append(0)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return write(*arguments)
 
 BlockStore.write = mortal
 mesh = prt.scene.builtin.sphere(rings=12, sectors=14)
