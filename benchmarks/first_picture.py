@@ -81,11 +81,11 @@ def measure(name: str, stages: Sequence[str], quick: bool) -> Iterator[dict[str,
         command = [sys.executable, "-m", "benchmarks.first_picture", *["--quick"] * quick, "--process", name]
         root = pathlib.Path(__file__).parents[1]
         for stage in ("cold", *(stage for stage in STAGES[1:] if stage in stages)):
-            own = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")  # with these set, jaxprt keeps no programs
-            given = {name: value for name, value in os.environ.items() if not name.startswith(own)}
-            caches = dict.fromkeys(("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA"), str(folder))
+            jax_cache = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")  # with these set, jaxprt keeps no programs
+            inherited = {name: value for name, value in os.environ.items() if not name.startswith(jax_cache)}
+            folders = dict.fromkeys(("XDG_CACHE_HOME", "HOME", "LOCALAPPDATA"), str(folder))
             start = {"JAXPRT_KEEP_PROGRAMS": "1", "FIRST_PICTURE_START": repr(time.time())}
-            environment = {**given, **caches, **start}
+            environment = {**inherited, **folders, **start}
             process = subprocess.run(
                 [*command, stage, str(folder)], cwd=root, env=environment, check=True, stdout=subprocess.PIPE, text=True
             )

@@ -108,7 +108,7 @@ def precompute(
     counts = [len(part.mesh.position) for part in scene.parts]
     parts = groups.kinds(shadings, recipes)
     place = groups.Place.of(counts, parts, [recipes[own[0]].joins for own in parts])
-    names = [_file_name(own, scene) for own in place.parts]
+    names = [_file_name(members, scene) for members in place.parts]
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
     lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
@@ -140,8 +140,8 @@ def _systems(
 ) -> list[System]:
     """The system of each group."""
     systems, unfinished = [], []
-    for own, size, target in zip(place.parts, place.size, targets, strict=True):
-        recipe, shading = recipes[own[0]], groups.joined([shadings[part] for part in own])
+    for members, size, target in zip(place.parts, place.size, targets, strict=True):
+        recipe, shading = recipes[members[0]], groups.joined([shadings[part] for part in members])
         try:
             systems.append(recipe.make(shading, target, vertices=size if recipe.joins else None))
         except UnfinishedError as others:  # Go on with the next group of the scene.
@@ -217,6 +217,9 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
 
 
 def _file_name(parts: Sequence[int], scene: Scene) -> str:
-    """A name for the files of a group: at most 40 letters and digits of its first part, and a key of several parts."""
+    """A name for the files of a group: at most 40 letters and digits of its first part's name.
+
+    A key of the indices of the parts follows where there are several.
+    """
     name = "".join(letter if letter.isalnum() else "_" for letter in scene.parts[parts[0]].name)[:40]
     return f"{parts[0]}_{name}" + (f"_{fingerprint(np.asarray(parts))[:8]}" if len(parts) > 1 else "")

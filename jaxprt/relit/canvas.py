@@ -26,7 +26,9 @@ def rows_of(
 ) -> Int[Array | np.ndarray, "m p"]:
     """Indices of the chosen points in rows of one length; -1 is padding.
 
-    Where the owner of each point is known, points of one owner stand together: what a row needs is then less.
+    Args:
+        chosen: Whether each point is chosen.
+        owner: Part of each point. Points of one part then stand together, and a row reads fewer vertices and texels.
     """
     if isinstance(chosen, Tracer):
         count = len(chosen)

@@ -270,7 +270,7 @@ class Stage(eqx.Module):
     @property
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
-        return [number for number, own in enumerate(self.surfaces) if isinstance(own.reflecting, SharpPart)]
+        return [number for number, group in enumerate(self.surfaces) if isinstance(group.reflecting, SharpPart)]
 
     def sharp_at(self, number: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""
@@ -349,9 +349,8 @@ def alike(one: Shading, other: Shading) -> bool:
 
 def joined_mesh(shadings: Sequence[Shading]) -> Mesh:
     """The meshes of several parts as one mesh, whose regions are the parts."""
-    zero = [np.zeros(len(shading.mesh.position), np.int32) for shading in shadings]
-    pairs = zip(shadings, zero, strict=True)
-    return join([dataclasses.replace(shading.mesh, region=region) for shading, region in pairs])
+    meshes = [shading.mesh for shading in shadings]
+    return join([dataclasses.replace(mesh, region=np.zeros(len(mesh.position), np.int32)) for mesh in meshes])
 
 
 def joined(shadings: Sequence[Shading]) -> Shading:

@@ -86,8 +86,8 @@ def make(
         return None
     sources = [*(shadings[number].mesh for number in emitting), *scene.point_lights]
     groups = []
-    for own, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
-        shading, mesh = shadings[own[0]], joined_mesh([shadings[part] for part in own])
+    for members, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
+        shading, mesh = shadings[members[0]], joined_mesh([shadings[part] for part in members])
         options = target.traced() | target.options("lamps")
         transport = axes.joined([lamps.precompute(mesh, sources, apart=True, **options)], size=size)
         if isinstance(shading.brdf, Lambert):

@@ -110,10 +110,10 @@ class PictureView(eqx.Module):
         vertices = _vertices(self, arriving, between)
         traced = iter(()) if self.reflected is None else iter(self.reflected.radiance(self.stage, arriving))
         colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
-        saved = known(arriving, self.stage, self.camera)
+        recompute = not known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = _color(self, row, arriving, vertices, saved=saved)
+            color = _color(self, row, arriving, vertices, recompute=recompute)
             if row.number in sharp:
                 color = color + next(traced)
             rows.append((row.index, finished(color, between)))
@@ -125,55 +125,63 @@ class PictureView(eqx.Module):
 
 
 def _color(
-    of: PictureView, row: Row, arriving: Arriving, vertices: dict[int, Array], *, saved: bool
+    picture: PictureView, row: Row, arriving: Arriving, vertices: dict[int, Array], *, recompute: bool
 ) -> Float[Array, "*m p c"]:
-    """Colors of the points of a row. Unless `saved`, derivatives compute again what depends on the view."""
-    surface, stage = sampled(of.stage.surfaces[row.number], row.samples), of.stage
+    """Colors of the points of a row.
+
+    Args:
+        picture: The picture.
+        row: The points.
+        arriving: The light that arrives at the scene.
+        vertices: Radiance of each channel at the vertices of groups that are interpolated.
+        recompute: Whether derivatives compute again what depends on the view, which needs less memory.
+    """
+    surface, stage = sampled(picture.stage.surfaces[row.number], row.samples), picture.stage
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
-        return _color_of_some(of, row, arriving)
+        return _color_of_some(picture, row, arriving)
     if row.interpolated:
-        points, own = _points(of, row.index)
+        points, on_group = _points(picture, row.index)
         return carried(
-            surface, vertices[row.number], own, look_at(stage.table, stage.rough, points), stage.given[row.number]
+            surface, vertices[row.number], on_group, look_at(stage.table, stage.rough, points), stage.given[row.number]
         )
     if row.kept is not None:
         return lit(surface, arriving.at(row.number), row.kept)
-    shade = partial(_shaded, of, surface, row.number, row.index)
-    return (shade if saved else jax.checkpoint(shade))(arriving)
+    shade = partial(_shaded, picture, surface, row.number, row.index)
+    return (jax.checkpoint(shade) if recompute else shade)(arriving)
 
 
-def _shaded(of: PictureView, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
-    points, own = _points(of, index)
-    seen = _seen(of.stage, surface, number, points, own, of.camera)
+def _shaded(picture: PictureView, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
+    points, on_group = _points(picture, index)
+    seen = _seen(picture.stage, surface, number, points, on_group, picture.camera)
     return lit(surface, arriving.at(number), seen)
 
 
-def _color_of_some(of: PictureView, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
+def _color_of_some(picture: PictureView, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
     """`_color` inside of `jax.jit`, where most rows may be padding alone."""
-    surface = sampled(of.stage.surfaces[row.number], row.samples)
-    shape = jax.eval_shape(lambda: _shaded(of, surface, row.number, row.index[0], arriving))
+    surface = sampled(picture.stage.surfaces[row.number], row.samples)
+    shape = jax.eval_shape(lambda: _shaded(picture, surface, row.number, row.index[0], arriving))
     none = jnp.zeros(shape.shape, shape.dtype)
 
     def some(index: Array) -> Array:
-        shade = jax.checkpoint(partial(_shaded, of, surface, row.number, index))
+        shade = jax.checkpoint(partial(_shaded, picture, surface, row.number, index))
         return jax.lax.cond(jnp.any(index >= 0), shade, lambda _: none, arriving)
 
     return jax.lax.map(some, row.index)
 
 
-def _points(of: PictureView, index: Any) -> tuple[Points, Points]:
-    return canvas.points_of(of.pixels, of.stage.face, of.stage.shift, index)
+def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
+    return canvas.points_of(picture.pixels, picture.stage.face, picture.stage.shift, index)
 
 
-def _vertices(of: PictureView, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
+def _vertices(picture: PictureView, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
     """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
-    stage, found = of.stage, []
-    for row in of.vertices:
+    stage, lit_rows = picture.stage, []
+    for row in picture.vertices:
         surface = stage.surfaces[row.number]
-        seen = _seen_alone(stage, row, of.camera) if row.kept is None else row.kept
-        found.append(finished(lit(surface, arriving.at(row.number), seen), between))
+        seen = _seen_alone(stage, row, picture.camera) if row.kept is None else row.kept
+        lit_rows.append(finished(lit(surface, arriving.at(row.number), seen), between))
     colors: dict[int, np.ndarray] = {}
-    for row, color in zip(of.vertices, map(np.asarray, found), strict=True):
+    for row, color in zip(picture.vertices, map(np.asarray, lit_rows), strict=True):
         shape = (stage.surfaces[row.number].channels, stage.place.size[row.number], color.shape[1])
         colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
     return {number: put(color) for number, color in colors.items()}
@@ -207,23 +215,23 @@ def make(
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows, between_vertices = _placed(stage, camera, samples, between)
-    made, asked, sharp = [], [], stage.sharp_groups
+    complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
         surface = sampled(stage.surfaces[row.number], row.samples)
-        kept = keep and not row.interpolated and not isinstance(row.index, Tracer)
-        if kept or row.number in sharp:
+        stores = keep and not row.interpolated and not isinstance(row.index, Tracer)
+        if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
-            points, own = canvas.points_of(pixels, stage.face, stage.shift, index)
-            if kept:
-                row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, own, camera))
+            points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
+            if stores:
+                row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, on_group, camera))
             if row.number in sharp:
-                blend = stage.blend(row.number, points, own)
-                asked.append(tracing.Asked(row.number, points, own, blend, stage.sharp_at(row.number, points)))
-        made.append(row)
-    reflected = tracing.trace(stage, asked, jnp.asarray(camera.eye), keep=keep) if asked else None
+                blend = stage.blend(row.number, points, on_group)
+                origins.append(tracing.Asked(row.number, points, on_group, blend, stage.sharp_at(row.number, points)))
+        complete.append(row)
+    reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
     vertices = tuple(_vertex_rows(stage, between_vertices, camera, keep=keep))
-    return PictureView(stage, arriving, camera, pixels, ray, tuple(made), vertices, reflected, fold)
+    return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold)
 
 
 def _vertex_rows(
@@ -320,13 +328,14 @@ def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera:
     wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
     square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
     good = np.asarray(may) & (square <= _ERROR**2 * seen)
-    chosen = (tuple(part for part in own if good[part]) for own in place.parts)
-    return tuple(
-        own
-        if number * _rows_for(place.counts, own) < _rows_for(seen, whole) - _rows_for(seen, set(whole) - set(own))
-        else ()
-        for number, own, whole in zip(channels, chosen, place.parts, strict=True)
-    )
+    result = []
+    for number, parts in zip(channels, place.parts, strict=True):
+        accurate = tuple(part for part in parts if good[part])
+        rest = set(parts) - set(accurate)
+        vertex_rows = number * _rows_for(place.counts, accurate)
+        saves = vertex_rows < _rows_for(seen, parts) - _rows_for(seen, rest)
+        result.append(accurate if saves else ())
+    return tuple(result)
 
 
 def _rows_for(count: Sequence[int] | np.ndarray, parts: Iterable[int]) -> int:

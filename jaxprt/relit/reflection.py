@@ -27,7 +27,7 @@ _EACH = 3  # number of bounces that are estimated one by one; further ones are e
 _EDGE = 8  # largest edge of the faces of light that is reflected
 _DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # of the estimate: degree of harmonics, and edges of the faces of rays
 _SLOWEST = 0.95  # largest ratio of a bounce to the previous one
-_REGIONS = 16  # of the transfer tensor, whose time and memory are proportional to them; one more for each group
+_REGIONS = 16  # most regions of the transfer tensor, besides one for each group: its time and memory grow with them
 _LOBES = 8  # number of lobes for sharp parts whose system has no table of lobes
 
 
@@ -51,8 +51,8 @@ def check(count: int | str | None) -> None:
 def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Target) -> GroupBounces:
     """Precomputes the light that all parts reflect onto each other and themselves.
 
-    In a scene of more than 16 parts, parts of a group with similar materials send light with their common mean
-    material. Patches add the differences between their colors, as for textures.
+    In a scene of more than 16 parts, those parts of a group whose materials are similar send light with the mean of
+    their materials. Patches add the differences between their colors, as for textures.
 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
@@ -66,10 +66,10 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
     first = [shadings[own[0]] for own in place.parts]
     of_group = [paths.factored(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
-    region, own = _regions(place, typical)
+    region, members = _regions(place, typical)
     mesh = dataclasses.replace(joined_mesh(shadings), region=np.repeat(region, place.counts))
-    sent = [of_group[place.group[parts[0]]] for parts in own]
-    weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in own]
+    sent = [of_group[place.group[parts[0]]] for parts in members]
+    weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in members]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(mesh, [each.brdf for each in sent], weights=weights, bounces=count, **options)
@@ -85,21 +85,22 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
 
 
 def _regions(place: Place, typical: Sequence[Array | None]) -> tuple[Int[np.ndarray, " n"], list[list[int]]]:
-    """Parts that send light to other surfaces with one mean material: region of each part, and parts of each region.
+    """The region of the transfer tensor to which each part belongs, and the parts of each region.
 
-    Parts whose material cannot change have one material in a group. Others have a region each, unless there are too
-    many; then those with the most similar weights share one.
+    The parts of a region send light to other surfaces with one mean material. A group whose material cannot change is
+    one region. In other groups each part has a region of its own, unless there are too many; then the parts with the
+    most similar weights share one, by Ward's clustering.
     """
     region = np.full(len(place.counts), -1, np.int32)
-    for own in map(list, place.parts):
-        label = np.arange(len(own))
-        most = -(-_REGIONS * len(own) // len(region))
-        if typical[own[0]] is None:
+    for parts in map(list, place.parts):
+        label = np.arange(len(parts))
+        most = -(-_REGIONS * len(parts) // len(region))
+        if typical[parts[0]] is None:
             label = np.zeros_like(label)
-        elif most < len(own):
-            rows = _alike([typical[part] for part in own]).reshape(len(own), -1)
+        elif most < len(parts):
+            rows = _stacked([typical[part] for part in parts]).reshape(len(parts), -1)
             label = scipy.cluster.hierarchy.fcluster(scipy.cluster.hierarchy.ward(rows), most, "maxclust") - 1
-        region[own] = np.max(region) + 1 + label
+        region[parts] = np.max(region) + 1 + label
     return region, [np.flatnonzero(region == number).tolist() for number in range(np.max(region) + 1)]
 
 
@@ -107,11 +108,11 @@ def _mean(weights: Sequence[Array | None], counts: Sequence[int]) -> Float[Array
     """Mean of the weights of some parts over their vertices; None without weights."""
     if weights[0] is None:
         return None
-    rows = _alike(weights)
+    rows = _stacked(weights)
     return jax.device_put(np.average(rows, axis=0, weights=list(counts)).astype(rows.dtype))
 
 
-def _alike(weights: Sequence[Array | None]) -> Float[np.ndarray, "n p c"]:
+def _stacked(weights: Sequence[Array | None]) -> Float[np.ndarray, "n p c"]:
     """Weights in one array; gray ones are repeated to the colors of the others."""
     return np.stack(np.broadcast_arrays(*map(np.asarray, weights)))
 

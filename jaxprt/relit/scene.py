@@ -143,8 +143,8 @@ class RelitScene(System):
         self.drawn = groups.padded(self.mesh)
         self.lobes = tuple(None for _ in systems) if lobes is None else tuple(lobes)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
-        own = [_own(each) for each in shading]
-        self.appearance = tuple(jax.device_put(place.gathered(number, own)) for number in range(len(systems)))
+        first = [_precomputed(part) for part in shading]
+        self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
                 shading[members[0]],
@@ -293,16 +293,26 @@ class RelitScene(System):
         new = {name: each for name, each in given.items() if _is_model(each)}
         table, rough = self._tables(new)
         fixed = [name in given and name not in new for name in names]
-        own = Appearance(None)
-        every = [appearances.get(name, own) for name in names]
-        kept = [self._given(number, fixed, every) for number in range(len(self.surfaces))]
-        bend, samples, sharp = self._traits(every)
+        unchanged = Appearance(None)
+        changed = [appearances.get(name, unchanged) for name in names]
+        at_vertices = [self._given(number, fixed, changed) for number in range(len(self.surfaces))]
+        bend, samples, sharp = self._traits(changed)
         surfaces = [self._surface(number, sharp) for number in range(len(self.surfaces))]
         emitting = {} if self.lamps is None else {part: lamp for lamp, part in enumerate(self.lamps.emitting)}
         lamp = tuple(emitting.get(part, -1) for part in range(len(names)))
         bends = groups.spread(bend, self.place.counts, len(self.drawn.position), self.mesh.position.dtype)
         return Stage(
-            self.mesh, self.drawn, tuple(surfaces), table, rough, tuple(kept), bends, self.place, samples, sharp, lamp
+            self.mesh,
+            self.drawn,
+            tuple(surfaces),
+            table,
+            rough,
+            tuple(at_vertices),
+            bends,
+            self.place,
+            samples,
+            sharp,
+            lamp,
         )
 
     def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:
@@ -320,15 +330,15 @@ class RelitScene(System):
                 return table, None
             return table, put(material_table.with_materials(self.table, plain, before))
 
-    def _traits(self, every: Sequence[Appearance]) -> tuple[list, tuple[int, ...], tuple[bool, ...]]:
+    def _traits(self, appearances: Sequence[Appearance]) -> tuple[list, tuple[int, ...], tuple[bool, ...]]:
         """Curvature of each part's radiance, samples of bright texels, and whether its reflections are traced."""
-        found = list(zip(self.curvature, self.samples, self.sharp, strict=True))
-        for part, (new, shading) in enumerate(zip(every, self.shading, strict=True)):
-            if new.blend is not None and shading.table is not None and known(new):
+        rows = list(zip(self.curvature, self.samples, self.sharp, strict=True))
+        for part, (given, shading) in enumerate(zip(appearances, self.shading, strict=True)):
+            if given.blend is not None and shading.table is not None and known(given):
                 number = self.place.group[part]
-                now = dataclasses.replace(shading, blend=new.blend)
-                found[part] = traits(now, self.surfaces[number].system, self.lobes[number])
-        bend, samples, sharp = zip(*found, strict=True)
+                new = dataclasses.replace(shading, blend=given.blend)
+                rows[part] = traits(new, self.surfaces[number].system, self.lobes[number])
+        bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
 
     def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
@@ -347,7 +357,7 @@ class RelitScene(System):
         own = self.place.parts[number]
         if not any(fixed[part] for part in own) or self.surfaces[number].scale is None:
             return None
-        names = {part: appearances[part] if fixed[part] else _own(self.shading[part]) for part in own}
+        names = {part: appearances[part] if fixed[part] else _precomputed(self.shading[part]) for part in own}
         whole = self.place.gathered(number, [names.get(part, Appearance(None)) for part in range(len(fixed))])
         dtype = self.mesh.position.dtype
         flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in own])
@@ -568,10 +578,10 @@ class RelitScene(System):
     def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""
         pairs = zip(self.scene.parts, self.shading, strict=True)
-        return [appearances.get(part.name) or _own(shading) for part, shading in pairs]
+        return [appearances.get(part.name) or _precomputed(shading) for part, shading in pairs]
 
 
-def _own(shading: Shading) -> Appearance:
+def _precomputed(shading: Shading) -> Appearance:
     """The material that a part was precomputed with."""
     return Appearance(shading.blend, shading.emitted)
 

@@ -367,13 +367,13 @@ def _placed(array: Any, place: tuple[int, int], value: Any) -> Any:
 
 def _factors(material: TexturedMaterial | Callable) -> Any:
     """The factors of a material as one row, whose last entry is 1 for `BlinnPhong`."""
-    own = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
-    xp = np if known(material, own) else jnp  # a material that is made while JAX traces has traced factors
+    textured = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
+    xp = np if known(material, textured) else jnp  # a material that is made while JAX traces has traced factors
     if isinstance(material, BlinnPhong):
         colors = {"base_color": material.diffuse, "specular_color": material.specular}
-        every: dict[str, Any] = vars(own) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
-        return xp.hstack([*(xp.broadcast_to(every[name], (width,)) for name, width in _FACTORS), 1])
-    return xp.hstack([*(getattr(own, name) for name, _ in _FACTORS), 0])
+        factor: dict[str, Any] = vars(textured) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
+        return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), 1])
+    return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0])
 
 
 def _concatenated(rows: Sequence[Any], dtype: Any) -> Any:

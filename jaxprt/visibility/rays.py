@@ -164,18 +164,19 @@ class VisibilityJob(blocks.Job):
                 stacklevel=4,
             )
         vertex = chosen(mesh, vertex)
-        rays = Occluder(shadowing)
-        start = start_points(mesh, rays, apart=apart)[vertex]
+        occluder_rays = Occluder(shadowing)
+        start = start_points(mesh, occluder_rays, apart=apart)[vertex]
         normal, tangent = (np.asarray(each)[vertex] for each in (mesh.normal, mesh.tangent))
         frame = frames(normal, tangent).astype(np.float32)
         # The key depends on the inputs only: computed values are rounded differently on other processors.
-        parts = (mesh.region,) if apart and np.ptp(mesh.region) else ()
-        key = blocks.fingerprint(*(np.asarray(each, np.int64) for each in (mesh.face, vertex, shadowing.face, *parts)))
+        region = (mesh.region,) if apart and np.ptp(mesh.region) else ()
+        index = mesh.face, vertex, shadowing.face, *region
+        key = blocks.fingerprint(*(np.asarray(array, np.int64) for array in index))
         given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
         rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
         near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}
         job = cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
-        object.__setattr__(job, "rays", rays)  # the cached property
+        vars(job)["rays"] = occluder_rays  # the cached property, so that Embree builds its tree once
         return job
 
     def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:

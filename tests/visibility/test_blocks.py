@@ -480,7 +480,7 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
     path = tmp_path / "a.prt"
     relit(sphere, path=path)
     starts, frames = visibility.start_points, visibility.rays.frames
-    monkeypatch.setattr(visibility.rays, "start_points", lambda *each, **options: rounded(starts(*each, **options)))
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *meshes, **options: rounded(starts(*meshes, **options)))
     monkeypatch.setattr(visibility.rays, "frames", lambda *each: rounded(frames(*each)))
     monkeypatch.setattr(separable.wavelets, "compress", None)  # Nothing is computed again.
     other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
@@ -502,7 +502,7 @@ def test_regions_that_touch_start_their_rays_apart_and_have_a_store_of_their_own
     wall = make_mesh(np.asarray(floor.position)[:, [0, 2, 1]] * [1, -1, 1] + [0, 1, -1], floor.face)
     whole = join([floor, wall])
     rays = visibility.Occluder(whole)
-    alone = [visibility.start_points(each, rays) for each in (floor, wall)]
+    alone = [visibility.start_points(surface, rays) for surface in (floor, wall)]
     np.testing.assert_array_equal(visibility.start_points(whole, rays, apart=True), np.concatenate(alone))
     assert np.any(visibility.start_points(whole, rays) != np.concatenate(alone))
     options = {"degree": 1, "size": 4, "path": tmp_path / "store", "progress": False}
@@ -530,7 +530,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     ]
     before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
     starts = visibility.start_points
-    monkeypatch.setattr(visibility.rays, "start_points", lambda *each, **options: rounded(starts(*each, **options)))
+    monkeypatch.setattr(visibility.rays, "start_points", lambda *meshes, **options: rounded(starts(*meshes, **options)))
     turned = eqx.tree_at(lambda m: m.face, mesh, mesh.face[::-1])
     for job, (kind, fields) in zip(before, kinds, strict=True):
         again = kind.make(mesh, None, None, 8, **rounded(fields))

@@ -1,8 +1,8 @@
 """Light that the parts of a scene reflect onto each other, for groups of parts with one BRDF.
 
-Each group has one BRDF with channels that textures weight at its vertices, and all its parts send light with the same
-functions. The weights of these functions are those of each part's mean material. Here, several parts whose light has
-one mean material count as one part.
+Each group has one BRDF with channels that textures weight at its vertices. It consists of one or more regions of the
+transfer tensor: a part, or several parts of similar materials. All regions of a group send light with the same
+functions, weighted by the mean material of each region.
 """
 
 from collections.abc import Sequence
@@ -66,38 +66,38 @@ class Members(eqx.Module):
 
     Attributes:
         vertex: Index of each vertex of the group in the scene; padding repeats the last one.
-        part: Index of the part of each vertex, among the parts of the group.
+        region: Index of the region of each vertex, among the regions of the group.
         area: Surface area that each vertex represents; 0 in padding.
-        parts: Number of parts of the group.
+        regions: Number of regions of the group.
     """
 
     vertex: Int[Array, " v"]
-    part: Int[Array, " v"]
+    region: Int[Array, " v"]
     area: Float[Array, " v"]
-    parts: int = eqx.field(static=True)
+    regions: int = eqx.field(static=True)
 
     def mean(self, value: Float[Array, "v *k"]) -> Float[Array, "r *k"]:
-        """Means of a value of the vertices over the area of each part; zero for a part without area."""
+        """Means of a value of the vertices over the area of each region; zero for a region without area."""
         wide = self.area.reshape(-1, *[1] * (value.ndim - 1))
-        total, whole = (jax.ops.segment_sum(each, self.part, self.parts) for each in (wide * value, self.area))
+        total, whole = (jax.ops.segment_sum(column, self.region, self.regions) for column in (wide * value, self.area))
         return total / jnp.where(whole > 0, whole, 1).reshape(-1, *[1] * (value.ndim - 1))
 
 
 class GroupBounces(eqx.Module):
     """Light that the parts of a scene reflect onto each other and themselves, without direct light.
 
-    Light that a part sends to other surfaces has the mean weights and roughness over its area. Differences in albedo
-    are added patch by patch, as diffuse light. Light that a part sends to the eye has the weights and roughness of each
-    vertex or point.
+    Light that a region sends to other surfaces has the mean weights and roughness over its area. Differences in albedo
+    are added patch by patch, as diffuse light. Light that a region sends to the eye has the weights and roughness of
+    each vertex or point.
 
     Attributes:
-        tensor: Transfer tensor from `jaxprt.bounces.precompute`, whose regions are the parts. It is made with one
-            factored BRDF for each part, the same for all parts of a group.
+        tensor: Transfer tensor from `jaxprt.bounces.precompute`, with one factored BRDF for each region, the same for
+            all regions of a group.
         group: The vertices of each group, and their BRDF.
         members: Where the vertices of each group stand.
-        factor: Weights of the functions of each part of a group, as in `TransferTensor.factor`.
+        factor: Weights of the functions of each region of a group, as in `TransferTensor.factor`.
         strength: Albedo of these functions; None without patches.
-        order: Index of each function of the tensor among the functions of all groups, part by part.
+        order: Index of each function of the tensor among the functions of all groups, region by region.
         place: Index of each vertex of the scene among the vertices of all groups.
     """
 
@@ -113,47 +113,47 @@ class GroupBounces(eqx.Module):
     def make(
         cls, tensor: TransferTensor, group: Sequence[ReflectingPart], vertices: Sequence[Int[np.ndarray, " _"]]
     ) -> "GroupBounces":
-        """Joins the parts of each group.
+        """Joins the regions of each group.
 
         Args:
-            tensor: The tensor, whose regions are the parts.
+            tensor: The tensor. Each of its regions lies in one group.
             group: The vertices of each group, and then padding.
             vertices: Index in the scene of each vertex of a group, without padding.
 
         Raises:
             TypeError: `tensor` is not a `TransferTensor`.
-            ValueError: The tensor is of sets, or of other parts or vertices.
+            ValueError: The tensor is of sets, or of other regions or vertices.
         """
         require.kind("the tensor", tensor, TransferTensor, source="jaxprt.bounces.precompute")
         region, area = np.asarray(tensor.region), np.asarray(tensor.area)
-        own = [np.unique(region[vertex], return_inverse=True) for vertex in vertices]
-        numbers = np.concatenate([number for number, _ in own]).tolist()
-        found = [each.ndim for each in tensor.factor]
-        if found != [2] * len(numbers):
+        regions = [np.unique(region[vertex], return_inverse=True) for vertex in vertices]
+        numbers = np.concatenate([number for number, _ in regions]).tolist()
+        axes = [factor.ndim for factor in tensor.factor]
+        if axes != [2] * len(numbers):
             raise ValueError(
-                f"the tensor must have one factored BRDF for each of {len(numbers)} parts, got {len(found)} BRDFs, "
-                f"{sum(each > 2 for each in found)} of them sets"
+                f"the tensor must have one factored BRDF for each of {len(numbers)} regions, got {len(axes)} BRDFs, "
+                f"{sum(count > 2 for count in axes)} of them sets"
             )
         members = []
-        for each, vertex, (number, part) in zip(group, vertices, own, strict=True):
-            room = len(each.position) - len(vertex)
+        for surface, vertex, (number, of_vertex) in zip(group, vertices, regions, strict=True):
+            room = len(surface.position) - len(vertex)
             if room < 0:
-                raise ValueError(f"a group must have the tensor's {len(vertex)} vertices, got {len(each.position)}")
-            rows = (np.pad(row, (0, room), mode="edge").astype(np.int32) for row in (vertex, part))
-            at_vertex, at_part, whole = jax.device_put((*rows, np.pad(area[vertex], (0, room)).astype(area.dtype)))
-            members.append(Members(at_vertex, at_part, whole, len(number)))
+                raise ValueError(f"a group must have the tensor's {len(vertex)} vertices, got {len(surface.position)}")
+            index = (np.pad(row, (0, room), mode="edge").astype(np.int32) for row in (vertex, of_vertex))
+            columns = jax.device_put((*index, np.pad(area[vertex], (0, room)).astype(area.dtype)))
+            members.append(Members(*columns, regions=len(number)))
         size = [len(factor) for factor in tensor.factor]
-        start = np.empty(len(size), int)  # of the functions of each part, among those of all groups
+        start = np.empty(len(size), int)  # of the functions of each region, among those of all groups
         start[numbers] = np.cumsum([0, *(size[number] for number in numbers)])[:-1]
         order = np.concatenate([start[number] + np.arange(size[number]) for number in range(len(size))])
         place, begin = np.empty(len(region), np.int32), 0
-        for each, vertex in zip(group, vertices, strict=True):
+        for surface, vertex in zip(group, vertices, strict=True):
             place[vertex] = begin + np.arange(len(vertex))
-            begin += len(each.position)
-        kept = order[np.asarray(tensor.function)].astype(np.int32)
-        first = [number[0] for number, _ in own]
+            begin += len(surface.position)
+        of_tensor = order[np.asarray(tensor.function)].astype(np.int32)
+        first = [number[0] for number, _ in regions]
         strength = [None if tensor.patches is None else tensor.patches.strength[number] for number in first]
-        factor, rows = tuple(tensor.factor[number] for number in first), jax.device_put((kept, place))
+        factor, rows = tuple(tensor.factor[number] for number in first), jax.device_put((of_tensor, place))
         return cls(tensor, tuple(group), tuple(members), factor, tuple(strength), *rows)
 
     @promoted
@@ -203,14 +203,14 @@ def _stacked(rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "_ c"]:
 def _sent(
     own: ReflectingPart, members: Members, factor: Array, strength: Array | None, blend: Blend | None
 ) -> tuple[Float[Array, "r q _"], Float[Array, "v c"] | None]:
-    """Weights of the functions of each part of a group; and the albedo of each vertex minus that of its part's mean."""
+    """Weights of the functions of each region of a group, and each vertex's albedo minus that of its region's mean."""
     if blend is None:
-        return jnp.broadcast_to(factor, (members.parts, *factor.shape)), None
+        return jnp.broadcast_to(factor, (members.regions, *factor.shape)), None
     blend.check(len(own.position), factor.shape[1] if own.sent is None else own.sent.factor.shape[1])
     weight = blend.weight if own.sent is None else own.sent.weights(blend)
     mean = members.mean(weight)
     change = None
     if strength is not None:
         albedo = jnp.matmul(strength, factor, precision="highest")
-        change = jnp.einsum("k,vkc->vc", albedo, weight - mean[members.part], precision="highest")
+        change = jnp.einsum("k,vkc->vc", albedo, weight - mean[members.region], precision="highest")
     return jnp.einsum("qk,rkc->rqc", factor, mean, precision="highest"), change

@@ -50,12 +50,13 @@ def between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) ->
 @partial(isolated, static=("lobes",))
 def _between(read: tuple[Array, ...], upper: tuple[Array, ...], share: tuple[Array, ...], *, lobes: int) -> Entry:
     """Entries at all knots and nodes, interpolated: `upper` between knots, and in the given shares between nodes."""
-    every, count, total = [_entry(each, lobes=lobes) for each in read], 1 << len(upper), None
-    for number, part in enumerate(share):
-        own = every[number * count : (number + 1) * count]
+    entry, knots, total = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), None
+    for node, part in enumerate(share):
+        at_knots = entry[node * knots : (node + 1) * knots]
         for weight in reversed(upper):
-            own = [_merged(low, high, weight) for low, high in zip(own[::2], own[1::2], strict=True)]
-        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), own[0])
+            pairs = zip(at_knots[::2], at_knots[1::2], strict=True)
+            at_knots = [_interpolated(low, high, weight) for low, high in pairs]
+        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
         total = scaled if total is None else jax.tree.map(jnp.add, total, scaled)
     assert total is not None
     return total
@@ -73,12 +74,12 @@ def _entry(row: Float[Array, "v r"], *, lobes: int) -> Entry:
     return Entry(mean.reshape(-1, 3, lobes), scale, weight.reshape(-1, colors, lobes), diffuse)
 
 
-def _merged(low: Entry, high: Entry, upper: Float[Array, " v"]) -> Entry:
+def _interpolated(low: Entry, high: Entry, upper: Float[Array, " v"]) -> Entry:
     """Entries interpolated between two knots by the formula of `jaxprt.systems.lobe.table.mean`."""
     strength = [
-        jnp.maximum(share[:, None] * jnp.sum(each.weight, 1), 0) + _TINY
-        for share, each in ((1 - upper, low), (upper, high))
+        jnp.maximum(share[:, None] * jnp.sum(entry.weight, 1), 0) + _TINY
+        for share, entry in ((1 - upper, low), (upper, high))
     ]
     strong = strength[1] / (strength[0] + strength[1])
     weight = strong[:, None], strong, upper[:, None, None], upper[:, None]
-    return Entry(*(a + (b - a) * each for a, b, each in zip(low, high, weight, strict=True)))
+    return Entry(*(a + (b - a) * part for a, b, part in zip(low, high, weight, strict=True)))

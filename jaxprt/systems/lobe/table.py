@@ -156,8 +156,8 @@ class LobeBrdf(eqx.Module):
             for knot, each in zip(self.knot, parameter, strict=True)
         ]
         if place:
-            own = knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
-            mean, scale, strength, diffuse = (jnp.moveaxis(each, 0, -1) for each in own)
+            entry = knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
+            mean, scale, strength, diffuse = (jnp.moveaxis(column, 0, -1) for column in entry)
         else:
             value = grid.read(jnp.concatenate(rows), axis)
             mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])

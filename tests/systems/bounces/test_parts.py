@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_refused():
     system = made(mesh, [Lambert(1.0)] * 2, terms=1).bounces
     with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
         ReflectingPart(mesh.position, system.group[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
-    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 parts, got 2 BRDFs, 0 of them sets"):
+    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 regions, got 2 BRDFs, 0 of them sets"):
         GroupBounces.make(system.tensor, system.group[:1], [np.arange(count)])
     shorter = ReflectingPart(mesh.position[:3], system.group[0].frame[:3], system.group[0].brdf)
     with pytest.raises(ValueError, match=rf"must have the tensor's {count} vertices, got 3"):
