@@ -18,7 +18,7 @@ from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
-from jaxprt.scene import Environment, Part, Scene
+from jaxprt.scene import Environment, Part, Scene, sides
 from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import UnfinishedError
@@ -45,7 +45,10 @@ def precompute(
     """Precomputes a scene for relighting: traces visibility at its vertices and fits the BRDFs of its parts.
 
     All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all parts. Their colors
-    and strengths may change after precomputation.
+    and strengths may change after precomputation. Holes, opacity and backs are those of the scene's materials.
+
+    Parts with `back="lit"` get reversed copies of the faces whose backs can be seen (`jaxprt.scene.sides.two_sided`).
+    In `RelitScene.mesh` the copies of a part follow its vertices and faces.
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
@@ -85,6 +88,7 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    scene = sides.two_sided(scene)
     _check_options(size, error, rate, environments, rays, path, executor)
     reflection.check(bounces)
     folder = None if path is None else pathlib.Path(path)

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
@@ -233,6 +233,7 @@ class Stage(eqx.Module):
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
+        hidden: Whether cameras see through the backs of each part.
     """
 
     whole: Mesh
@@ -246,6 +247,14 @@ class Stage(eqx.Module):
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
+    hidden: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def hidden_faces(self) -> Bool[np.ndarray, " f"] | None:
+        """Triangles that cameras do not see from behind; None without."""
+        if not any(self.hidden):
+            return None
+        return np.asarray(self.hidden)[self.part[np.asarray(self.whole.face)[:, 0]]]
 
     @property
     def face(self) -> Int[Array | np.ndarray, "f 3"]:
@@ -393,7 +402,7 @@ def padded(mesh: Mesh) -> Mesh:
         name: np.pad(value, [(0, count)] + [(0, 0)] * (value.ndim - 1), mode="edge") for name, value in fields.items()
     }
     face = np.pad(mesh.face, ((0, shared_size(len(mesh.face)) - len(mesh.face)), (0, 0)))
-    return put(dataclasses.replace(mesh, **rows, face=face, texture=None, origin=origins.ZERO))
+    return put(dataclasses.replace(mesh, **rows, face=face, texture=None, origin=origins.ZERO, opacity=None))
 
 
 @jit

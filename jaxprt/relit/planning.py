@@ -25,7 +25,7 @@ from jaxprt.relit import channels, groups, reflection
 from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
-from jaxprt.scene import Environment, Scene
+from jaxprt.scene import Environment, Scene, sides
 from jaxprt.scene.scene import centered
 from jaxprt.visibility import blocks
 
@@ -179,7 +179,7 @@ def plan(
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if path is not None:
         require.path("path", path)
-    scene = centered(scene)
+    scene = centered(sides.two_sided(scene))
     environments = lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
     size = checked(environments, asked, rate)
@@ -206,7 +206,7 @@ def plan(
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
-    reflected = reflection.fractions(shadings, environments)
+    reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity)
     bounces = reflection.needed(reflected, asked)
     names = tuple(part.name for part in scene.parts)
     return Plan(names, tuple(plans), reflected, bounces, float(asked), float(rate), size, key)

@@ -23,7 +23,7 @@ from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import samples_of
 from jaxprt.relit.surface import combine, view_of
 from jaxprt.relit.tracing import Reflections
-from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, sides
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
@@ -313,6 +313,7 @@ class RelitScene(System):
             samples,
             sharp,
             lamp,
+            tuple(sides.hidden_backs(self.scene).tolist()),
         )
 
     def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:

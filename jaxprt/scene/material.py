@@ -14,6 +14,8 @@ from jaxprt.compile import jit
 from jaxprt.scene import texture
 
 _COLORS = "base_color", "emissive", "specular_color"
+ALPHA_MODES = "opaque", "mask", "blend"
+BACKS = "black", "hidden", "lit"
 
 
 def _scalar(value: Any) -> Any:
@@ -122,10 +124,17 @@ class TexturedMaterial(eqx.Module):
         anisotropy_texture: Texture [h w 3] with the direction, as (direction + 1) / 2, in the first two channels, and
             a factor on the strength in the third.
         normal_texture: Normal map [h w 3], as (normal + 1) / 2 in the frame of tangent, bitangent and normal.
+        alpha: Opacity, from 0 for a surface that is not there to 1. Ignored if `alpha_mode` is "opaque".
+        alpha_texture: Texture [h w 1] that multiplies `alpha`.
+        alpha_cutoff: Opacity from which on a surface is there, for "mask"; at least 0. It is absent below.
+        alpha_mode: "opaque"; "mask" for a surface with holes; or "blend" for one that hides the share `alpha` of
+            what is behind it, and stops that share of light.
+        back: What cameras see of the back of the surface: "black"; "hidden" for nothing, so that they see what is
+            behind it; or "lit" for the same material. Backs cast shadows in all cases.
 
     Raises:
         TypeError: A texture is an array, not a `Texture`.
-        ValueError: A factor is not finite or out of its range.
+        ValueError: A factor is not finite or out of its range, or `alpha_mode` or `back` is another word.
 
     Reference: Khronos glTF 2.0 specification, section 3.9 and appendix B; its extensions KHR_materials_ior,
     KHR_materials_specular, KHR_materials_anisotropy and KHR_materials_emissive_strength.
@@ -149,16 +158,28 @@ class TexturedMaterial(eqx.Module):
     specular_color_texture: Texture | None = None
     anisotropy_texture: Texture | None = None
     normal_texture: Texture | None = None
+    alpha: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    alpha_texture: Texture | None = None
+    alpha_cutoff: Float[Array, ""] = eqx.field(converter=_scalar, default=0.5)
+    alpha_mode: str = eqx.field(static=True, default="opaque")
+    back: str = eqx.field(static=True, default="black")
 
     def __check_init__(self):
         """Refuses factors that are not finite or out of their range."""
-        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy"):
+        for name, words in (("alpha_mode", ALPHA_MODES), ("back", BACKS)):
+            if getattr(self, name) not in words:
+                raise ValueError(
+                    f"{name} of TexturedMaterial must be one of {', '.join(words)}, got {getattr(self, name)!r}"
+                )
+        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", "alpha"):
             require.within(f"{name} of TexturedMaterial", getattr(self, name), 0, 1)
-        for name in ("emissive", "specular_color", "ior"):
+        for name in ("emissive", "specular_color", "ior", "alpha_cutoff"):
             require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0.0)
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
         for name, value in vars(self).items():
+            if isinstance(value, str):
+                continue
             if not name.endswith("_texture"):
                 shape = (3,) if name in _COLORS else ()
                 if jnp.shape(value) != shape:

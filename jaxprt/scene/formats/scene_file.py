@@ -28,7 +28,7 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform, KHR_mesh_quantization and
     EXT_mesh_gpu_instancing. Meshes with a skin are in the pose that the file's joints have. Triangles without normals
     are flat. Compressed geometry is read from its uncompressed fallback. A file that requires another extension is
-    refused. A single warning names all other features of the file (alpha modes, transmission, animations, lights,
+    refused. A single warning names all other features of the file (transmission, animations, lights,
     orthographic cameras, images that cannot be read, and so on). Primitives without material get the default material
     of the specification, a white rough metal.
 
