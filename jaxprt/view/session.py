@@ -117,7 +117,9 @@ class Session:
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         sky = background(self.stages.lights[0], ray_direction(camera))
-        return np.asarray(display(render(scene.mesh, color, camera, background=sky)))
+        region = np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]
+        mesh = seen_from_front(scene.mesh, camera, sides.hidden_backs(scene.scene)[region])
+        return np.asarray(display(render(mesh, color, camera, background=sky)))
 
     def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         scene = self.stages.scene

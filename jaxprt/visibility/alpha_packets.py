@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 
 from jaxprt.scene import texture
 from jaxprt.scene.opacity import BLEND, CLEAR, Opacity
+from jaxprt.scene.subdivision import places
 from jaxprt.visibility import packets
 
 LAYERS = 8  # translucent surfaces that a ray collects: the nearest ones
@@ -29,11 +30,13 @@ _BLEND, _CLEAR = np.float32(BLEND), np.float32(CLEAR)
 class AlphaPackets:
     """An Embree scene of triangles, some of which have an opacity.
 
+    The two sides of a sheet (`jaxprt.scene.sides`) stop light once: a reversed copy of an earlier triangle is left out.
+
     Args:
         position: Vertex positions.
         face: Three vertex indices for each triangle.
         opacity: Opacity of the vertices.
-        clear_only: Whether to leave out the opaque triangles.
+        clear_only: Whether to leave out the opaque triangles, and to keep both sides of sheets, for `layers`.
 
     Raises:
         MemoryError: Embree runs out of memory.
@@ -54,6 +57,8 @@ class AlphaPackets:
         self._occluded, self._intersect = embree.occluded, embree.intersect
         layer = np.asarray(opacity.layer)[face[:, 0]]
         opaque, clear = np.flatnonzero((layer == 0) & (not clear_only)), np.flatnonzero(layer > 0)
+        if not clear_only:
+            clear = clear[~_is_reverse(position, face[clear])]
         self._scene, self._index = packets.new_scene(self), [own for own in (opaque, clear) if len(own)]
         if len(opaque):
             packets.attach(self._scene, position, face[opaque])
@@ -123,6 +128,18 @@ class AlphaPackets:
         alpha, skipped = np.zeros(shape, np.float32), np.ascontiguousarray(hidden[self._clear], np.uint8)
         _collected(self._intersect, self._scene, origin, direction, far, skipped, count, place, face, alpha)
         return count, self._clear[face], place, alpha
+
+
+def _is_reverse(position: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Whether an earlier face has the same corners in the opposite order."""
+    corner = places(position)[face]
+    order = np.argsort(corner, axis=1)
+    odd = ((order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])).astype(int)
+    _, row = np.unique(np.take_along_axis(corner, order, 1), axis=0, return_inverse=True)
+    row = row.reshape(-1)
+    first = np.full((len(face), 2), len(face))
+    np.minimum.at(first, (row, odd), np.arange(len(face)))
+    return first[row, 1 - odd] < first[row, odd]
 
 
 def _table(face: np.ndarray, layer: np.ndarray, opacity: Opacity) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -9,6 +9,7 @@ import pytest
 from jaxprt import visibility
 from jaxprt.scene import Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, join, make_mesh
+from jaxprt.scene.sides import two_sided
 from jaxprt.visibility import Occluder, blocks
 
 SIZE = 8
@@ -56,6 +57,13 @@ def test_a_translucent_surface_stops_its_share_of_light():
     above = seen(make_mesh(*GROUND)) > 0
     np.testing.assert_allclose(got[above], expected[above], atol=1 / 8)  # neighbors by an eighth are not supersampled
     assert np.mean(got[above]) == pytest.approx(np.mean(expected[above]), abs=0.01)
+
+
+def test_both_sides_of_a_translucent_sheet_stop_light_once():
+    plain = scene(alpha_texture=None, alpha=0.25, alpha_mode="blend", back="lit")
+    doubled = two_sided(plain)
+    assert len(doubled.mesh.face) == len(plain.mesh.face) + 2
+    np.testing.assert_array_equal(seen(doubled.mesh), seen(plain.mesh))
 
 
 def test_rays_stop_as_often_as_light_does():
