@@ -115,6 +115,7 @@ def _slots(
             "pictures of surfaces with holes or translucent ones need concrete values, but the camera or the scene is "
             "traced by JAX: make the picture outside of jax.jit, or close the jitted function over them"
         )
+    assert occluder.opacity is not None
     count = len(occluder.face)
     clear = np.zeros(len(mesh.face), bool)
     clear[:count] = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]] > 0

@@ -10,6 +10,8 @@ from jaxprt.scene import texture
 from jaxprt.scene.material import TexturedMaterial
 from jaxprt.scene.opacity import BLEND, CLEAR, Opacity
 
+_OPAQUE: tuple[Any, ...] = 0.0, (0, 0), -1, (1, 1)  # cutoff, wrap modes, and the place and shape of an image
+
 
 def of_parts(parts: Sequence[Any]) -> Opacity | None:
     """The opacity of the vertices of some parts, one after another; None if all of them are opaque.
@@ -22,7 +24,7 @@ def of_parts(parts: Sequence[Any]) -> Opacity | None:
         return None
     total = sum(len(part.mesh.position) for part in parts)
     coordinate, factor = np.zeros((total, 2), np.float32), np.ones(total, np.float32)
-    layer, rows, texels, first = np.zeros(total, np.int32), [(0.0, (0, 0), -1, (1, 1))], [np.ones(1, np.float32)], 0
+    layer, rows, texels, first = np.zeros(total, np.int32), [_OPAQUE], [np.ones(1, np.float32)], 0
     place: dict[int, int] = {}
     for part, through in zip(parts, clear, strict=True):
         own = slice(first, first + len(part.mesh.position))

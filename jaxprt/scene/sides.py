@@ -128,6 +128,7 @@ def _doubled(part: Part, copied: Bool[np.ndarray, " f"]) -> Part:
 
     Normal maps then bend the normals of both sides as one surface: a bump of the front is a dent of the back.
     """
+    assert isinstance(part.material, TexturedMaterial)
     material = dataclasses.replace(part.material, back="hidden")
     if not copied.any():
         return dataclasses.replace(part, material=material)

@@ -16,11 +16,12 @@ from jaxtyping import Bool, Float
 
 from jaxprt import require
 from jaxprt.image import display, ray_direction, render
+from jaxprt.image.layers import seen_from_front
 from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, load_environment
+from jaxprt.scene import Environment, load_environment, sides
 from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
@@ -117,9 +118,13 @@ class Session:
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         sky = background(self.stages.lights[0], ray_direction(camera))
-        region = np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]
-        mesh = seen_from_front(scene.mesh, camera, sides.hidden_backs(scene.scene)[region])
+        mesh = seen_from_front(scene.mesh, camera, self._hidden_faces())
         return np.asarray(display(render(mesh, color, camera, background=sky)))
+
+    def _hidden_faces(self) -> Bool[np.ndarray, " f"]:
+        """Triangles that cameras do not see from behind."""
+        mesh = self.stages.scene.mesh
+        return sides.hidden_backs(self.stages.scene.scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
 
     def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         scene = self.stages.scene
@@ -143,7 +148,10 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        arrays = np.asarray(mesh.position, "<f4"), stages.counterclockwise(mesh)
+        hidden, face = self._hidden_faces(), stages.counterclockwise(mesh)
+        # Those with black backs come first: of the others the viewer draws no backs.
+        content["backs"] = int(np.count_nonzero(~hidden))
+        arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
         return Reply(content, [each.tobytes() for each in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:

@@ -9,7 +9,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Integer
-from numba import carray
+from numba import carray  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import types
 from numba.extending import intrinsic
 

@@ -64,14 +64,18 @@ class Occluder:
         """The Embree scene for packets of rays; None if the library that embreex ships has none."""
         from jaxprt.visibility import packets  # numba takes half a second to import
 
-        if self.opacity is not None:
-            return self._alpha()
         return packets.Packets(self.position, self.face) if packets.available() else None
 
     def _alpha(self, **options: bool):
         from jaxprt.visibility.alpha_packets import AlphaPackets
 
+        assert self.opacity is not None
         return AlphaPackets(self.position, self.face, self.opacity, **options)
+
+    @cached_property
+    def _partial(self):
+        """The Embree scene for rays that pass holes and translucent surfaces."""
+        return self._alpha()
 
     @cached_property
     def translucent(self):
@@ -164,7 +168,7 @@ class Occluder:
             way: Index of each ray's direction in `direction`.
         """
         with self._building:
-            packed = self._packed
+            packed = self._packed if self.opacity is None else self._partial
         if packed is not None:
             return packed.blocked(origin, direction, point, way)
         with self._building:
@@ -180,8 +184,8 @@ class Occluder:
     ) -> Float32[np.ndarray, " n"]:
         """Share of light that passes along each ray, for an occluder that `blends`. `blocked` has the arguments."""
         with self._building:
-            packed = self._packed
-        return packed.passed(origin, direction, point, way)
+            partial = self._partial
+        return partial.passed(origin, direction, point, way)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.
@@ -194,8 +198,8 @@ class Occluder:
         """
         if self.opacity is not None and not solid:
             with self._building:
-                packed = self._packed
-            return packed.hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
+                partial = self._partial
+            return partial.hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
         with self._building:
             single = self._single
         found = single.run(origin, direction, query="INTERSECT", output=True)

@@ -263,7 +263,7 @@ def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
 
 
 def _rounded(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
-    """Whole numbers whose mean over neighboring texels is that of the values: ordered dithering by a Kronecker sequence.
+    """Whole numbers whose mean over neighboring texels is that of the values, by ordered dithering.
 
     Rounding to the nearest would change the share that all texels behind one translucent surface have, by up to 1/32.
     """
