@@ -5,7 +5,7 @@ another in their group, and where each part stands is known on the host.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
-from jaxprt.scene.mesh import join
+from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
@@ -38,6 +39,9 @@ class Surface(eqx.Module):
 
     Attributes:
         system: The system of direct light from the environment.
+        position: Positions of the vertices.
+        frame: Their shading frames; rows are tangent, bitangent, normal.
+        brdf: The BRDF, with one channel for each weight of a blend.
         reflecting: How they reflect light from other surfaces; None without bounces.
         lit: How they reflect light from lamps; None without lamps.
         scale: Factor of each channel of the BRDF; None for a BRDF that cannot change.
@@ -46,6 +50,9 @@ class Surface(eqx.Module):
     """
 
     system: System
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    brdf: Callable
     reflecting: ReflectingPart | None
     lit: LitByLamps | None
     scale: Float[Array, " k"] | None
@@ -310,6 +317,11 @@ class Stage(eqx.Module):
 
 
 def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:
+    """Projects an environment for the systems of all groups and for bounces."""
+    return SceneLight(direct(surfaces, environment), None if bounces is None else bounces.light(environment))
+
+
+def direct(surfaces: Sequence[Surface], environment: Environment) -> tuple[PyTree, ...]:
     """Projects an environment for the systems of all groups. Systems with the same `shared_light` share one result."""
     made: dict[Any, PyTree] = {}
     result = []
@@ -319,7 +331,7 @@ def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment
         if key is not None:
             made[key] = lit
         result.append(lit)
-    return SceneLight(tuple(result), None if bounces is None else bounces.light(environment))
+    return tuple(result)
 
 
 def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]]:
@@ -364,14 +376,38 @@ def joined(shadings: Sequence[Shading]) -> Shading:
     return dataclasses.replace(first, blend=blend)
 
 
-def surface(shading: Shading, system: System, reflecting: ReflectingPart | None, lit: LitByLamps | None) -> Surface:
-    """The group of parts of which one is given."""
-    scale = (
-        None
-        if shading.scale is None or shading.blend is None
-        else jax.device_put(np.asarray(shading.scale, jnp.result_type(float)))
-    )
-    return Surface(system, reflecting, lit, scale, shading.term, bool(shading.knot))
+def surface(
+    number: int,
+    shadings: Sequence[Shading],
+    place: Place,
+    system: System,
+    reflecting: ReflectingPart | None,
+    lit: LitByLamps | None,
+) -> Surface:
+    """A group of a scene.
+
+    Args:
+        number: Index of the group.
+        shadings: The `Shading` of each part of the scene.
+        place: Where the vertices of the parts stand.
+        system: The system of direct light.
+        reflecting: How the group reflects light from other surfaces; None without bounces.
+        lit: How it reflects light from lamps; None without lamps.
+    """
+    members = [shadings[part] for part in place.parts[number]]
+    shading, dtype = members[0], jnp.result_type(float)
+    scale = None
+    if shading.scale is not None and shading.blend is not None:
+        scale = jax.device_put(np.asarray(shading.scale, dtype))
+    if isinstance(system, BrightTexels):
+        position, frame = system.visibility.position, system.visibility.frame
+    else:
+        pairs = [(np.asarray(own.mesh.position, dtype), frames(own.mesh.normal, own.mesh.tangent)) for own in members]
+        position, frame = (
+            jax.device_put(place.column(number, rows).astype(dtype)) for rows in zip(*pairs, strict=True)
+        )
+    brdf, varies = grid.as_argument(shading.brdf), bool(shading.knot)
+    return Surface(system, position, frame, brdf, reflecting, lit, scale, shading.term, varies)
 
 
 def spread(values: Sequence[Any], counts: Sequence[int], size: int, dtype: Any) -> Any:

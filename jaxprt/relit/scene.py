@@ -147,12 +147,14 @@ class RelitScene(System):
         self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
-                shading[members[0]],
+                number,
+                shading,
+                place,
                 system,
                 None if bounces is None else bounces.group[number],
                 None if lamps is None else lamps.group[number],
             )
-            for number, (members, system) in enumerate(zip(place.parts, systems, strict=True))
+            for number, system in enumerate(systems)
         )
         pairs = zip(shading, place.group, strict=True)
         found = [traits(each, systems[number], self.lobes[number]) for each, number in pairs]
@@ -404,6 +406,7 @@ class RelitScene(System):
         *,
         materials: Mapping[str, Any] | None = None,
         samples: int = 4,
+        shadows: str = "rays",
         between: Between = None,
     ) -> Float[Array, "h w c"]:
         """Renders the scene under an environment, in linear radiance.
@@ -419,6 +422,9 @@ class RelitScene(System):
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
                 than 4, and matters where sharp highlights are smaller than a pixel.
+            shadows: "rays" traces shadows of the brightest texels from the points of the picture, so that they are
+                sharp on any mesh. "vertices" interpolates visibility between vertices, which is always done where JAX
+                traces the light or the camera. Rays are constants of derivatives.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
@@ -430,12 +436,19 @@ class RelitScene(System):
                 gives.
             ValueError: The environment is a batch, `samples` is another number, or for the reasons that `view` gives.
         """
-        view = self._picture_view(camera, materials, samples=samples, keep=False, between=between)
+        if not isinstance(shadows, str):
+            raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
+        view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
         return view.picture(environment, between=between)
 
     @promoted
     def picture_view(
-        self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
+        self,
+        camera: Camera | None = None,
+        *,
+        materials: Mapping[str, Any] | None = None,
+        samples: int = 4,
+        shadows: str | Environment = "rays",
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
@@ -447,8 +460,11 @@ class RelitScene(System):
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
                 than 4, and matters where sharp highlights are smaller than a pixel.
+            shadows: "rays" and "vertices" as in `picture`. With "rays", texels that earlier lights had in common are
+                not traced again. A light traces its brightest texels now, for all pictures of the view, also inside of
+                `jax.jit`.
         """
-        return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
+        return self._picture_view(camera, materials, samples=samples, keep=True, shadow=shadows, between=None)
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera
@@ -602,15 +618,21 @@ def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
 
 
 class _Lit(eqx.Module):
-    """The light that arrives at a scene with given materials, as a function of the environment."""
+    """The light that arrives at a scene with given materials, as a function of the environment.
+
+    Direct light may be that of another environment.
+    """
 
     scene: RelitScene
     materials: Any
     appearances: dict[str, Appearance]
 
-    def __call__(self, environment: Environment) -> Arriving:
+    def __call__(self, environment: Environment, direct: Environment | None = None) -> Arriving:
         lights = scene_lamps.split(self.scene.lamps, self.materials)[1]
-        return self.scene.shade(self.scene.light(environment), {**self.appearances, **lights})
+        light = self.scene.light(environment)
+        if direct is not None:
+            light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
+        return self.scene.shade(light, {**self.appearances, **lights})
 
 
 def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[float, int, bool]:

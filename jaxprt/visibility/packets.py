@@ -15,7 +15,7 @@ from typing import no_type_check
 import llvmlite.ir
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Integer
+from jaxtyping import Bool, Float32, Integer, UInt8
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -29,6 +29,7 @@ _COHERENT = 1 << 16
 _EVERY_FEATURE = 0xFFFFFFFF
 _NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
+_ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # places of ray origins in a pixel, from its center
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
@@ -95,6 +96,21 @@ class Packets:
         found = np.empty(len(point), np.bool_)
         _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
         return found
+
+    def shares(
+        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
+    ) -> None:
+        """Traces the rays of some points of a picture to texels; `jaxprt.visibility.texel_rays` explains the arguments.
+
+        Args:
+            surface: Positions and normals of vertices, triangles, and the distance from each at which rays start.
+            points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
+            texels: Directions of the places in each texel, of its middle, number of rays, and first place.
+            part: The points to trace.
+            share: The result, in 255ths.
+        """
+        address, arguments = self._occluded, self._arguments.ctypes.data
+        _shares(address, self._scene, arguments, surface, points, texels, part.start, part.stop, share)
 
 
 def available() -> bool:
@@ -174,3 +190,79 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
         _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
             found[packet + lane] = ray[8, lane] < 0
+
+
+@no_type_check
+@_cached
+def _shares(address, scene, arguments, surface, points, texels, first, last, share):
+    """Visible shares of texels at points of a picture: see `Packets.shares`."""
+    position, normal, face, offset = surface
+    triangle, barycentric, slope, pattern = points
+    direction, middle, count, shift = texels
+    strata = direction.shape[1]
+    memory = np.empty(13 * 16 + 16, np.float32)
+    begin = (-memory.ctypes.data // 4) % 16
+    ray = memory[begin : begin + 12 * 16].reshape(12, 16)
+    number = ray.view(np.uint32)
+    valid = memory[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
+    origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
+    weight, above, visible = np.empty(3), np.empty(16, np.bool_), np.empty(16, np.int32)
+    for packet in range(first, last, 16):
+        lanes = min(16, last - packet)
+        for lane in range(lanes):
+            point = packet + lane
+            a, b, c = face[max(triangle[point], 0)]
+            across = np.cross(
+                position[b].astype(np.float64) - position[a].astype(np.float64),
+                position[c].astype(np.float64) - position[a].astype(np.float64),
+            )
+            inside = across @ (normal[a] + normal[b] + normal[c]).astype(np.float64)
+            length = np.sqrt(across @ across)
+            # Without an area there is no side to start from.
+            scale = 0.0 if length == 0 or triangle[point] < 0 else (-1 / length if inside < 0 else 1 / length)
+            for axis in range(3):
+                facing[axis, lane] = scale * across[axis]
+            for place in range(4):
+                for corner in range(3):
+                    moved = barycentric[point, corner]
+                    moved += _ORIGINS[place, 0] * slope[point, 0, corner] + _ORIGINS[place, 1] * slope[point, 1, corner]
+                    weight[corner] = max(moved, 0.0)
+                weight /= max(weight.sum(), 1e-30)
+                for axis in range(3):
+                    origin[place, axis, lane] = (
+                        weight[0] * position[a, axis]
+                        + weight[1] * position[b, axis]
+                        + weight[2] * position[c, axis]
+                        + offset[max(triangle[point], 0)] * facing[axis, lane]
+                    )
+        for texel in range(len(count)):
+            some = False
+            for lane in range(lanes):
+                visible[lane] = 0
+                cosine = 0.0
+                for axis in range(3):
+                    cosine += facing[axis, lane] * middle[texel, axis]
+                above[lane] = cosine > 0
+                some |= above[lane]
+            if some:
+                for turn in range(count[texel]):
+                    for lane in range(16):
+                        valid[lane] = -1 if lane < lanes and above[lane] else 0
+                        here = min(lane, lanes - 1)
+                        base = pattern[packet + here]
+                        stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
+                        place = (base // 4 + base + texel + turn) % 4
+                        for axis in range(3):
+                            ray[axis, lane] = origin[place, axis, here]
+                            ray[4 + axis, lane] = direction[texel, stratum, axis]
+                        ray[3, lane] = 0.0  # near
+                        ray[7, lane] = 0.0  # time
+                        ray[8, lane] = 1e37  # far; minus infinity after a hit
+                        number[9, lane] = 0xFFFFFFFF  # mask
+                        number[10, lane] = lane
+                        number[11, lane] = 0  # flags
+                    _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                    for lane in range(lanes):
+                        visible[lane] += above[lane] and ray[8, lane] > 0
+            for lane in range(lanes):
+                share[texel, packet + lane] = (255 * visible[lane] + count[texel] // 2) // count[texel]
