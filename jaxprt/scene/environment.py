@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
-from jaxprt.compile import jit
+from jaxprt.compile import jit, known, put
 from jaxprt.files import images
-from jaxprt.scene import resampling
+from jaxprt.scene import panorama, resampling
+from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 
 # Arrangement of the six faces in each layout: its height and width in faces; the row and column of each face (+x, -x,
@@ -33,6 +34,7 @@ _AROUND = 4096  # smallest number of parts around the horizon into which a latlo
 _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 _STATED = {"latlong": "openexr-latlong", "cube": "openexr-cube"}  # values of the EXR attribute envmap
+_PANORAMA = "_panorama"
 
 
 class Environment(eqx.Module):
@@ -43,6 +45,12 @@ class Environment(eqx.Module):
     relighting is linear: a difference of two lights, the light of one basis function and the gradient of a light are
     environments too. `load_environment` sets negative pixels of files to zero. Inside `jax.jit` values are not known
     and not checked: a NaN then reaches every vertex that the texel lights.
+
+    A light that comes from a file also remembers the file's pixels, up to 8192 columns of them, as its `panorama`:
+    `background` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
+    to this object on the host and are no part of the pytree, so lights of all files share programs. What `jax.jit`,
+    `jax.vmap`, `jax.grad`, `jax.tree.map`, files of `jaxprt.files.save` and `Environment(light.radiance)` return has
+    the texels alone, and is shown by them.
 
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
@@ -61,6 +69,21 @@ class Environment(eqx.Module):
         if len(shape) < 4 or shape[-4] != 6 or shape[-3] != shape[-2] or 0 in shape[-3:]:
             raise ValueError(f"the light's radiance must be [..., 6, n, n, c], got {list(shape)}")
         require.finite("the light's radiance", self.radiance)
+
+    @property
+    def panorama(self) -> Panorama | None:
+        """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
+        return self.__dict__.get(_PANORAMA)
+
+
+def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
+    """A light that remembers the pixels of its file."""
+    light = Environment(radiance)
+    if panorama is not None:
+        # Not a field: as a leaf of the pytree the sizes of files would ask for programs of their own, and as static
+        # data each file would.
+        object.__setattr__(light, _PANORAMA, panorama)
+    return light
 
 
 def _size(value: object) -> None:
@@ -127,7 +150,12 @@ def environment_from_image(
         raise TypeError(f"layout must be one of {', '.join(LAYOUTS)}, got {require.shown(layout)}")
     layout = layout or layout_of(image, {}, name)
     _check_layout(image, layout, name)
-    return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
+    image = _clean(image, name)
+    light = jnp.asarray(resample(image, layout=layout, size=size))
+    on_edge = layout.startswith("openexr")
+    if layout in _CUBES:
+        return _with_panorama(light, panorama.from_faces(_cut_faces(image, layout), on_edge=on_edge))
+    return _with_panorama(light, panorama.from_latlong(image, on_edge=on_edge))
 
 
 def resample(
@@ -179,24 +207,26 @@ def _environment(value: object) -> None:
     rotation=functools.partial(require.rotation, "rotation"),
     samples=functools.partial(require.count, "samples", least=1),
 )
-@functools.partial(jit, static_argnames="samples")
 def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
     """Rotates distant light: radiance from direction s arrives from direction R s afterwards.
+
+    A light with the pixels of a file (`Environment.panorama`) is made of these anew, in the same number of texels, so
+    that turning it often or by little does not blur it. Inside `jax.jit`, and for other lights, the texels are turned:
 
     Each texel is the mean of ``samples`` x ``samples`` parts. The value of a part is interpolated bilinearly, with a
     transition between texels that is as wide as a part. The mean then approximates the overlap of rotated texels with
     those of the cube. A sun in one texel therefore moves smoothly instead of flickering, and rotations that map the
     cube onto itself permute the texels. Parts cover some texels of the original light more than others; its values are
-    weighted to compensate. Each color is scaled so that its integral over the sphere is conserved. Constant light does
-    not change. The light should not be negative.
+    weighted to compensate. The light should not be negative.
 
-    The result is differentiable in both arguments. At the identity the gradient is the central one of a piecewise
-    smooth function.
+    Both ways, each color is scaled so that its integral over the sphere is conserved, and constant light does not
+    change. When texels are turned, the result is differentiable in both arguments. At the identity the gradient is the
+    central one of a piecewise smooth function.
 
     Args:
         light: One light, or a batch of them.
         rotation: A proper rotation matrix. Inside `jax.jit` it is not checked, and others give wrong results.
-        samples: Parts along the edge of a texel.
+        samples: Parts along the edge of a texel, when texels are turned.
 
     Returns:
         The rotated light.
@@ -208,6 +238,15 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
     Reference: the weights are one step of the balancing in Sinkhorn and Knopp 1967.
     """
+    if light.panorama is None or not known(light, rotation):
+        return _rotated_texels(light, rotation, samples=samples)
+    turned = light.panorama.rotated(np.asarray(rotation))
+    radiance = turned.cubemap(light.radiance.shape[-2]).astype(light.radiance.dtype)
+    return _with_panorama(put(radiance), turned)
+
+
+@functools.partial(jit, static_argnames="samples")
+def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, samples: int) -> Environment:
     radiance = light.radiance
     n = radiance.shape[-2]
     # Points on the cube have coordinates in fractions of texels, which quarter turns preserve exactly.
@@ -241,18 +280,61 @@ def _direction(value: Any) -> Array:
     return direction
 
 
+@require.arguments(light=_environment, size=_size)
+def finer(light: Environment, *, size: int = 256) -> Environment:
+    """The same light in texels of another size, from the pixels of its file.
+
+    Texels are area means over the pixels, turned as `rotate` has turned the light, and the integral over the sphere is
+    conserved. Use it where the texels of the light are too coarse, as for shadow rays towards a small sun.
+
+    Args:
+        light: One light, not a batch.
+        size: Texels along the edge of a cube face.
+
+    Returns:
+        The light with faces of size x size texels; or the given light itself if it does not have the pixels of a file
+        (`Environment.panorama` is None).
+
+    Raises:
+        TypeError: The light is not an `Environment`, or the size is not a whole number.
+        ValueError: The size is below 1.
+        MemoryError: The cubemap does not fit into memory.
+    """
+    pixels = light.panorama
+    if pixels is None or size == light.radiance.shape[-2]:
+        return light
+    require.memory(f"a cubemap of 6 x {size} x {size} texels", 100 * 6 * size**2, "choose a smaller size")
+    return _with_panorama(put(pixels.cubemap(size).astype(light.radiance.dtype)), pixels)
+
+
 @require.arguments(light=_environment, direction=_direction)
-@jit
-def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-    """Radiance that arrives from given directions in world coordinates, interpolated bilinearly between texels.
+def background(
+    light: Environment, direction: Float[Array, "*b 3"], *, angle: Float[Array, "*b"] | float = 0.0
+) -> Float[Array, "*b c"]:
+    """Radiance that arrives from given directions in world coordinates: what is seen behind objects.
+
+    It is that of the pixels of the light's file (`Environment.panorama`), interpolated bilinearly; or, inside `jax.jit`
+    and without a file, that of the light's texels, interpolated bilinearly.
 
     Args:
         light: One light, not a batch.
         direction: Directions of any length, in world coordinates.
+        angle: Width in radians of the pixels of a picture that look in these directions. The pixels of the file are
+            averaged over it. Texels are not.
 
     Returns:
         Radiance for each direction, in the units of the light.
     """
+    if light.panorama is None or not known(light, direction, angle):
+        return _texels_behind(light, direction)
+    ray = np.asarray(direction).reshape(-1, 3)
+    wide = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
+    color = light.panorama.sampled(ray, wide).astype(light.radiance.dtype)
+    return put(color.reshape(*direction.shape[:-1], 3))
+
+
+@jit
+def _texels_behind(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
     return cubemap.lookup(light.radiance, direction)
 
 
