@@ -240,10 +240,16 @@ def _vertices(picture: PictureView, arriving: Arriving, between: Between) -> dic
         surface = stage.surfaces[row.number]
         seen = _seen_alone(stage, row, picture.camera) if row.kept is None else row.kept
         lit_rows.append(finished(lit(surface, arriving.at(row.number), seen), between))
-    colors: dict[int, np.ndarray] = {}
-    for row, color in zip(picture.vertices, map(np.asarray, lit_rows), strict=True):
+    host = known(lit_rows)  # How many vertices are shaded depends on the view.
+    colors: dict[int, Any] = {}
+    for row, color in zip(picture.vertices, map(np.asarray, lit_rows) if host else lit_rows, strict=True):
         shape = (stage.surfaces[row.number].channels, stage.place.size[row.number], color.shape[1])
-        colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
+        if row.number not in colors:
+            colors[row.number] = (np if host else jnp).zeros(shape, color.dtype)
+        if host:
+            colors[row.number][row.channel, row.vertex] = color
+        else:
+            colors[row.number] = colors[row.number].at[row.channel, row.vertex].set(color)
     return {number: put(color) for number, color in colors.items()}
 
 

@@ -13,7 +13,7 @@ import weakref
 from typing import Any
 
 import equinox as eqx
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
@@ -21,6 +21,8 @@ from jaxprt.compile import known, put
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit.casting import caster
 from jaxprt.scene import Environment, Mesh, light_samples
+from jaxprt.scene import environment as environments
+from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
 from jaxprt.visibility import texel_rays
@@ -32,6 +34,8 @@ _MORE = 16  # rays of a point beyond one for each texel, shared out by flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT = 4  # number of views whose traced texels are kept
+
+_FINER: weakref.WeakKeyDictionary[Panorama, np.ndarray] = weakref.WeakKeyDictionary()
 
 
 class TexelShares(eqx.Module):
@@ -62,12 +66,11 @@ class TracedLight(eqx.Module):
     def row(self, index: Any) -> tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t p"]]:
         """The texels, what is taken out of them, and their shares at some points; an index of -1 is padding."""
         share = self.shares.share
-        index = (np if known(index) else jax.numpy).maximum(index, 0)
-        return (
-            self.shares.texel,
-            self.excess,
-            put(np.ascontiguousarray(share[:, index])) if known(share, index) else (jax.numpy.asarray(share)[:, index]),
-        )
+        if known(share, index):  # The number of points depends on the view.
+            own = put(np.asarray(share)[:, np.maximum(index, 0)])
+        else:
+            own = jnp.asarray(share)[:, jnp.maximum(index, 0)]
+        return self.shares.texel, self.excess, own
 
 
 def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
@@ -85,8 +88,7 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     """
     if not known(mesh, pixels, environment):
         return None
-    texel = bright_texels.brightest(environment, count=TEXELS)
-    excess, rest = bright_texels.without(environment, texel, rank=_RANK, least=_LEAST)
+    texel, excess, rest = bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)
     size = environment.radiance.shape[-2]
     number = np.asarray(texel)
     flux = np.asarray(excess, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)).ravel()[number]
@@ -96,7 +98,7 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     count = np.clip(1 + np.round(_MORE * flux[bright] / flux.sum()).astype(int), 1, texel_rays.PLACES)
     fine = _finer(environment)
     direction = light_samples.in_texels(number[bright], fine, size=size, count=texel_rays.PLACES)
-    share = np.zeros((TEXELS, len(pixels.triangle)), np.uint8)
+    share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
     rays = texel_rays.TexelRays(direction, count)
     share[bright] = _kept(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
     return TracedLight(rest, excess, TexelShares(texel, share))
@@ -104,13 +106,18 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
 
 def fixed(environment: Environment, shares: TexelShares) -> TracedLight:
     """A light, known or traced by JAX, with texels that were traced before."""
-    excess, rest = bright_texels.without(environment, shares.texel, rank=_RANK, least=0.0)
+    excess, rest = bright_texels.without(environment, shares.texel, rank=_RANK, least=_LEAST)
     return TracedLight(rest, excess, shares)
 
 
-def _finer(environment: Environment) -> Float[np.ndarray, "6 m m c"]:
-    """The light at a finer resolution, as far as it is known."""
-    return np.asarray(environment.radiance)
+def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
+    """The light at the resolution at which the places of rays are drawn; its own texels if it knows no finer ones."""
+    size, panorama = light.radiance.shape[-2], light.panorama
+    if panorama is None or size >= _FINE or _FINE % size:
+        return np.asarray(light.radiance)
+    if panorama not in _FINER:
+        _FINER[panorama] = np.asarray(environments.finer(light, size=_FINE).radiance)
+    return _FINER[panorama]
 
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: texel_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:

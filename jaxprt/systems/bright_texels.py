@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree, UInt8
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.brdf import grid
@@ -184,33 +184,39 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
     return texel, excess, Environment(rest)
 
 
-@partial(jit, static_argnames=("count",))
-def brightest(light: Environment, *, count: int) -> Int[Array, " t"]:
-    """Indices of the texels of one environment with the most flux, radiance times solid angle; the most first."""
-    return _largest(_flux_of(light), count)
+@partial(jit, static_argnames=("count", "rank"))
+def brightest(
+    light: Environment, *, count: int, rank: int, least: Float[ArrayLike, ""]
+) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
+    """Takes the radiance of the brightest texels out of a light, as far as they are brighter than many others.
+
+    Unlike with `split`, some brighter texels stay in the rest, which another system may split again.
+
+    Args:
+        light: One environment.
+        count: Number of texels.
+        rank: What exceeds the flux of so many brighter texels is taken out.
+        least: Smallest share of the light's flux that is taken out of a texel; others keep their radiance.
+
+    Returns:
+        Indices of the texels with the most flux, radiance times solid angle, the most first; the radiance taken out of
+        each, in its color; and the rest of the environment.
+    """
+    flux = _flux_of(light)
+    texel = _largest(flux, min(count, len(flux)))
+    return texel, *without(light, texel, rank=rank, least=least)
 
 
 @partial(jit, static_argnames=("rank",))
 def without(
-    light: Environment, texel: Int[Array, " t"], *, rank: int, least: float
+    light: Environment, texel: Int[Array, " t"], *, rank: int, least: Float[ArrayLike, ""]
 ) -> tuple[Float[Array, "t c"], Environment]:
-    """Takes the radiance of given texels out of a light, as far as they are brighter than others.
-
-    Args:
-        light: One environment.
-        texel: Indices of different texels.
-        rank: What exceeds the flux of so many brighter texels is taken out, so that the rest is as smooth as its other
-            texels.
-        least: Smallest share of the light's flux; texels with less stay as they are.
-
-    Returns:
-        The radiance taken out of each texel, in its color; and the rest of the environment.
-    """
+    """The radiance taken out of given texels, and the rest of the environment: see `brightest`."""
     flux = _flux_of(light)
-    level = flux[_largest(flux, rank + 1)[-1]]
+    level = flux[_largest(flux, min(rank + 1, len(flux)))[-1]]
     own = flux[texel]
     fraction = jnp.maximum(1 - level / jnp.where(own > 0, own, 1), 0)
-    fraction = jnp.where(own * (1 - level / jnp.where(own > 0, own, 1)) >= least * jnp.sum(flux), fraction, 0)
+    fraction = jnp.where(own * fraction >= least * jnp.sum(flux), fraction, 0)
     radiance = light.radiance.reshape(-1, light.radiance.shape[-1])
     excess = radiance[texel] * fraction[:, None].astype(radiance.dtype)
     return excess, Environment(radiance.at[texel].add(-excess).reshape(light.radiance.shape))

@@ -194,75 +194,84 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
 
 @no_type_check
 @_cached
+def _start(surface, points, point, lane, origin, facing):
+    """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
+
+    The normal is zero in padding and for triangles without an area, which have no side to start from.
+    """
+    position, normal, face, offset = surface
+    triangle, barycentric, slope, _ = points
+    number = max(triangle[point], 0)
+    a, b, c = face[number]
+    first = position[a].astype(np.float64)
+    across = np.cross(position[b].astype(np.float64) - first, position[c].astype(np.float64) - first)
+    length = np.sqrt(across @ across)
+    side = across @ (normal[a] + normal[b] + normal[c]).astype(np.float64)
+    scale = 0.0 if length == 0 or triangle[point] < 0 else (-1 / length if side < 0 else 1 / length)
+    weight = np.empty(3)
+    for axis in range(3):
+        facing[axis, lane] = scale * across[axis]
+    for place in range(4):
+        for corner in range(3):
+            moved = barycentric[point, corner]
+            moved += _ORIGINS[place, 0] * slope[point, 0, corner] + _ORIGINS[place, 1] * slope[point, 1, corner]
+            weight[corner] = max(moved, 0.0)
+        weight /= max(weight.sum(), 1e-30)
+        for axis in range(3):
+            on_triangle = weight[0] * position[a, axis] + weight[1] * position[b, axis] + weight[2] * position[c, axis]
+            origin[place, axis, lane] = on_triangle + offset[number] * facing[axis, lane]
+
+
+@no_type_check
+@_cached
 def _shares(address, scene, arguments, surface, points, texels, first, last, share):
     """Visible shares of texels at points of a picture: see `Packets.shares`."""
-    position, normal, face, offset = surface
-    triangle, barycentric, slope, pattern = points
+    pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
     memory = np.empty(13 * 16 + 16, np.float32)
     begin = (-memory.ctypes.data // 4) % 16
     ray = memory[begin : begin + 12 * 16].reshape(12, 16)
-    number = ray.view(np.uint32)
     valid = memory[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
-    weight, above, visible = np.empty(3), np.empty(16, np.bool_), np.empty(16, np.int32)
+    above, visible = np.empty(16, np.bool_), np.empty(16, np.int32)
     for packet in range(first, last, 16):
         lanes = min(16, last - packet)
         for lane in range(lanes):
-            point = packet + lane
-            a, b, c = face[max(triangle[point], 0)]
-            across = np.cross(
-                position[b].astype(np.float64) - position[a].astype(np.float64),
-                position[c].astype(np.float64) - position[a].astype(np.float64),
-            )
-            inside = across @ (normal[a] + normal[b] + normal[c]).astype(np.float64)
-            length = np.sqrt(across @ across)
-            # Without an area there is no side to start from.
-            scale = 0.0 if length == 0 or triangle[point] < 0 else (-1 / length if inside < 0 else 1 / length)
-            for axis in range(3):
-                facing[axis, lane] = scale * across[axis]
-            for place in range(4):
-                for corner in range(3):
-                    moved = barycentric[point, corner]
-                    moved += _ORIGINS[place, 0] * slope[point, 0, corner] + _ORIGINS[place, 1] * slope[point, 1, corner]
-                    weight[corner] = max(moved, 0.0)
-                weight /= max(weight.sum(), 1e-30)
-                for axis in range(3):
-                    origin[place, axis, lane] = (
-                        weight[0] * position[a, axis]
-                        + weight[1] * position[b, axis]
-                        + weight[2] * position[c, axis]
-                        + offset[max(triangle[point], 0)] * facing[axis, lane]
-                    )
+            _start(surface, points, packet + lane, lane, origin, facing)
         for texel in range(len(count)):
-            some = False
-            for lane in range(lanes):
-                visible[lane] = 0
-                cosine = 0.0
-                for axis in range(3):
-                    cosine += facing[axis, lane] * middle[texel, axis]
-                above[lane] = cosine > 0
-                some |= above[lane]
-            if some:
-                for turn in range(count[texel]):
-                    for lane in range(16):
-                        valid[lane] = -1 if lane < lanes and above[lane] else 0
-                        here = min(lane, lanes - 1)
-                        base = pattern[packet + here]
-                        stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
-                        place = (base // 4 + base + texel + turn) % 4
-                        for axis in range(3):
-                            ray[axis, lane] = origin[place, axis, here]
-                            ray[4 + axis, lane] = direction[texel, stratum, axis]
-                        ray[3, lane] = 0.0  # near
-                        ray[7, lane] = 0.0  # time
-                        ray[8, lane] = 1e37  # far; minus infinity after a hit
-                        number[9, lane] = 0xFFFFFFFF  # mask
-                        number[10, lane] = lane
-                        number[11, lane] = 0  # flags
-                    _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
-                    for lane in range(lanes):
-                        visible[lane] += above[lane] and ray[8, lane] > 0
+            visible[:] = 0
+            for lane in range(16):
+                way = middle[texel]
+                cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
+                above[lane] = lane < lanes and cosine > 0
+            for turn in range(count[texel] if above.any() else 0):
+                for lane in range(16):
+                    here = min(lane, lanes - 1)
+                    base = pattern[packet + here]
+                    stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
+                    place = (base // 4 + base + texel + turn) % 4
+                    valid[lane] = -1 if above[lane] else 0
+                    for axis in range(3):
+                        ray[axis, lane] = origin[place, axis, here]
+                        ray[4 + axis, lane] = direction[texel, stratum, axis]
+                _whole_ray(ray)
+                _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                for lane in range(lanes):
+                    visible[lane] += above[lane] and ray[8, lane] > 0
             for lane in range(lanes):
                 share[texel, packet + lane] = (255 * visible[lane] + count[texel] // 2) // count[texel]
+
+
+@no_type_check
+@_cached
+def _whole_ray(ray):
+    """Fills in the fields of sixteen rays that are always the same."""
+    number = ray.view(np.uint32)
+    for lane in range(16):
+        ray[3, lane] = 0.0  # near
+        ray[7, lane] = 0.0  # time
+        ray[8, lane] = 1e37  # far; minus infinity after a hit
+        number[9, lane] = 0xFFFFFFFF  # mask
+        number[10, lane] = lane
+        number[11, lane] = 0  # flags
