@@ -10,7 +10,7 @@ from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.starts import start_points
+from jaxprt.visibility.starts import start_points, uncovered_starts
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
@@ -47,7 +47,8 @@ class DiffuseTracer:
         own, other = np.split(alike.ravel(), [count])
         self.casts = np.isin(own, other)
         self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
-        self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
+        rest = np.asarray(occluder.face)[~np.isin(other, own)]
+        self._other = _mesh(np.asarray(occluder.position), rest, np.asarray(occluder.normal))
 
     def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
         """Reflected radiance at the vertices of the surface, before subdivision."""
@@ -61,8 +62,8 @@ class DiffuseTracer:
         offset: Float32[np.ndarray, " n"],
         casting: Int[np.ndarray, "m 3"],
         vertex: Int[np.ndarray, " p"],
-    ) -> Float32[np.ndarray, "p l c"]:
-        """Reflected radiance at some vertices of the subdivided surface.
+    ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """Reflected radiance at some vertices of the subdivided surface, and whether they are covered by objects.
 
         Args:
             position: Positions of all vertices.
@@ -73,18 +74,24 @@ class DiffuseTracer:
             vertex: Indices of the vertices at which radiance is wanted.
 
         Returns:
-            Radiance for each light and color of the samples.
+            Radiance for each light and color of the samples, and a mask of the vertices that no one sees.
         """
         if not vertex.size:
-            return np.zeros((0, *self._samples.weight.shape[1:]), np.float32)
+            return np.zeros((0, *self._samples.weight.shape[1:]), np.float32), np.zeros(0, bool)
         used, index = np.unique(np.concatenate([around.ravel(), vertex]), return_inverse=True)
         mesh = _mesh(position[used], index[: around.size].reshape(-1, 3), normal[used])
         other = self._other
-        place, face = (
-            np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
+        place, face, upright = (
+            np.concatenate(pair)
+            for pair in (
+                (other.position, position),
+                (other.face, casting + len(other.position)),
+                (other.normal, normal),
+            )
         )
-        start = start_points(mesh, Occluder(_mesh(place, face)), offset=offset)
-        return self._light(start[index[around.size :]], normal[vertex])
+        start, hidden = uncovered_starts(mesh, Occluder(_mesh(place, face, upright)), offset=offset)
+        own = index[around.size :]
+        return self._light(start[own], normal[vertex]), hidden[own]
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Radiance that surfaces with the given normals reflect at the given ray origins."""
@@ -105,10 +112,9 @@ class DiffuseTracer:
         return result
 
 
-def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray | None = None) -> Mesh:
-    """A mesh in NumPy arrays, so that new shapes do not cause compilation. Fields that rays do not need are zero."""
-    upright = np.zeros_like(position) if normal is None else normal
-    fields = position.astype(np.float32), face.astype(np.int32), upright.astype(np.float32)
+def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray) -> Mesh:
+    """A mesh in NumPy arrays, so that new shapes do not cause compilation."""
+    fields = position.astype(np.float32), face.astype(np.int32), normal.astype(np.float32)
     place, corner, upright = (jax.device_put(each) for each in fields)
     region = jax.device_put(np.zeros(len(position), np.int32))
     return jax.tree.map(np.asarray, Mesh(place, corner, upright, upright, region))

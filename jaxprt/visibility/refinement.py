@@ -150,12 +150,12 @@ class _Surface:
         self._tracer, self._casts = tracer, tracer.casts
         self.light = tracer.at_vertices()
         self._key = np.zeros(0, np.int64)  # keys of the edges whose midpoints are known, in ascending order
-        self._middle = self.light[:0]
+        self._middle, self._covered = self.light[:0], np.zeros(0, bool)
         area = self._area()
         share = points * area / max(area.sum(), np.finfo(np.float64).tiny)
         # No points on sheets: there only shared vertices tell the two sides apart.
         self._points = subdivision.scatter(np.where(tracer.double, 0, share).astype(np.int64))
-        self._at_points = self._traced_points()
+        self._at_points, self._inside = self._traced_points()
         self.error = np.zeros((len(self.face), self.light.shape[1]))
         self._measure(np.arange(len(self.face)))
 
@@ -169,9 +169,12 @@ class _Surface:
         return self._area()[:, None] * self.error / np.where(scale > 0, scale, 1)
 
     def differences(self, face: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 l c"]:
-        """Radiance at the midpoints of edges, minus the mean of their endpoints."""
+        """Radiance at the midpoints of edges, minus the mean of their endpoints; 0 where an object covers them."""
         ends = _ends(face)
-        return self._middle[np.searchsorted(self._key, _key(ends))] - self.light[ends].mean(2)
+        middle = np.searchsorted(self._key, _key(ends))
+        apart = self._middle[middle] - self.light[ends].mean(2)
+        apart[self._covered[middle]] = 0
+        return apart
 
     def divide(self, division: Division) -> None:
         """Divides triangles and traces rays on the new ones."""
@@ -206,6 +209,7 @@ class _Surface:
         here = again[self._points.triangle]
         triangle, weight = self._points.triangle[here], self._points.weight[here]
         apart = self._at_points[here] - np.einsum("pk,pklc->plc", weight, self.light[self.face[triangle]])
+        apart[self._inside[here]] = 0
         total = 3 * self.error
         np.add.at(total, triangle, np.sum(apart**2, -1))
         error = (total / (3 + np.bincount(triangle, minlength=len(total)))[:, None])[changed]
@@ -225,15 +229,16 @@ class _Surface:
         casting = np.concatenate([self.face[rest], smaller[np.repeat(self._casts[changed], 4)]])
         new = np.flatnonzero(~np.isin(edge, self._key))
         offset = np.repeat(self.offset[changed], 4)
-        light = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
+        light, covered = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
+        covered = np.concatenate([self._covered, covered])
         # Drop the edges that have been cut.
         keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
         order = keep[np.argsort(key[keep])]
-        self._key, self._middle = key[order], light[order]
+        self._key, self._middle, self._covered = key[order], light[order], covered[order]
 
-    def _traced_points(self) -> Float32[np.ndarray, "p l c"]:
-        """Radiance at the points inside of triangles."""
+    def _traced_points(self) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """Radiance at the points inside of triangles, and whether an object covers them."""
         triangle, weight = self._points
         count, corner = len(self.position), self.face[triangle]
         place, normal = (
