@@ -13,6 +13,7 @@ _BACK = 1.25  # how far rays go back to the vertex, in offsets
 _STEEPEST = 0.25  # smallest cosine between the direction off the surface and the normals of faces around a vertex
 _TURNS = 16  # steps that turn this direction off faces which it grazes
 _PROBES = (4, 28)  # rays, in two passes, that must all hit backs for a vertex to count as covered
+_INWARD, _FLAT = 4.0, 0.999  # step to the inside of faces, in offsets, and smallest cosine between faces of one plane
 _SHORT = 0.02  # how far before the surface that covers an edge the rays of its covered end start, relative to the edge
 
 
@@ -53,15 +54,36 @@ def uncovered_starts(
     distance = offsets(position, np.arange(len(position))[:, None])  # of vertices without faces
     np.maximum.at(distance, face.ravel(), np.repeat(offsets(position, face) if offset is None else offset, 3))
     distance = (distance / np.maximum(steepness, _STEEPEST))[:, None].astype(np.float32)
-    start = position + distance * out
+    start = position + distance * (out + _inward(position, face, out))
     foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
     if foreign.any():
         start[foreign] = _surface(occluder, position[foreign], out[foreign], distance[foreign])
-    exact = ~foreign
+    exact, off = ~foreign, start.copy()
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    hidden = covered(occluder, start, out)
-    return _emerged(occluder, face, start, hidden), hidden
+    hidden, moved = covered(occluder, start, out), np.flatnonzero(np.any(start != off, 1))
+    # A vertex on which an object stands is inside of it before, and inside of its own surface after.
+    hidden[moved] |= covered(occluder, off[moved], out[moved])
+    return _emerged(occluder, face, np.where(hidden[:, None], off, start), hidden), hidden
+
+
+def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:
+    """Steps along the surface, in offsets, from vertices at the border of flat faces to the inside of these faces.
+
+    Where such a vertex lies in a wall that stands on its face, rays start in front of the wall, and not in it.
+    """
+    position = position.astype(np.float64)
+    toward = position[face].mean(1)[:, None] - position[face]
+    toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-30)
+    count = np.maximum(np.bincount(face.ravel(), minlength=len(position)), 1)[:, None]
+    mean = _added(face.ravel(), toward.reshape(-1, 3), len(position)) / count
+    # Faces that are not in one plane have no inside that is above all of them.
+    flat = np.ones(len(position))
+    np.minimum.at(
+        flat, face.ravel(), np.abs(np.sum(np.repeat(_face_normal(position, face), 3, 0) * out[face.ravel()], 1))
+    )
+    mean -= np.sum(mean * out, 1, keepdims=True) * out
+    return (_INWARD * np.where(flat[:, None] > _FLAT, mean, 0)).astype(np.float32)
 
 
 def covered(
