@@ -332,6 +332,8 @@ def scene_verbs() -> dict[str, Verb]:
             prt.scene.environment.rotate, light=environment(), rotation=np.eye(3, dtype=np.float32), samples=1
         ),
         "environment.background": Verb(prt.scene.environment.background, light=environment(), direction=EYE),
+        "environment.sky": Verb(prt.scene.environment.sky, light=environment(), direction=EYE, angle=0.1),
+        "environment.finer": Verb(prt.scene.environment.finer, light=environment(), size=8),
         "probes.sample": Verb(
             prt.relit.probes.sample,
             right=("materials",),

@@ -24,7 +24,6 @@ from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene
-from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
 from jaxprt.systems.protocol import Blend, System
@@ -279,10 +278,10 @@ def reflect(view: View, system: str, made: Made, stops: dict[str, float], output
     lights, camera, mesh = list(view.lights.values()), view.camera, view.scene.mesh
     direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
     pixels = image.shading_points(image.rasterize(mesh, camera, samples=4), mesh, camera)
-    way, result = image.ray_direction(camera), {}
+    result = {}
     for name, light, first, both in zip(view.lights, lights, direct, whole, strict=True):
         _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), 1.0)
-        total = float(jnp.sum(both - background(light, way) * pixels.background[..., None]))
+        total = float(jnp.sum(both - image.sky(light, camera) * pixels.background[..., None]))
         result[name] = float(jnp.sum(both - first)) / total if total > 0 else 0.0
     return result
 

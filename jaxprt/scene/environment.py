@@ -34,7 +34,6 @@ _AROUND = 4096  # smallest number of parts around the horizon into which a latlo
 _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 _STATED = {"latlong": "openexr-latlong", "cube": "openexr-cube"}  # values of the EXR attribute envmap
-_PANORAMA = "_panorama"
 
 
 class Environment(eqx.Module):
@@ -47,10 +46,10 @@ class Environment(eqx.Module):
     and not checked: a NaN then reaches every vertex that the texel lights.
 
     A light that comes from a file also remembers the file's pixels, up to 8192 columns of them, as its `panorama`:
-    `background` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
+    `sky` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
     to this object on the host and are no part of the pytree, so lights of all files share programs. What `jax.jit`,
-    `jax.vmap`, `jax.grad`, `jax.tree.map`, files of `jaxprt.files.save` and `Environment(light.radiance)` return has
-    the texels alone, and is shown by them.
+    `jax.vmap`, `jax.grad`, `jax.tree.map`, `copy`, `pickle`, `jaxprt.files.load` and `Environment(light.radiance)`
+    return has the texels alone, and is shown by them.
 
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
@@ -59,6 +58,10 @@ class Environment(eqx.Module):
         TypeError: The radiance does not consist of real numbers, or is a masked array.
         ValueError: The radiance has another shape, is not finite, or is above 1e32.
     """
+
+    # Not a field: as a leaf of the pytree, files of unlike sizes would need programs of their own, and as static data
+    # every file would. Not in __dict__ either, of which equinox makes pytrees.
+    __slots__ = ("_panorama",)
 
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
 
@@ -73,16 +76,18 @@ class Environment(eqx.Module):
     @property
     def panorama(self) -> Panorama | None:
         """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
-        return self.__dict__.get(_PANORAMA)
+        return getattr(self, "_panorama", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and pickled: the texels alone."""
+        return dict(self.__dict__)
 
 
 def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
     """A light that remembers the pixels of its file."""
     light = Environment(radiance)
     if panorama is not None:
-        # Not a field: as a leaf of the pytree the sizes of files would ask for programs of their own, and as static
-        # data each file would.
-        object.__setattr__(light, _PANORAMA, panorama)
+        object.__setattr__(light, "_panorama", panorama)  # of a new object, before others see it
     return light
 
 
@@ -308,34 +313,49 @@ def finer(light: Environment, *, size: int = 256) -> Environment:
 
 
 @require.arguments(light=_environment, direction=_direction)
-def background(
-    light: Environment, direction: Float[Array, "*b 3"], *, angle: Float[Array, "*b"] | float = 0.0
-) -> Float[Array, "*b c"]:
-    """Radiance that arrives from given directions in world coordinates: what is seen behind objects.
-
-    It is that of the pixels of the light's file (`Environment.panorama`), interpolated bilinearly; or, inside `jax.jit`
-    and without a file, that of the light's texels, interpolated bilinearly.
+@jit
+def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+    """Radiance that arrives from given directions in world coordinates, interpolated bilinearly between texels.
 
     Args:
         light: One light, not a batch.
         direction: Directions of any length, in world coordinates.
-        angle: Width in radians of the pixels of a picture that look in these directions. The pixels of the file are
-            averaged over it. Texels are not.
+
+    Returns:
+        Radiance for each direction, in the units of the light.
+    """
+    return cubemap.lookup(light.radiance, direction)
+
+
+def _angle(value: Any) -> Any:
+    require.at_least("angle", value, 0.0)
+    return value
+
+
+@require.arguments(light=_environment, direction=_direction, angle=_angle)
+def sky(
+    light: Environment, direction: Float[Array, "*b 3"], *, angle: Float[Array | np.ndarray, "*b"] | float = 0.0
+) -> Float[Array, "*b c"]:
+    """Radiance that a picture shows in given directions, from the pixels of the light's file.
+
+    It is interpolated bilinearly between pixels, and averaged over the pixels of the picture by mip maps. A light
+    without the pixels of a file (`Environment.panorama` is None) has the radiance of `background`; so has every light
+    inside `jax.jit` and for derivatives.
+
+    Args:
+        light: One light, not a batch.
+        direction: Directions of any length, in world coordinates.
+        angle: Width in radians of the pixel of the picture that looks in each direction; 0 does not average.
 
     Returns:
         Radiance for each direction, in the units of the light.
     """
     if light.panorama is None or not known(light, direction, angle):
-        return _texels_behind(light, direction)
+        return background(light, direction)
     ray = np.asarray(direction).reshape(-1, 3)
-    wide = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
-    color = light.panorama.sampled(ray, wide).astype(light.radiance.dtype)
+    width = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
+    color = light.panorama.sampled(ray, width).astype(light.radiance.dtype)
     return put(color.reshape(*direction.shape[:-1], 3))
-
-
-@jit
-def _texels_behind(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-    return cubemap.lookup(light.radiance, direction)
 
 
 def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) -> str:

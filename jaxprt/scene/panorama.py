@@ -56,10 +56,11 @@ class Panorama:
         """
         from jaxprt.scene import panorama_loops  # numba takes half a second to import
 
-        local = np.ascontiguousarray(direction @ self.turn.astype(direction.dtype))
-        wide = np.broadcast_to(np.asarray(angle, local.dtype), len(local))
-        color = np.zeros((len(local), 3), np.float32)
-        panorama_loops.sampled(*self._levels(), self.cube, local, np.ascontiguousarray(wide), color)
+        ray = np.ascontiguousarray(direction, np.float32)
+        width = np.ascontiguousarray(np.broadcast_to(np.asarray(angle, np.float32), len(ray)))
+        color = np.empty((len(ray), 3), np.float32)
+        levels = self.half, self.radiance, self.first, self.height, self.width
+        panorama_loops.sampled(*levels, self.cube, self.turn, ray, width, color)
         return color
 
     def cubemap(self, size: int) -> Float64[np.ndarray, "6 n n 3"]:
@@ -87,9 +88,6 @@ class Panorama:
         mean += excess[:, :3].reshape(mean.shape) / solid_angle
         after = (solid_angle * mean).sum((0, 1, 2))
         return mean * np.divide(self.integral, after, out=np.ones(3), where=after != 0)
-
-    def _levels(self) -> tuple[np.ndarray, ...]:
-        return self.half, self.radiance, self.first, self.height, self.width
 
 
 def from_latlong(image: Float[np.ndarray, "h w 3"], *, on_edge: bool) -> Panorama:
@@ -134,7 +132,7 @@ def _pyramid(image: np.ndarray, *, latlong: bool) -> Panorama:
         if max(shapes[-1]) <= 2:
             break
         image = _halved(image, latlong=latlong)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # patterns of infinity and NaN, which no pixel has
         radiance = (np.arange(2**16, dtype=np.uint16).view(np.float16).astype(np.float64) / scale).astype(np.float32)
     first = np.cumsum([0, *map(len, levels[:-1])])
     height, width = np.array(shapes, np.int64).T.copy()
@@ -142,7 +140,7 @@ def _pyramid(image: np.ndarray, *, latlong: bool) -> Panorama:
 
 
 def _integral(image: np.ndarray, *, latlong: bool) -> Float64[np.ndarray, " 3"]:
-    _, height, width, _ = image.shape
+    height = image.shape[1]
     if latlong:
         edge = np.sin(np.pi * (0.5 - np.arange(height + 1) / height))
         return -np.diff(edge) @ image[0].mean(1, dtype=np.float64) * 2 * np.pi
@@ -176,7 +174,7 @@ def _between(value: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def _centered(image: np.ndarray, axis: int) -> np.ndarray:
-    """Pixels of equal width in place of samples that include both ends of an axis: two for each, and one at the ends."""
+    """Pixels of one width for samples that include both ends of an axis: two for each, one at each end."""
     count = image.shape[axis]
     return image if count == 1 else np.take(image, np.arange(1, 2 * count - 1) // 2, axis)
 
