@@ -79,7 +79,7 @@ def sky(
         colors: Number of colors of the picture.
     """
     if environment.panorama is None or not known(environment, camera, ray, share):
-        return _shared(background(environment, ray), share, colors=colors)
+        return _texels_behind(environment, ray, share, colors=colors)
     cover = np.asarray(share).reshape(-1)
     seen = np.flatnonzero(cover > 0)
     color = environment.panorama.sampled(np.asarray(ray).reshape(-1, 3)[seen], pixel_angle(camera).reshape(-1)[seen])
@@ -89,7 +89,10 @@ def sky(
 
 
 @partial(jit, static_argnames="colors")
-def _shared(behind: Float[Array, "h w c"], share: Float[Array, "h w"], *, colors: int) -> Float[Array, "h w _"]:
+def _texels_behind(
+    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+) -> Float[Array, "h w _"]:
+    behind = background(environment, ray)
     share = share.astype(behind.dtype)[..., None]
     picture = jnp.where(share > 0, share * behind, 0)
     return jnp.broadcast_to(picture, (*picture.shape[:2], colors))

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
@@ -275,6 +276,59 @@ def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, sample
     turned = turned * jnp.where(after == 0, 1, before / jnp.where(after == 0, 1, after))
     batched = turned.reshape(6, n, n, -1, radiance.shape[-1])
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
+
+
+def _toward(value: Any) -> np.ndarray:
+    require.finite("direction", value)
+    direction = np.asarray(value, np.float64)
+    if direction.shape != (3,) or not direction.any():
+        raise ValueError(f"direction must be one direction, [3], and not zero, got {require.shown(value)}")
+    return direction / np.linalg.norm(direction)
+
+
+def _colors(value: Any) -> np.ndarray:
+    require.finite("radiance", value)
+    color = np.asarray(value, np.float64)
+    if color.shape not in ((), (1,), (3,)):
+        raise ValueError(f"radiance must be one number or three, got an array of shape {list(color.shape)}")
+    return np.broadcast_to(color, (3,))
+
+
+@require.arguments(
+    light=_environment,
+    direction=_toward,
+    angle=functools.partial(require.number, "angle", low=1e-4, high=np.pi),
+    radiance=_colors,
+)
+def add_disk(light: Environment, direction: ArrayLike, *, angle: float, radiance: ArrayLike) -> Environment:
+    """Adds a round lamp to distant light, such as a sun. It adds to the light that is behind it.
+
+    A lamp of irradiance E on a surface that faces it has about the radiance E / (pi angle^2). Lamps that are smaller
+    than a texel keep their flux: the texel around their center has it. Pictures show lamps as disks if the light has
+    the pixels of a file (`Environment.panorama`). Not for use inside `jax.jit`.
+
+    Args:
+        light: One light, not a batch. The result has three colors.
+        direction: Direction towards the lamp, in world coordinates.
+        angle: Angular radius in radians; the sun's is 0.00465.
+        radiance: Radiance of the lamp, one number or three colors.
+
+    Returns:
+        The light with the lamp.
+
+    Raises:
+        TypeError: The light is not an `Environment`, or the lamp does not consist of real numbers.
+        ValueError: The light is a batch or has other colors than one or three, the direction is zero, the angle is not
+            between 1e-4 and pi, or the radiance is not finite.
+    """
+    require.colors("the light", light.radiance)
+    require.array("the light's radiance", light.radiance, "6 n n c")
+    texels = panorama.disk_texels(np.asarray(direction), float(angle), light.radiance.shape[-2])
+    total = np.asarray(light.radiance, np.float64) + texels[..., None] * np.asarray(radiance)
+    pixels = light.panorama
+    if pixels is not None:
+        pixels = pixels.with_disk(np.concatenate([np.asarray(direction), [float(angle)], np.asarray(radiance)]))
+    return _with_panorama(put(total.astype(light.radiance.dtype)), pixels)
 
 
 def _direction(value: Any) -> Array:

@@ -132,6 +132,28 @@ def sampled(half, radiance, first, height, width, cube, turn, direction, angle, 
 
 @no_type_check
 @_compiled
+def add_disks(disk, direction, angle, color):
+    """Adds the radiance of round lamps to `color`, with edges as soft as the pixel around each direction is wide.
+
+    A row of `disk` is a unit direction, an angular radius in radians, and three colors of radiance.
+    """
+    for ray in range(len(direction)):
+        x, y, z = direction[ray, 0], direction[ray, 1], direction[ray, 2]
+        length = math.sqrt(x * x + y * y + z * z)
+        for k in range(len(disk)):
+            toward = (disk[k, 0] * x + disk[k, 1] * y + disk[k, 2] * z) / length
+            reach = disk[k, 3] + angle[ray]
+            if toward > 1 - reach * reach / 2:  # at most the cosine of the reach
+                off = math.acos(min(toward, 1.0)) - disk[k, 3]
+                cover = 1.0 if off <= 0 else 0.0
+                if angle[ray] > 0:
+                    cover = min(max(0.5 - off / angle[ray], 0.0), 1.0)
+                for c in range(3):
+                    color[ray, c] += cover * disk[k, 4 + c]
+
+
+@no_type_check
+@_compiled
 def _add_flux(total, size, matrix, x, y, z, area, red, green, blue):
     """Adds the flux and area of a small part of the sphere to the texel of a cubemap that it lies in after a turn."""
     face, s, t = _project(

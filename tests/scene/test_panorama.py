@@ -165,6 +165,25 @@ def test_finer_texels_hold_the_same_light():
     assert environment.finer(light, size=16) is light
 
 
+def test_a_disk_adds_its_flux_and_is_seen_where_it_turned_to():
+    light, direction, angle = sunny(), np.array([0.6, 0.64, -0.48]), 0.2
+    with_disk = environment.add_disk(light, 3 * direction, angle=angle, radiance=[1.0, 2.0, 3.0])
+    area = np.asarray(cubemap.solid_angle(size=16), np.float64)[..., None]
+    flux = (area * (np.asarray(with_disk.radiance, np.float64) - light.radiance)).sum((0, 1, 2))
+    np.testing.assert_allclose(flux, 2 * np.pi * (1 - np.cos(angle)) * np.array([1, 2, 3]), rtol=1e-3)
+    turned = environment.rotate(with_disk, jnp.asarray(TURN, jnp.float32))
+    place = jnp.asarray(np.stack([TURN @ direction, -TURN @ direction]), jnp.float32)
+    without = environment.sky(environment.rotate(light, jnp.asarray(TURN, jnp.float32)), place)
+    difference = environment.sky(turned, place, angle=0.01) - without
+    np.testing.assert_allclose(difference, [[1, 2, 3], [0, 0, 0]], atol=1e-2)
+    fine = (
+        environment.finer(turned, size=32).radiance
+        - environment.finer(environment.rotate(light, jnp.asarray(TURN, jnp.float32)), size=32).radiance
+    )
+    area = np.asarray(cubemap.solid_angle(size=32), np.float64)[..., None]
+    np.testing.assert_allclose((area * np.asarray(fine)).sum((0, 1, 2)), flux, rtol=2e-3)
+
+
 def test_lights_without_a_file_stay_as_they_are():
     made = environment.Environment(jnp.ones((6, 4, 4, 3)))
     assert made.panorama is None
