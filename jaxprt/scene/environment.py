@@ -388,7 +388,10 @@ def _angle(value: Any) -> Any:
 
 @require.arguments(light=_environment, direction=_direction, angle=_angle)
 def sky(
-    light: Environment, direction: Float[Array, "*b 3"], *, angle: Float[Array | np.ndarray, "*b"] | float = 0.0
+    light: Environment,
+    direction: Float[Array | np.ndarray, "*b 3"],
+    *,
+    angle: Float[Array | np.ndarray, "*b"] | float = 0.0,
 ) -> Float[Array, "*b c"]:
     """Radiance that a picture shows in given directions, from the pixels of the light's file.
 

@@ -277,5 +277,5 @@ def _f0(material: TexturedMaterial) -> float:
 def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
     """A light with lamps added as disks."""
     for lamp in lamps:
-        light = add_disk(light, lamp.direction, angle=lamp.angle, radiance=lamp.radiance)
+        light = add_disk(light, np.asarray(lamp.direction), angle=lamp.angle, radiance=np.asarray(lamp.radiance))
     return light

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility.buried import out_of_solids
 from jaxprt.visibility.occluder import Occluder, check, offsets
 
 # Largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal, and of the longest edge of
@@ -23,7 +24,7 @@ def start_points(
     never shadows its own front, however far the shading normal leans. The distance from these faces is what rounding
     needs there. If a vertex lies inside a simplified occluder, its rays start where they leave the occluder. If a
     vertex touches another surface, its rays start on the open side of that surface, so that light does not leak in
-    from below.
+    from below. If a vertex lies inside of another solid, its rays start where its triangles come out of it.
 
     Args:
         mesh: The mesh.
@@ -50,7 +51,7 @@ def start_points(
     exact = ~foreign
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    return start
+    return out_of_solids(mesh, occluder, start, out, distance)
 
 
 def _rows(position: np.ndarray) -> np.ndarray:
