@@ -220,7 +220,7 @@ def _page(
     return _PAGE.format(title=html.escape(title), data=data, **modules).encode()
 
 
-def _skies(session: Session, room: float) -> list[Reply | None]:
+def _skies(session: Session, room: int | float) -> list[Reply | None]:
     """Pictures of the lights for the background, as fine as their files and the room in the page permit.
 
     Args:
