@@ -148,7 +148,8 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
     alone = not told_apart(options.files)[0]
     shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
     edge = {"width": options.size, "height": options.size}
-    return View(looked, lit, orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge))
+    camera = orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge)
+    return View(looked, lit, camera, tone=options.tone)
 
 
 def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:

@@ -127,7 +127,7 @@ class PictureView(eqx.Module):
                 color = color + next(reflected)
             rows.append((row.index, finished(color, between)))
             colors = max(colors, color.shape[-1])
-        picture = canvas.sky(environment, self.ray, self.pixels.background, colors=colors)
+        picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
         for index, color in rows:
             picture = canvas.drawn(picture, self.pixels, index, color)
         return picture if self.fold == 1 else _folded(picture, fold=self.fold)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
+from jaxprt.image import automatic_exposure, rasterize
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.channels import Appearance, Shading, appearance
@@ -465,6 +466,50 @@ class RelitScene(System):
                 `jax.jit`.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, shadow=shadows, between=None)
+
+    @promoted
+    def coverage(self, camera: Camera | None = None, *, samples: int = 4) -> Float[Array, "h w"]:
+        """Fraction of each pixel that shows surfaces and not the environment: the alpha channel of `picture`.
+
+        Args:
+            camera: The camera; `self.camera` if None.
+            samples: Samples of each pixel, 4 or 1.
+
+        Raises:
+            TypeError: `camera` is not a `Camera`.
+            ValueError: `samples` is another number.
+        """
+        camera = self.camera if camera is None else camera
+        require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        fragments = rasterize(self.drawn, camera.local(self.mesh.origin), samples=samples)
+        seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
+        return seen if seen.ndim == 2 else jnp.mean(seen, -1)
+
+    @promoted
+    def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:
+        """Exposure of a picture in stops that brings the brightest surfaces near white, whatever is behind them.
+
+        `jaxprt.image.display(picture, stops=relit.exposure(picture))` shows the picture. It is
+        `jaxprt.image.automatic_exposure` with the scene's `coverage`.
+
+        Args:
+            picture: What `picture` has returned for the camera.
+            camera: The camera; `self.camera` if None.
+
+        Raises:
+            TypeError: `picture` does not consist of numbers, or `camera` is not a `Camera`.
+            ValueError: The picture has another size than the camera, or holds NaN.
+        """
+        require.array("the picture", picture, "h w 3", "h w 1")
+        camera = self.camera if camera is None else camera
+        require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"the picture must have the camera's {camera.height} x {camera.width} pixels (rows x columns), got "
+                f"{picture.shape[0]} x {picture.shape[1]}"
+            )
+        picture = jnp.broadcast_to(picture, (*picture.shape[:2], 3))
+        return automatic_exposure(picture, coverage=self.coverage(camera))
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
@@ -34,7 +35,6 @@ _AROUND = 4096  # smallest number of parts around the horizon into which a latlo
 _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 _STATED = {"latlong": "openexr-latlong", "cube": "openexr-cube"}  # values of the EXR attribute envmap
-_PANORAMA = "_panorama"
 
 
 class Environment(eqx.Module):
@@ -47,10 +47,10 @@ class Environment(eqx.Module):
     and not checked: a NaN then reaches every vertex that the texel lights.
 
     A light that comes from a file also remembers the file's pixels, up to 8192 columns of them, as its `panorama`:
-    `background` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
+    `sky` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
     to this object on the host and are no part of the pytree, so lights of all files share programs. What `jax.jit`,
-    `jax.vmap`, `jax.grad`, `jax.tree.map`, files of `jaxprt.files.save` and `Environment(light.radiance)` return has
-    the texels alone, and is shown by them.
+    `jax.vmap`, `jax.grad`, `jax.tree.map`, `copy`, `pickle`, `jaxprt.files.load` and `Environment(light.radiance)`
+    return has the texels alone, and is shown by them.
 
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
@@ -59,6 +59,10 @@ class Environment(eqx.Module):
         TypeError: The radiance does not consist of real numbers, or is a masked array.
         ValueError: The radiance has another shape, is not finite, or is above 1e32.
     """
+
+    # Not a field: as a leaf of the pytree, files of unlike sizes would need programs of their own, and as static data
+    # every file would. Not in __dict__ either, of which equinox makes pytrees.
+    __slots__ = ("_panorama",)
 
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
 
@@ -73,16 +77,18 @@ class Environment(eqx.Module):
     @property
     def panorama(self) -> Panorama | None:
         """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
-        return self.__dict__.get(_PANORAMA)
+        return getattr(self, "_panorama", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and pickled: the texels alone."""
+        return dict(self.__dict__)
 
 
 def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
     """A light that remembers the pixels of its file."""
     light = Environment(radiance)
     if panorama is not None:
-        # Not a field: as a leaf of the pytree the sizes of files would ask for programs of their own, and as static
-        # data each file would.
-        object.__setattr__(light, _PANORAMA, panorama)
+        object.__setattr__(light, "_panorama", panorama)  # of a new object, before others see it
     return light
 
 
@@ -272,6 +278,59 @@ def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, sample
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
+def _toward(value: Any) -> np.ndarray:
+    require.finite("direction", value)
+    direction = np.asarray(value, np.float64)
+    if direction.shape != (3,) or not direction.any():
+        raise ValueError(f"direction must be one direction, [3], and not zero, got {require.shown(value)}")
+    return direction / np.linalg.norm(direction)
+
+
+def _colors(value: Any) -> np.ndarray:
+    require.finite("radiance", value)
+    color = np.asarray(value, np.float64)
+    if color.shape not in ((), (1,), (3,)):
+        raise ValueError(f"radiance must be one number or three, got an array of shape {list(color.shape)}")
+    return np.broadcast_to(color, (3,))
+
+
+@require.arguments(
+    light=_environment,
+    direction=_toward,
+    angle=functools.partial(require.number, "angle", low=1e-4, high=np.pi),
+    radiance=_colors,
+)
+def add_disk(light: Environment, direction: ArrayLike, *, angle: float, radiance: ArrayLike) -> Environment:
+    """Adds a round lamp to distant light, such as a sun. It adds to the light that is behind it.
+
+    A lamp of irradiance E on a surface that faces it has about the radiance E / (pi angle^2). Lamps that are smaller
+    than a texel keep their flux: the texel around their center has it. Pictures show lamps as disks if the light has
+    the pixels of a file (`Environment.panorama`). Not for use inside `jax.jit`.
+
+    Args:
+        light: One light, not a batch. The result has three colors.
+        direction: Direction towards the lamp, in world coordinates.
+        angle: Angular radius in radians; the sun's is 0.00465.
+        radiance: Radiance of the lamp, one number or three colors.
+
+    Returns:
+        The light with the lamp.
+
+    Raises:
+        TypeError: The light is not an `Environment`, or the lamp does not consist of real numbers.
+        ValueError: The light is a batch or has other colors than one or three, the direction is zero, the angle is not
+            between 1e-4 and pi, or the radiance is not finite.
+    """
+    require.colors("the light", light.radiance)
+    require.array("the light's radiance", light.radiance, "6 n n c")
+    texels = panorama.disk_texels(np.asarray(direction), float(angle), light.radiance.shape[-2])
+    total = np.asarray(light.radiance, np.float64) + texels[..., None] * np.asarray(radiance)
+    pixels = light.panorama
+    if pixels is not None:
+        pixels = pixels.with_disk(np.concatenate([np.asarray(direction), [float(angle)], np.asarray(radiance)]))
+    return _with_panorama(put(total.astype(light.radiance.dtype)), pixels)
+
+
 def _direction(value: Any) -> Array:
     require.finite("direction", value)
     direction = require.floating(value)
@@ -308,34 +367,52 @@ def finer(light: Environment, *, size: int = 256) -> Environment:
 
 
 @require.arguments(light=_environment, direction=_direction)
-def background(
-    light: Environment, direction: Float[Array, "*b 3"], *, angle: Float[Array, "*b"] | float = 0.0
-) -> Float[Array, "*b c"]:
-    """Radiance that arrives from given directions in world coordinates: what is seen behind objects.
-
-    It is that of the pixels of the light's file (`Environment.panorama`), interpolated bilinearly; or, inside `jax.jit`
-    and without a file, that of the light's texels, interpolated bilinearly.
+@jit
+def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+    """Radiance that arrives from given directions in world coordinates, interpolated bilinearly between texels.
 
     Args:
         light: One light, not a batch.
         direction: Directions of any length, in world coordinates.
-        angle: Width in radians of the pixels of a picture that look in these directions. The pixels of the file are
-            averaged over it. Texels are not.
+
+    Returns:
+        Radiance for each direction, in the units of the light.
+    """
+    return cubemap.lookup(light.radiance, direction)
+
+
+def _angle(value: Any) -> Any:
+    require.at_least("angle", value, 0.0)
+    return value
+
+
+@require.arguments(light=_environment, direction=_direction, angle=_angle)
+def sky(
+    light: Environment,
+    direction: Float[Array | np.ndarray, "*b 3"],
+    *,
+    angle: Float[Array | np.ndarray, "*b"] | float = 0.0,
+) -> Float[Array, "*b c"]:
+    """Radiance that a picture shows in given directions, from the pixels of the light's file.
+
+    It is interpolated bilinearly between pixels, and averaged over the pixels of the picture by mip maps. A light
+    without the pixels of a file (`Environment.panorama` is None) has the radiance of `background`; so has every light
+    inside `jax.jit` and for derivatives.
+
+    Args:
+        light: One light, not a batch.
+        direction: Directions of any length, in world coordinates.
+        angle: Width in radians of the pixel of the picture that looks in each direction; 0 does not average.
 
     Returns:
         Radiance for each direction, in the units of the light.
     """
     if light.panorama is None or not known(light, direction, angle):
-        return _texels_behind(light, direction)
+        return background(light, direction)
     ray = np.asarray(direction).reshape(-1, 3)
-    wide = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
-    color = light.panorama.sampled(ray, wide).astype(light.radiance.dtype)
+    width = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
+    color = light.panorama.sampled(ray, width).astype(light.radiance.dtype)
     return put(color.reshape(*direction.shape[:-1], 3))
-
-
-@jit
-def _texels_behind(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-    return cubemap.lookup(light.radiance, direction)
 
 
 def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) -> str:

@@ -11,6 +11,7 @@ from jaxprt.sphere import cubemap as cubemaps
 WIDEST = 8192  # columns of the finest level; wider pictures are halved first
 _LARGEST = 2.0**15  # the largest value in half precision, after scaling by a power of two
 _BRIGHT = 32  # times the mean radiance: pixels that are cut into more pieces
+_RIM = 4  # parts along the edge of a texel, to resolve the rim of a lamp
 _ACROSS = 2  # pieces of pixels across the smallest texel of a cubemap, at least
 
 
@@ -29,7 +30,8 @@ class Panorama:
         width: Columns.
         cube: Whether pixels lie on six faces as in `jaxprt.sphere.cubemap`, and not in a latlong picture.
         turn: Rotation from the directions of the file to those of the world.
-        integral: Integral over the sphere, for each color.
+        integral: Integral over the sphere, for each color, without the disks.
+        disk: Round lamps in front of the pixels: unit direction in the world, angular radius in radians, and radiance.
     """
 
     half: UInt16[np.ndarray, "p 3"]
@@ -40,10 +42,22 @@ class Panorama:
     cube: bool
     turn: Float64[np.ndarray, "3 3"]
     integral: Float64[np.ndarray, " 3"]
+    disk: Float64[np.ndarray, "d 7"]
+
+    @property
+    def rows(self) -> int:
+        """Rows of a latlong picture that shows all pixels."""
+        return int(self.height[0] * (2 if self.cube else 1))
 
     def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> "Panorama":
         """The same pixels, turned: radiance from direction s arrives from direction R s afterwards."""
-        return dataclasses.replace(self, turn=np.asarray(rotation, np.float64) @ self.turn)
+        rotation = np.asarray(rotation, np.float64)
+        disk = np.concatenate([np.einsum("ij,dj->di", rotation, self.disk[:, :3]), self.disk[:, 3:]], 1)
+        return dataclasses.replace(self, turn=rotation @ self.turn, disk=disk)
+
+    def with_disk(self, disk: Float64[np.ndarray, " 7"]) -> "Panorama":
+        """The same pixels behind one more round lamp."""
+        return dataclasses.replace(self, disk=np.concatenate([self.disk, disk[None]]))
 
     def sampled(
         self, direction: Float[np.ndarray, "n 3"], angle: Float[np.ndarray, " n"] | float
@@ -56,10 +70,13 @@ class Panorama:
         """
         from jaxprt.scene import panorama_loops  # numba takes half a second to import
 
-        local = np.ascontiguousarray(direction @ self.turn.astype(direction.dtype))
-        wide = np.broadcast_to(np.asarray(angle, local.dtype), len(local))
-        color = np.zeros((len(local), 3), np.float32)
-        panorama_loops.sampled(*self._levels(), self.cube, local, np.ascontiguousarray(wide), color)
+        ray = np.ascontiguousarray(direction, np.float32)
+        width = np.ascontiguousarray(np.broadcast_to(np.asarray(angle, np.float32), len(ray)))
+        color = np.empty((len(ray), 3), np.float32)
+        levels = self.half, self.radiance, self.first, self.height, self.width
+        panorama_loops.sampled(*levels, self.cube, self.turn, ray, width, color)
+        if len(self.disk):
+            panorama_loops.add_disks(self.disk, ray, width, color)
         return color
 
     def cubemap(self, size: int) -> Float64[np.ndarray, "6 n n 3"]:
@@ -86,10 +103,27 @@ class Panorama:
         mean = (total[:, :3] / total[:, 3:]).reshape(6, size, size, 3)
         mean += excess[:, :3].reshape(mean.shape) / solid_angle
         after = (solid_angle * mean).sum((0, 1, 2))
-        return mean * np.divide(self.integral, after, out=np.ones(3), where=after != 0)
+        mean *= np.divide(self.integral, after, out=np.ones(3), where=after != 0)
+        for disk in self.disk:
+            mean += disk_texels(disk[:3], float(disk[3]), size)[..., None] * disk[4:]
+        return mean
 
-    def _levels(self) -> tuple[np.ndarray, ...]:
-        return self.half, self.radiance, self.first, self.height, self.width
+
+def disk_texels(direction: Float[np.ndarray, "3"], angle: float, size: int) -> Float64[np.ndarray, "6 n n"]:
+    """Mean radiance over the texels of a cubemap of a round lamp of radiance 1. Small lamps keep their flux too.
+
+    Args:
+        direction: Unit direction towards the lamp.
+        angle: Angular radius in radians.
+        size: Texels along the edge of a face.
+    """
+    part = np.asarray(cubemaps.direction(size=size * _RIM), np.float64)
+    area = np.asarray(cubemaps.solid_angle(size=size * _RIM), np.float64)
+    toward = np.einsum("...i,i->...", part, direction)
+    inside = area * (toward >= min(np.cos(angle), toward.max()))
+    flux = inside.reshape(6, size, _RIM, size, _RIM).sum((2, 4))
+    flux *= 2 * np.pi * (1 - np.cos(angle)) / flux.sum()
+    return flux / np.asarray(cubemaps.solid_angle(size=size), np.float64)
 
 
 def from_latlong(image: Float[np.ndarray, "h w 3"], *, on_edge: bool) -> Panorama:
@@ -134,15 +168,17 @@ def _pyramid(image: np.ndarray, *, latlong: bool) -> Panorama:
         if max(shapes[-1]) <= 2:
             break
         image = _halved(image, latlong=latlong)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # patterns of infinity and NaN, which no pixel has
         radiance = (np.arange(2**16, dtype=np.uint16).view(np.float16).astype(np.float64) / scale).astype(np.float32)
     first = np.cumsum([0, *map(len, levels[:-1])])
     height, width = np.array(shapes, np.int64).T.copy()
-    return Panorama(np.concatenate(levels), radiance, first, height, width, not latlong, np.eye(3), integral)
+    return Panorama(
+        np.concatenate(levels), radiance, first, height, width, not latlong, np.eye(3), integral, np.zeros((0, 7))
+    )
 
 
 def _integral(image: np.ndarray, *, latlong: bool) -> Float64[np.ndarray, " 3"]:
-    _, height, width, _ = image.shape
+    height = image.shape[1]
     if latlong:
         edge = np.sin(np.pi * (0.5 - np.arange(height + 1) / height))
         return -np.diff(edge) @ image[0].mean(1, dtype=np.float64) * 2 * np.pi
@@ -176,7 +212,7 @@ def _between(value: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def _centered(image: np.ndarray, axis: int) -> np.ndarray:
-    """Pixels of equal width in place of samples that include both ends of an axis: two for each, and one at the ends."""
+    """Pixels of one width for samples that include both ends of an axis: two for each, one at each end."""
     count = image.shape[axis]
     return image if count == 1 else np.take(image, np.arange(1, 2 * count - 1) // 2, axis)
 

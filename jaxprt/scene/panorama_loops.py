@@ -74,45 +74,82 @@ def _pixel(cube, height, width, face, row, column):
 
 @no_type_check
 @_compiled
-def _add_bilinear(half, radiance, first, cube, height, width, face, down, right, weight, color):
-    """Adds the radiance of a level at a point, from 0 to 1 down and to the right of a face, times a weight."""
-    row, column = down * height - 0.5, right * width - 0.5
-    top, left = int(math.floor(row)), int(math.floor(column))
-    row, column = row - top, column - left
-    for i in range(2):
-        for j in range(2):
-            part = weight * (row if i else 1 - row) * (column if j else 1 - column)
-            pixel = first + _pixel(cube, height, width, face, top + i, left + j)
-            for c in range(3):
-                color[c] += part * radiance[half[pixel, c]]
+def _radiance(half, radiance, pixel):
+    return radiance[half[pixel, 0]], radiance[half[pixel, 1]], radiance[half[pixel, 2]]
 
 
 @no_type_check
 @_compiled
-def sampled(half, radiance, first, height, width, cube, direction, angle, color):
-    """Adds the radiance from some directions to `color`: bilinear within a level and linear between two levels.
+def _bilinear(half, radiance, first, cube, height, width, face, down, right):
+    """Radiance of a level at a point, from 0 to 1 down and to the right of a face."""
+    row, column = down * height - 0.5, right * width - 0.5
+    top, left = math.floor(row), math.floor(column)
+    row, column = row - top, column - left
+    total = (0.0, 0.0, 0.0)
+    for i in range(2):
+        for j in range(2):
+            share = (row if i else 1 - row) * (column if j else 1 - column)
+            red, green, blue = _radiance(half, radiance, first + _pixel(cube, height, width, face, top + i, left + j))
+            total = total[0] + share * red, total[1] + share * green, total[2] + share * blue
+    return total
+
+
+@no_type_check
+@_compiled
+def sampled(half, radiance, first, height, width, cube, turn, direction, angle, color):
+    """Radiance from some directions: bilinear within a level and linear between two levels.
 
     `angle` is the width of the pixel around each direction in radians: the level is the one whose pixels are as wide.
     """
     last = len(first) - 1
     for ray in range(len(direction)):
-        x, y, z = direction[ray, 0], direction[ray, 1], direction[ray, 2]
+        right, up, near = direction[ray, 0], direction[ray, 1], direction[ray, 2]
+        x = turn[0, 0] * right + turn[1, 0] * up + turn[2, 0] * near
+        y = turn[0, 1] * right + turn[1, 1] * up + turn[2, 1] * near
+        z = turn[0, 2] * right + turn[1, 2] * up + turn[2, 2] * near
         if cube:
             face, s, t = _project(x, y, z)
-            right, down = (s + 1) / 2, (t + 1) / 2
+            across, down = (s + 1) / 2, (t + 1) / 2
             wide = angle[ray] * height[0] / 2 * (1 + s * s + t * t) ** 0.75
         else:
             face = 0
-            right = 0.5 - math.atan2(x, z) / (2 * math.pi)
+            across = 0.5 - math.atan2(x, z) / (2 * math.pi)
             down = 0.5 - math.atan2(y, math.sqrt(x * x + z * z)) / math.pi
             wide = angle[ray] * height[0] / math.pi
-        level = math.log2(wide) if wide > 1 else 0.0
-        level = min(level, last)
-        low = int(level)
-        share = level - low
-        for k in range(low, low + 2 if share > 0 else low + 1):
-            weight = share if k > low else 1 - share
-            _add_bilinear(half, radiance, first[k], cube, height[k], width[k], face, down, right, weight, color[ray])
+        level = min(math.log2(wide), float(last)) if wide > 1 else 0.0
+        k = int(level)
+        share = level - k
+        fine = _bilinear(half, radiance, first[k], cube, height[k], width[k], face, down, across)
+        if share > 0:
+            k += 1
+            coarse = _bilinear(half, radiance, first[k], cube, height[k], width[k], face, down, across)
+            for c in range(3):
+                color[ray, c] = (1 - share) * fine[c] + share * coarse[c]
+        else:
+            for c in range(3):
+                color[ray, c] = fine[c]
+
+
+@no_type_check
+@_compiled
+def add_disks(disk, direction, angle, color):
+    """Adds the radiance of round lamps to `color`, with edges as soft as the pixel around each direction is wide.
+
+    A row of `disk` is a unit direction, an angular radius in radians, and three colors of radiance.
+    """
+    for ray in range(len(direction)):
+        x, y, z = direction[ray, 0], direction[ray, 1], direction[ray, 2]
+        length = math.sqrt(x * x + y * y + z * z)
+        for k in range(len(disk)):
+            toward = (disk[k, 0] * x + disk[k, 1] * y + disk[k, 2] * z) / length
+            reach = disk[k, 3] + angle[ray]
+            if toward > 1 - reach * reach / 2:  # at most the cosine of the reach
+                off = math.acos(min(toward, 1.0)) - disk[k, 3]
+                cover = 1.0 if off <= 0 else 0.0
+                if angle[ray] > 0:
+                    cover = min(max(0.5 - off / angle[ray], 0.0), 1.0)
+                for c in range(3):
+                    color[ray, c] += cover * disk[k, 4 + c]
 
 
 @no_type_check
@@ -132,12 +169,6 @@ def _add_flux(total, size, matrix, x, y, z, area, red, green, blue):
     total[texel, 1] += area * green
     total[texel, 2] += area * blue
     total[texel, 3] += area
-
-
-@no_type_check
-@_compiled
-def _radiance(half, radiance, pixel):
-    return radiance[half[pixel, 0]], radiance[half[pixel, 1]], radiance[half[pixel, 2]]
 
 
 @no_type_check

@@ -10,7 +10,7 @@ from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.starts import start_points, uncovered_starts
+from jaxprt.visibility.starts import start_points, starts_and_buried
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
@@ -47,8 +47,7 @@ class DiffuseTracer:
         own, other = np.split(alike.ravel(), [count])
         self.casts = np.isin(own, other)
         self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
-        rest = np.asarray(occluder.face)[~np.isin(other, own)]
-        self._other = _mesh(np.asarray(occluder.position), rest, np.asarray(occluder.normal))
+        self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
 
     def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
         """Reflected radiance at the vertices of the surface, before subdivision."""
@@ -63,7 +62,7 @@ class DiffuseTracer:
         casting: Int[np.ndarray, "m 3"],
         vertex: Int[np.ndarray, " p"],
     ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
-        """Reflected radiance at some vertices of the subdivided surface, and whether they are covered by objects.
+        """Reflected radiance at some vertices of the subdivided surface, and whether they are inside of solids.
 
         Args:
             position: Positions of all vertices.
@@ -74,24 +73,19 @@ class DiffuseTracer:
             vertex: Indices of the vertices at which radiance is wanted.
 
         Returns:
-            Radiance for each light and color of the samples, and a mask of the vertices that no one sees.
+            Radiance for each light and color of the samples, and a mask of vertices inside of other solids.
         """
         if not vertex.size:
             return np.zeros((0, *self._samples.weight.shape[1:]), np.float32), np.zeros(0, bool)
         used, index = np.unique(np.concatenate([around.ravel(), vertex]), return_inverse=True)
         mesh = _mesh(position[used], index[: around.size].reshape(-1, 3), normal[used])
         other = self._other
-        place, face, upright = (
-            np.concatenate(pair)
-            for pair in (
-                (other.position, position),
-                (other.face, casting + len(other.position)),
-                (other.normal, normal),
-            )
+        place, face = (
+            np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
         )
-        start, hidden = uncovered_starts(mesh, Occluder(_mesh(place, face, upright)), offset=offset)
+        start, buried = starts_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
         own = index[around.size :]
-        return self._light(start[own], normal[vertex]), hidden[own]
+        return self._light(start[own], normal[vertex]), buried[own]
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Radiance that surfaces with the given normals reflect at the given ray origins."""
@@ -112,9 +106,10 @@ class DiffuseTracer:
         return result
 
 
-def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray) -> Mesh:
-    """A mesh in NumPy arrays, so that new shapes do not cause compilation."""
-    fields = position.astype(np.float32), face.astype(np.int32), normal.astype(np.float32)
+def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray | None = None) -> Mesh:
+    """A mesh in NumPy arrays, so that new shapes do not cause compilation. Fields that rays do not need are zero."""
+    upright = np.zeros_like(position) if normal is None else normal
+    fields = position.astype(np.float32), face.astype(np.int32), upright.astype(np.float32)
     place, corner, upright = (jax.device_put(each) for each in fields)
     region = jax.device_put(np.zeros(len(position), np.int32))
     return jax.tree.map(np.asarray, Mesh(place, corner, upright, upright, region))

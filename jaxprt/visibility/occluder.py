@@ -38,7 +38,6 @@ class Occluder:
         check(mesh, "occluder")
         self.position = np.asarray(mesh.position, np.float32)
         self.face = np.asarray(mesh.face, np.int32)
-        self._normal = np.asarray(mesh.normal, np.float32)
         used = self.position[self.face.ravel()]
         low, high = used.min(0), used.max(0)
         self.diagonal = float(np.linalg.norm(high.astype(np.float64) - low)) or 1.0
@@ -50,19 +49,6 @@ class Occluder:
             )
         self.offset = offsets(self.position, self.face)
         self._building = threading.Lock()
-
-    @cached_property
-    def front(self) -> Float32[np.ndarray, "f 3"]:
-        """Normal of each triangle, of any length, on the side of its shading normals, or by its winding without them.
-
-        It is zero for two coincident triangles of opposite orientation, which have no back.
-        """
-        a, b, c = np.swapaxes(self.position[self.face], 0, 1)
-        across = np.cross(b - a, c - a)
-        across /= np.maximum(np.abs(across).max(1, keepdims=True), np.finfo(np.float32).tiny)
-        side = np.sum(across * self._normal[self.face].sum(1), 1, keepdims=True)
-        sheet = np.any(self._twin != self.face, axis=1, keepdims=True)
-        return np.where(sheet, 0, np.where(side < 0, -across, across)).astype(np.float32)
 
     @cached_property
     def _single(self) -> EmbreeScene:

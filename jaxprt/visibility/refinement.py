@@ -150,7 +150,7 @@ class _Surface:
         self._tracer, self._casts = tracer, tracer.casts
         self.light = tracer.at_vertices()
         self._key = np.zeros(0, np.int64)  # keys of the edges whose midpoints are known, in ascending order
-        self._middle, self._covered = self.light[:0], np.zeros(0, bool)
+        self._middle, self._buried = self.light[:0], np.zeros(0, bool)
         area = self._area()
         share = points * area / max(area.sum(), np.finfo(np.float64).tiny)
         # No points on sheets: there only shared vertices tell the two sides apart.
@@ -169,11 +169,11 @@ class _Surface:
         return self._area()[:, None] * self.error / np.where(scale > 0, scale, 1)
 
     def differences(self, face: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 l c"]:
-        """Radiance at the midpoints of edges, minus the mean of their endpoints; 0 where an object covers them."""
+        """Radiance at the midpoints of edges, minus the mean of their endpoints; 0 inside of solids."""
         ends = _ends(face)
         middle = np.searchsorted(self._key, _key(ends))
         apart = self._middle[middle] - self.light[ends].mean(2)
-        apart[self._covered[middle]] = 0
+        apart[self._buried[middle]] = 0
         return apart
 
     def divide(self, division: Division) -> None:
@@ -229,16 +229,16 @@ class _Surface:
         casting = np.concatenate([self.face[rest], smaller[np.repeat(self._casts[changed], 4)]])
         new = np.flatnonzero(~np.isin(edge, self._key))
         offset = np.repeat(self.offset[changed], 4)
-        light, covered = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
+        light, buried = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
-        covered = np.concatenate([self._covered, covered])
+        buried = np.concatenate([self._buried, buried])
         # Drop the edges that have been cut.
         keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
         order = keep[np.argsort(key[keep])]
-        self._key, self._middle, self._covered = key[order], light[order], covered[order]
+        self._key, self._middle, self._buried = key[order], light[order], buried[order]
 
     def _traced_points(self) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
-        """Radiance at the points inside of triangles, and whether an object covers them."""
+        """Radiance at the points inside of triangles, and whether they are inside of solids."""
         triangle, weight = self._points
         count, corner = len(self.position), self.face[triangle]
         place, normal = (

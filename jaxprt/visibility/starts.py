@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from jaxprt.scene.mesh import Mesh, frames
+from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility.buried import out_of_solids
 from jaxprt.visibility.occluder import Occluder, check, offsets
 
 # Largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal, and of the longest edge of
@@ -12,9 +13,7 @@ _SINK, _SINK_EDGE = 0.02, 1.0
 _BACK = 1.25  # how far rays go back to the vertex, in offsets
 _STEEPEST = 0.25  # smallest cosine between the direction off the surface and the normals of faces around a vertex
 _TURNS = 16  # steps that turn this direction off faces which it grazes
-_PROBES = (4, 28)  # rays, in two passes, that must all hit backs for a vertex to count as covered
 _INWARD, _FLAT = 4.0, 0.999  # step to the inside of faces, in offsets, and smallest cosine between faces of one plane
-_SHORT = 0.02  # how far before the surface that covers an edge the rays of its covered end start, relative to the edge
 
 
 def start_points(
@@ -26,8 +25,7 @@ def start_points(
     never shadows its own front, however far the shading normal leans. The distance from these faces is what rounding
     needs there. If a vertex lies inside a simplified occluder, its rays start where they leave the occluder. If a
     vertex touches another surface, its rays start on the open side of that surface, so that light does not leak in
-    from below. If a vertex is covered, inside of another object, its rays start where an edge to a neighbor leaves
-    that object: no one sees the vertex, but its triangles would be dark outside of the object too.
+    from below. If a vertex lies inside of another solid, its rays start where its triangles come out of it.
 
     Args:
         mesh: The mesh.
@@ -41,13 +39,13 @@ def start_points(
         ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
             finite.
     """
-    return uncovered_starts(mesh, occluder, offset=offset, apart=apart)[0]
+    return starts_and_buried(mesh, occluder, offset=offset, apart=apart)[0]
 
 
-def uncovered_starts(
+def starts_and_buried(
     mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None, apart: bool = False
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
-    """The result of `start_points`, and whether each vertex is covered: all rays from it hit the backs of surfaces."""
+    """The result of `start_points`, and whether each vertex lies inside of another solid."""
     check(mesh, "mesh")
     position, face = np.asarray(mesh.position, np.float32), np.asarray(mesh.face)
     out, steepness = _outward(mesh, apart)
@@ -58,13 +56,10 @@ def uncovered_starts(
     foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
     if foreign.any():
         start[foreign] = _surface(occluder, position[foreign], out[foreign], distance[foreign])
-    exact, off = ~foreign, start.copy()
+    exact = ~foreign
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    hidden, moved = covered(occluder, start, out), np.flatnonzero(np.any(start != off, 1))
-    # A vertex on which an object stands is inside of it before, and inside of its own surface after.
-    hidden[moved] |= covered(occluder, off[moved], out[moved])
-    return _emerged(occluder, face, np.where(hidden[:, None], off, start), hidden), hidden
+    return out_of_solids(mesh, occluder, start, out, distance)
 
 
 def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:
@@ -84,62 +79,6 @@ def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[
     )
     mean -= np.sum(mean * out, 1, keepdims=True) * out
     return (_INWARD * np.where(flat[:, None] > _FLAT, mean, 0)).astype(np.float32)
-
-
-def covered(
-    occluder: Occluder, start: Float32[np.ndarray, "v 3"], out: Float32[np.ndarray, "v 3"]
-) -> Bool[np.ndarray, " v"]:
-    """Whether all rays from points hit backs of surfaces, as they do inside of objects.
-
-    Of two coincident faces of opposite orientation, rays hit the front.
-
-    Args:
-        occluder: Geometry that casts shadows.
-        start: Origins of the rays.
-        out: Unit vectors around which the hemispheres of the rays lie.
-    """
-    result = np.ones(len(start), bool)
-    first = 0
-    for count in _PROBES:
-        number = np.arange(first, first + count)
-        height = (number + 0.5) / sum(_PROBES)
-        turn = number * np.pi * (3 - np.sqrt(5))
-        radius = np.sqrt(1 - height**2)
-        probe = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], 1)
-        left = np.flatnonzero(result)
-        if not len(left):
-            break
-        axes = frames(out[left], np.zeros_like(out[left]))
-        way = np.einsum("pk,vki->vpi", probe, axes).reshape(-1, 3).astype(np.float32)
-        triangle, _, _ = occluder.hit(np.repeat(start[left], count, 0), way)
-        hit = np.flatnonzero(triangle >= 0)
-        back = np.zeros(len(way), bool)
-        back[hit] = np.sum(occluder.front[triangle[hit]] * way[hit], 1) > 0
-        result[left] = back.reshape(-1, count).all(1)
-        first += count
-    return result
-
-
-def _emerged(
-    occluder: Occluder, face: np.ndarray, start: np.ndarray, hidden: Bool[np.ndarray, " v"]
-) -> Float32[np.ndarray, "v 3"]:
-    """Moves the ray origins of covered vertices to where an edge to an open neighbor leaves what covers them."""
-    if not hidden.any() or hidden.all():
-        return start
-    ends = np.concatenate([face[:, [k, (k + step) % 3]] for k in range(3) for step in (1, 2)])
-    inner, outer = ends[hidden[ends[:, 0]] & ~hidden[ends[:, 1]]].T
-    if not len(inner):
-        return start
-    way = start[inner] - start[outer]
-    length = np.linalg.norm(way, axis=1)
-    triangle, distance, _ = occluder.hit(start[outer], way / np.maximum(length, 1e-30)[:, None])
-    reach = np.where(triangle >= 0, np.minimum(distance, length), length) - _SHORT * length
-    # The nearest point to the vertex, of those on its edges.
-    order = np.argsort(-(length - reach), kind="stable")
-    result = start.copy()
-    point = start[outer] + (np.maximum(reach, 0) / np.maximum(length, 1e-30))[:, None] * way
-    result[inner[order]] = point[order]
-    return result
 
 
 def _rows(position: np.ndarray) -> np.ndarray:
