@@ -3,6 +3,7 @@
 import json
 import math
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,16 @@ class Header:
                     raise self.error(f"{must}, all of them objects", f"{excerpt(item)} at {number}")
             self._items[kind] = items
         return self._items[kind]
+
+    def change(self, kind: str, fields: Mapping[int, Mapping[str, Any]]) -> None:
+        """Replaces fields of some objects of a kind, which the header itself keeps.
+
+        Args:
+            kind: The kind, such as "nodes".
+            fields: New fields by the index of the object.
+        """
+        items = self.items(kind)
+        self._items[kind] = [{**item, **fields.get(number, {})} for number, item in enumerate(items)]
 
     def index(self, kind: str, value: Any, owner: str) -> int:
         """The index of an object of a kind.

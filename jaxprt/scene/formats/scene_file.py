@@ -16,8 +16,26 @@ def _path(value: Any) -> None:
         require.path("path", value)
 
 
-@require.arguments(path=_path)
-def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = False) -> Scene:
+def _time(value: Any) -> float | None:
+    if value is None:
+        return None
+    require.number("time", value, 0.0)
+    return float(value)
+
+
+def _animation(value: Any) -> None:
+    if value is not None and not isinstance(value, str):
+        require.count("animation", value)
+
+
+@require.arguments(path=_path, time=_time, animation=_animation)
+def load_scene(
+    path: str | pathlib.Path | Mapping[str, Any],
+    *,
+    outside: bool = False,
+    time: float | None = None,
+    animation: str | int | None = None,
+) -> Scene:
     """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
     Geometry is read like `load_mesh` reads it. Each material in use becomes one part, named after the material; equal
@@ -26,7 +44,7 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
     texture coordinates, and perspective cameras, whose pictures are 512 pixels high. It supports the extensions
     KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform, KHR_mesh_quantization and
-    EXT_mesh_gpu_instancing. Meshes with a skin are in the pose that the file's joints have. Triangles without normals
+    EXT_mesh_gpu_instancing. Triangles without normals
     are flat. Compressed geometry is read from its uncompressed fallback. A file that requires another extension is
     refused. A single warning names all other features of the file (alpha modes, transmission, animations, lights,
     orthographic cameras, images that cannot be read, and so on). Primitives without material get the default material
@@ -54,6 +72,10 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     Args:
         path: The file, or the dictionary.
         outside: Whether the file may refer to files outside of its folder. Use it only for scenes that you trust.
+        time: Time in seconds from the start of an animation of a glTF file: nodes, cameras, joints and weights of morph
+            targets are where the animation has them then. Times beyond its end show the end. With None they are where
+            the file's nodes have them, which is what other viewers show before they play an animation.
+        animation: Name or index of the animation; None for the first one.
 
     Returns:
         The scene.
@@ -67,11 +89,17 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     """
     if not isinstance(outside, bool):
         raise TypeError(f"outside must be True or False, got {require.shown(outside)}")
+    if animation is not None and time is None:
+        raise ValueError(f"time must be a number of seconds where an animation is given, got None for {animation!r}")
     if isinstance(path, Mapping):
+        if time is not None:
+            raise ValueError(f"the scene must be a glTF file where a time is given, got a dictionary and {time:g} s")
         return mitsuba_dict.read(path)
     path = pathlib.Path(path)
     if path.suffix.lower() in (".glb", ".gltf"):
-        return gltf.read(path, outside=outside)
+        return gltf.read(path, outside=outside, time=time, animation=animation)
+    if time is not None:
+        raise ValueError(f"{path} must be a glTF file where a time is given, got {path.suffix.lower()!r}")
     mesh_file.check(path)
     content = mesh_file.content(path, groups=False)
     plain = mesh_colors.matte(geometry=content.geometry)
