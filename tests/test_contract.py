@@ -37,6 +37,7 @@ from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
 from jaxprt.scene.points import Points
+from jaxprt.scene.suns import Sun
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -216,6 +217,7 @@ HOST = {
     "scene.formats.gltf_extensions": "reads files",
     "scene.formats.gltf_file": "reads files",
     "scene.formats.gltf_geometry": "reads files",
+    "scene.formats.gltf_lights": "reads files",
     "scene.formats.gltf_header": "reads files",
     "scene.formats.texture_images": "stores decoded images",
     "scene.formats.gltf_morph": "reads files",
@@ -576,6 +578,9 @@ EXAMPLES = {
     "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.light_probes.light_probe": example(lambda draw: call(draw.light()), tool="Unity"),
+    "scene.suns.with_suns": example(
+        lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
+    ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),

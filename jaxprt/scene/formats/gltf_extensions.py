@@ -12,6 +12,7 @@ HONORED = {
     "KHR_texture_transform",
     "KHR_mesh_quantization",
     INSTANCING,
+    "KHR_lights_punctual",
     *_COMPRESSION,
 }
 # What jaxprt draws is right without these: the default variant, the finest level of detail, and no metadata.

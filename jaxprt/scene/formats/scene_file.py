@@ -28,13 +28,19 @@ def _animation(value: Any) -> None:
         require.count("animation", value)
 
 
-@require.arguments(path=_path, time=_time, animation=_animation)
+def _scale(value: Any) -> float:
+    require.number("lights", value, 0.0)
+    return float(value)
+
+
+@require.arguments(path=_path, time=_time, animation=_animation, lights=_scale)
 def load_scene(
     path: str | pathlib.Path | Mapping[str, Any],
     *,
     outside: bool = False,
     time: float | None = None,
     animation: str | int | None = None,
+    lights: float = 1.0,
 ) -> Scene:
     """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
@@ -76,6 +82,9 @@ def load_scene(
             targets are where the animation has them then. Times beyond its end show the end. With None they are where
             the file's nodes have them, which is what other viewers show before they play an animation.
         animation: Name or index of the animation; None for the first one.
+        lights: Factor on the lights of a glTF file (KHR_lights_punctual). One candela is taken as an intensity of 1 and
+            one lux as an irradiance of 1, as three.js takes them. Blender writes watts times 683 lm/W, so `1 / 683`
+            gives its watts back. With 0 they are left out.
 
     Returns:
         The scene.
@@ -97,7 +106,7 @@ def load_scene(
         return mitsuba_dict.read(path)
     path = pathlib.Path(path)
     if path.suffix.lower() in (".glb", ".gltf"):
-        return gltf.read(path, outside=outside, time=time, animation=animation)
+        return gltf.read(path, outside=outside, time=time, animation=animation, lights=lights)
     if time is not None:
         raise ValueError(f"{path} must be a glTF file where a time is given, got {path.suffix.lower()!r}")
     mesh_file.check(path)

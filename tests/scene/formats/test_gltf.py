@@ -382,11 +382,11 @@ def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     ]
     parts = [writer.square(material=0, COLOR_1=SQUARE) | {"targets": [{}]}, writer.square(mode=1)]
     one(*parts, writer=writer)
-    writer.header |= {"animations": [{}], "extensionsUsed": ["KHR_lights_punctual"]}
+    writer.header |= {"animations": [{}], "extensionsUsed": ["KHR_animation_pointer"]}
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(writer.write(tmp_path / "much.glb"))
     (message,) = [str(each.message) for each in caught]
-    expected = ["COLOR_1", "KHR_lights_punctual", "KHR_materials_clearcoat", "alpha mode BLEND"]
+    expected = ["COLOR_1", "KHR_animation_pointer", "KHR_materials_clearcoat", "alpha mode BLEND"]
     expected += ["doubleSided", "occlusion textures", "points and lines"]
     expected += ["textures of primitives without texture coordinates"]
     assert message.startswith(f"{tmp_path / 'much.glb'}: not supported and ignored are ")

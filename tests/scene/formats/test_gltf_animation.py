@@ -59,7 +59,7 @@ def position(path, **options) -> np.ndarray:
         return np.asarray(load_scene(path, **options).mesh.position)
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", [name for name in POSES if name != "lit.glb"])
 def test_vertices_are_where_three_js_has_them(data, tmp_path, name):
     path = moving().write(tmp_path / "moving.glb") if name == "moving.glb" else data / "foreign" / name
     assert {"rest"} < POSES[name].keys() or name == "alien.glb"

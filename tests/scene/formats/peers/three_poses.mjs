@@ -1,4 +1,5 @@
 // Prints where three.js has the vertices of a glTF file in poses of its animations, as JSON: some positions and the mean.
+// Lights, if there are any, come last.
 // npm install three@0.187 && node three_poses.mjs FILE [NAME@SECONDS ...]; without a name, the first animation.
 // three_poses.json is the output for each file of test_gltf_animation.py, by the name of the file.
 import fs from 'node:fs';
@@ -58,4 +59,14 @@ for (const pose of ['rest', ...poses]) {
   const some = all.filter((_, i) => i % step === 0);
   result[pose] = { count: all.length, mean, some: some.map((vertex) => vertex.map((x) => Number(x.toPrecision(7)))) };
 }
+const lights = [];
+gltf.scene.traverse((object) => {
+  if (!object.isLight) return;
+  const position = object.getWorldPosition(new THREE.Vector3());
+  const { name, type, intensity, angle, penumbra } = object;
+  const color = object.color.toArray();
+  const target = object.target?.getWorldPosition(new THREE.Vector3()).sub(position).normalize().toArray();
+  lights.push({ name, type, color, intensity, position: position.toArray(), target, angle, penumbra });
+});
+if (lights.length) result.lights = lights;
 console.log(JSON.stringify(result));
