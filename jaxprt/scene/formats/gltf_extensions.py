@@ -1,12 +1,12 @@
 """The extensions of glTF files that are read, and the refusal of files that cannot be read without others."""
 
-from jaxprt.scene.formats.gltf_file import MESHOPT
+from jaxprt.scene.formats import gltf_meshopt
+from jaxprt.scene.formats.gltf_draco import DRACO
 from jaxprt.scene.formats.gltf_header import Header
 
 INSTANCING = "EXT_mesh_gpu_instancing"
-DRACO = "KHR_draco_mesh_compression"
-# Compressed geometry is read from its uncompressed fallback, or refused where it is needed and has none.
-_COMPRESSION = {DRACO, *MESHOPT}
+# Compressed data are decoded where they have no uncompressed fallback.
+_COMPRESSION = {DRACO, *gltf_meshopt.NAMES, "KHR_texture_basisu", "EXT_texture_webp"}
 HONORED = {
     *(f"KHR_materials_{name}" for name in ("ior", "specular", "anisotropy", "emissive_strength")),
     "KHR_texture_transform",

@@ -11,7 +11,8 @@ import numpy as np
 from jaxprt import require
 from jaxprt.scene.formats import gltf_morph, gltf_skin
 from jaxprt.scene.formats.geometry import Geometry, instances, joined
-from jaxprt.scene.formats.gltf_extensions import DRACO, check_required
+from jaxprt.scene.formats.gltf_draco import DracoReader
+from jaxprt.scene.formats.gltf_extensions import check_required
 from jaxprt.scene.formats.gltf_file import Document, Elements
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
@@ -102,7 +103,8 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     ignored: set[str] = set()
     mesh_of = [document.index("meshes", node.item["mesh"], f"node {node.number}") for node in drawn]
     skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
-    primitives = {mesh: _primitives(document, mesh, mesh in skinned, ignored) for mesh in dict.fromkeys(mesh_of)}
+    draco = DracoReader(document)
+    primitives = {mesh: _primitives(document, mesh, mesh in skinned, draco, ignored) for mesh in dict.fromkeys(mesh_of)}
     # Meshes without triangles have no instances: these would take memory that `_check_memory` does not count.
     drawn = [node for node, mesh in zip(drawn, mesh_of, strict=True) if primitives[mesh]]
     mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
@@ -130,7 +132,7 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     return Contents(geometry, () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
 
 
-def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str]) -> list[Primitive]:
+def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader, ignored: set[str]) -> list[Primitive]:
     """The primitives of a mesh that consist of triangles. Adds the names of what is not read to `ignored`."""
     owner = f"mesh {mesh}"
     primitives = []
@@ -152,10 +154,11 @@ def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str])
             key for key in attribute if key.startswith(("TEXCOORD_", "COLOR_")) and key[-2:] not in ("_0", "_1")
         }
         ignored |= {"COLOR_1"} & set(attribute)
-        _check_uncompressed(document, item, name)
-        elements = _elements(document, attribute, skinned, name)
-        index = None
-        if "indices" in item:
+        decoded = draco.primitive(item, name) or {}
+        elements = _elements(document, attribute, skinned, decoded, name)
+        index = decoded.get("indices")
+        mode = mode if index is None else _TRIANGLES
+        if "indices" in item and index is None:
             index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)
         corners = len((index or elements["POSITION"]).value)
         if corners < 3 or (mode == _TRIANGLES and corners % 3):
@@ -167,8 +170,10 @@ def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str])
     return primitives
 
 
-def _elements(document: Document, attribute: dict[str, Any], skinned: bool, name: str) -> dict[str, Elements]:
-    """The attributes of a primitive that are read."""
+def _elements(
+    document: Document, attribute: dict[str, Any], skinned: bool, decoded: dict[str, Elements], name: str
+) -> dict[str, Elements]:
+    """The attributes of a primitive that are read; some may be decoded already."""
     if "POSITION" not in attribute:
         raise document.error("must be an undamaged glTF file", f"one that lacks 'POSITION' in {name}")
     widths = dict(_ATTRIBUTES)
@@ -180,21 +185,13 @@ def _elements(document: Document, attribute: dict[str, Any], skinned: bool, name
     for key, width in widths.items():
         if key in attribute:
             whole = key.startswith("JOINTS_")
-            elements[key] = document.accessor(attribute[key], f"{key} of {name}", *width, whole=whole)
+            owner = f"{key} of {name}"
+            document.form(attribute[key], owner, *width, whole=whole)
+            elements[key] = decoded.get(key) or document.accessor(attribute[key], owner, *width, whole=whole)
             got, count = len(elements[key].value), len(elements["POSITION"].value)
             if got != count:
                 raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(got))
     return elements
-
-
-def _check_uncompressed(document: Document, item: dict[str, Any], name: str) -> None:
-    """Refuses a primitive whose geometry is only in a compressed form. Its accessors are then without data."""
-    if DRACO not in document.object(item, "extensions", name):
-        return
-    for value in [*item["attributes"].values(), *([item["indices"]] if "indices" in item else [])]:
-        if "bufferView" not in document.item("accessors", value, name):
-            got = f"{DRACO} in {name}, and accessor {value} has no uncompressed data"
-            raise document.error("must have uncompressed geometry", got)
 
 
 def _check_memory(

@@ -16,6 +16,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
+_SOURCES = ("KHR_texture_basisu", "EXT_texture_webp")
 _SHOWN = 80  # characters of a URI in warnings
 
 
@@ -111,8 +112,9 @@ class MaterialReader:
         texture, name = document.items("textures")[index], f"texture {index}"
         moved = document.object(document.object(info, "extensions", owner), "KHR_texture_transform", owner)
         number = document.integer({**info, **moved}, "texCoord", owner, 0)
-        if "source" not in texture or number > 1:
-            self.ignored.add("textures without PNG or JPEG" if "source" not in texture else "third texture coordinates")
+        source = self._source(texture, name)
+        if source is None or number > 1:
+            self.ignored.add("textures without an image" if source is None else "third texture coordinates")
             return None
         sampler = {}
         if "sampler" in texture:
@@ -120,8 +122,16 @@ class MaterialReader:
         if sampler.get("magFilter") == _NEAREST:
             self.ignored.add("nearest filters (textures are interpolated)")
         across, up = (_WRAP.get(document.integer(sampler, side, name, 0), "repeat") for side in ("wrapS", "wrapT"))
-        image = self._pixels(texture["source"], channels, name, decoded)
+        image = self._pixels(source, channels, name, decoded)
         return None if image is None else Texture(image, self._transform(moved, owner), number, (across, up))
+
+    def _source(self, texture: dict[str, Any], name: str) -> Any:
+        """The image of a texture: PNG or JPEG, or else that of an extension; None if there is none."""
+        if "source" in texture:
+            return texture["source"]
+        extensions = self._document.object(texture, "extensions", name)
+        used = (self._document.object(extensions, key, name).get("source") for key in _SOURCES if key in extensions)
+        return next((source for source in used if source is not None), None)
 
     def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array | None:
         """Channels of an image; None, with a record of the reason, if it cannot be decoded."""

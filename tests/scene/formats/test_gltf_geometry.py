@@ -1,4 +1,4 @@
-"""Geometry of glTF files: flat normals, instances, skins, compressed geometry, and sizes."""
+"""Geometry of glTF files: flat normals, instances, skins, and sizes."""
 
 import json
 import sys
@@ -380,41 +380,6 @@ def test_a_simple_skin_stands_where_its_joints_are(data):
     # Both joints stand at (0, 1, 0) and were bound at (0.5, 1, 0).
     assert np.min(mesh.position, 0).tolist() == [-0.5, 0, 0]
     assert np.max(mesh.position, 0).tolist() == [0.5, 2, 0]
-
-
-@pytest.mark.parametrize("name", ["EXT_meshopt_compression", "KHR_meshopt_compression"])
-def test_compressed_views_are_read_from_their_fallback_or_refused_by_name(tmp_path, name):
-    writer = one((writer := Writer()).square(), writer=writer)
-    writer.header["bufferViews"][0]["extensions"] = {name: {"buffer": 0, "byteLength": 9, "count": 4}}
-    writer.header |= {"extensionsUsed": [name], "extensionsRequired": [name]}
-    path = tmp_path / "a.glb"
-    np.testing.assert_array_equal(load_scene(writer.write(path)).parts[0].mesh.position, SQUARE)
-    for buffer in ({"extensions": {name: {"fallback": True}}}, {}):
-        writer.header["bufferViews"][0] |= {"buffer": 1, "byteOffset": 0}
-        writer.header["buffers"] = [{"byteLength": 48, **buffer}]
-        for suffix in ("a.glb", "a.gltf"):
-            message = (
-                rf"{suffix} must have uncompressed geometry, got {name} in buffer view 0, whose fallback, buffer 1"
-            )
-            with pytest.raises(ValueError, match=message):
-                load_scene(writer.write(tmp_path / suffix))
-    (tmp_path / "plain.bin").write_bytes(SQUARE.tobytes())
-    writer.header["buffers"][0]["uri"] = "plain.bin"
-    np.testing.assert_array_equal(load_scene(writer.write(path)).parts[0].mesh.position, SQUARE)
-
-
-def test_draco_primitives_are_read_from_their_accessors_or_refused_by_name(tmp_path):
-    name = "KHR_draco_mesh_compression"
-    writer = one((writer := Writer()).square(), writer=writer)
-    writer.header["meshes"][0]["primitives"][0]["extensions"] = {name: {"bufferView": 0, "attributes": {"POSITION": 0}}}
-    writer.header["extensionsUsed"] = [name]
-    path = tmp_path / "a.glb"
-    np.testing.assert_array_equal(load_scene(writer.write(path)).parts[0].mesh.position, SQUARE)
-    del writer.header["accessors"][0]["bufferView"]
-    writer.header["extensionsRequired"] = [name]
-    for load in (load_scene, load_mesh):
-        with pytest.raises(ValueError, match=f"must have uncompressed geometry, got {name} in primitive 0 of mesh 0"):
-            load(writer.write(path))
 
 
 def test_zeros_without_a_buffer_view_are_bounded_by_the_size_of_the_file(tmp_path):

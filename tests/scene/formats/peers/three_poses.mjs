@@ -43,11 +43,13 @@ function positions() {
 }
 
 const result = {};
+let mixer;
 for (const pose of ['rest', ...poses]) {
+  mixer?.stopAllAction(); // puts everything back to where the file has it
   const [name, seconds] = pose.includes('@') ? pose.split('@') : ['', pose];
   if (pose !== 'rest') {
     const clip = name ? THREE.AnimationClip.findByName(gltf.animations, name) : gltf.animations[0];
-    const mixer = new THREE.AnimationMixer(gltf.scene);
+    mixer = new THREE.AnimationMixer(gltf.scene);
     const action = mixer.clipAction(clip).setLoop(THREE.LoopOnce);
     action.clampWhenFinished = true;
     action.play();
