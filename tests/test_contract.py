@@ -584,6 +584,14 @@ EXAMPLES = {
         lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
     ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
+    "brdf.coat.ClearCoat": example(
+        lambda draw: call(
+            brdf.ClearCoat(brdf.MetallicRoughness(draw.uniform(3), 0.5, 0.6), draw.uniform()[()], 0.3),
+            draw.upper(5),
+            draw.upper(5),
+        ),
+        gradient=("self",),
+    ),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
         gradient=("self",),  # The value is the same for all directions.

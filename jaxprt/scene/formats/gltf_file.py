@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxprt import require
 from jaxprt.files import inputs
 from jaxprt.scene.formats import gltf_meshopt
 from jaxprt.scene.formats.gltf_header import Header, excerpt
@@ -23,7 +22,6 @@ from jaxprt.scene.formats.gltf_header import Header, excerpt
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
-_SLACK = 64  # bytes of compressed data besides which a header can be short
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")  # of a URI that is not relative
 
 
@@ -93,7 +91,6 @@ class Document(Header):
         self._outside = outside
         self._buffer: dict[int, bytes] = {}
         self._view: dict[int, tuple[memoryview, int]] = {}
-        self._decoded = 0
         text = content = inputs.content(path, "a glTF file")
         self._length = len(content)
         self._chunk: bytes | None = None
@@ -151,20 +148,6 @@ class Document(Header):
         dtype = np.dtype(_COMPONENT[kind])
         normalized = self.boolean(item, "normalized", name) and dtype.kind in "iu"
         return Form(item, name, dtype, count, width, int(np.iinfo(dtype).max) if normalized else 0)
-
-    def decoding(self, size: int, length: int, name: str, *, most: int) -> None:
-        """Refuses compressed data that would become larger than they can, or than memory. Counts what is decoded.
-
-        Args:
-            size: Bytes that the header states for the decoded data.
-            length: Bytes of the compressed data.
-            name: The compressed data, for messages.
-            most: Decoded bytes that one compressed byte can hold at most.
-        """
-        if size > most * (length + _SLACK):
-            raise self.error(f"must have at most {most} decoded bytes for each byte of {name}", f"{size} for {length}")
-        self._decoded += size
-        require.memory(f"the decoded data of {self.path}", self._decoded, "load a smaller scene")
 
     def image(self, value: Any, owner: str) -> bytes:
         """The bytes of an image, embedded or in a separate file."""

@@ -47,15 +47,19 @@ class MaterialReader:
         owner = f"material {index}"
         item = self._document.item("materials", index, owner)
         extensions = self._document.object(item, "extensions", owner)
-        ior, specular, brushed, emissive = (
+        ior, specular, brushed, emissive, coat, passing = (
             self._document.object(extensions, f"KHR_materials_{name}", owner)
-            for name in ("ior", "specular", "anisotropy", "emissive_strength")
+            for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "transmission")
         )
         pbr = self._document.object(item, "pbrMetallicRoughness", owner)
         glow = self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner)
         glow = glow * self._number(emissive, "emissiveStrength", 1.0, owner)
         normal = self._document.object(item, "normalTexture", owner)
         self._note(item, owner)
+        if "clearcoatNormalTexture" in coat:
+            self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
+        if passing.get("transmissionFactor", 0) != 0:
+            self.ignored.add("what is seen through transmitting surfaces (their reflection is read)")
         field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
@@ -69,6 +73,9 @@ class MaterialReader:
             "anisotropy": self._number(brushed, "anisotropyStrength", 0.0, owner),
             "rotation": self._number(brushed, "anisotropyRotation", 0.0, owner),
             "normal_scale": self._number(normal, "scale", 1.0, owner),
+            "clearcoat": self._number(coat, "clearcoatFactor", 0.0, owner),
+            "clearcoat_roughness": self._number(coat, "clearcoatRoughnessFactor", 0.0, owner),
+            "transmission": self._number(passing, "transmissionFactor", 0.0, owner),
         }
         colors = (0, 1, 2)
         field |= {
@@ -80,6 +87,9 @@ class MaterialReader:
             "specular_color_texture": self._texture(specular, "specularColorTexture", colors, owner, decoded=True),
             "anisotropy_texture": self._texture(brushed, "anisotropyTexture", colors, owner),
             "normal_texture": self._texture(item, "normalTexture", colors, owner),
+            "clearcoat_texture": self._texture(coat, "clearcoatTexture", (0,), owner),
+            "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
+            "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
         }
         try:
             return TexturedMaterial(**field)

@@ -1,11 +1,8 @@
 """Buffer views of glTF files that meshoptimizer compressed: EXT_meshopt_compression and KHR_meshopt_compression."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jaxprt.scene.formats.gltf_header import Header, excerpt
-
-if TYPE_CHECKING:
-    from jaxprt.scene.formats.gltf_file import Document
 
 NAMES = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _MODES = ("ATTRIBUTES", "TRIANGLES", "INDICES")
@@ -29,9 +26,7 @@ def is_fallback(header: Header, buffer: dict[str, Any], name: str) -> bool:
     return stated and "uri" not in buffer
 
 
-def decoded(
-    document: "Document", view: dict[str, Any], extension: dict[str, Any], content: memoryview, name: str
-) -> bytes:
+def decoded(document: Header, view: dict[str, Any], extension: dict[str, Any], content: memoryview, name: str) -> bytes:
     """The bytes of a compressed buffer view.
 
     Args:

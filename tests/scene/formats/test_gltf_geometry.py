@@ -184,7 +184,7 @@ def test_damaged_instances_are_refused(tmp_path, attribute, message):
 def test_required_extensions_that_are_not_known_are_refused_by_name_and_optional_ones_are_warned_of(tmp_path):
     writer = one((writer := Writer()).square(), writer=writer)
     path = tmp_path / "a.glb"
-    for name in ("KHR_lights_punctual", "EXT_texture_webp", "KHR_materials_unlit", "VENDOR_anything"):
+    for name in ("EXT_lights_image_based", "EXT_texture_avif", "VENDOR_anything"):
         writer.header |= {"extensionsUsed": [name, name], "extensionsRequired": [name]}
         with pytest.raises(ValueError, match=f"a.glb must not require extensions other than .*, got {name}$"):
             load_scene(writer.write(path))
@@ -192,11 +192,19 @@ def test_required_extensions_that_are_not_known_are_refused_by_name_and_optional
         with pytest.warns(UserWarning, match=f"a.glb: not supported and ignored are {name}$"):
             load_scene(writer.write(path))
     # Geometry alone needs no textures or lights, but it may need what nobody knows.
-    writer.header["extensionsRequired"] = ["KHR_lights_punctual", "EXT_texture_webp", "KHR_materials_unlit"]
+    writer.header["extensionsRequired"] = ["EXT_lights_image_based", "EXT_texture_avif", "KHR_materials_unlit"]
     assert len(load_mesh(writer.write(path)).position) == 4
     writer.header["extensionsRequired"] = ["VENDOR_anything"]
     with pytest.raises(ValueError, match="VENDOR_anything"):
         load_mesh(writer.write(path))
+    # Other looks of materials are named where a material has them.
+    writer.header |= {"extensionsUsed": ["KHR_materials_unlit"], "extensionsRequired": ["KHR_materials_unlit"]}
+    assert len(load_scene(writer.write(path)).parts) == 1
+    writer.header["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
+    writer.header["meshes"][0]["primitives"][0]["material"] = 0
+    with pytest.warns(UserWarning, match=r"a\.glb: not supported and ignored are KHR_materials_unlit$"):
+        load_scene(writer.write(path))
+    del writer.header["meshes"][0]["primitives"][0]["material"]
     # What is read without them is right.
     writer.header |= {"extensionsUsed": [], "extensionsRequired": ["KHR_mesh_quantization", "KHR_texture_transform"]}
     assert len(load_scene(writer.write(path)).parts) == 1
