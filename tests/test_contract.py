@@ -117,6 +117,7 @@ HOST = {
     "decompose.tucker.hooi": "the same",
     "decompose.tucker.ranks_for": "chooses by values, on the host",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
+    "brdf.coat.coat_reflectance": "one formula for NumPy and JAX arrays",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
     "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
@@ -586,11 +587,17 @@ EXAMPLES = {
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
     "brdf.coat.ClearCoat": example(
         lambda draw: call(
-            brdf.ClearCoat(brdf.MetallicRoughness(draw.uniform(3), 0.5, 0.6), draw.uniform()[()], 0.3),
+            brdf.ClearCoat(
+                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(), draw.uniform()
+            ),
             draw.upper(5),
             draw.upper(5),
         ),
-        gradient=("self",),
+    ),
+    "brdf.coat.CoatedModel": example(
+        lambda draw: call(
+            brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True), draw.upper(5), draw.upper(5)
+        ),
     ),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
