@@ -17,7 +17,6 @@ from jaxprt.systems import axes, bright_texels, harmonic, lobe
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.protocol import System
 from jaxprt.view import matrices
-from jaxprt.view.uncoated import without_coats
 
 _LIGHT = 32  # texels along a face's edge of the light that lobes are looked up in
 _TEXELS = 64  # number of brightest texels that are summed one by one
@@ -83,9 +82,8 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
         texels: Whether the brightest texels of the light are summed one by one, on the parts that support it.
         degree: Highest degree of the transfer matrices; None keeps their degree.
     """
-    parts, shadings, bare = without_coats(scene.scene, scene.shading, _systems(scene))
-    whole = [axes.mapped(each, lambda _, leaf: put(leaf)) for each in bare]
-    systems = [_exported(part.name, each) for part, each in zip(parts.parts, whole, strict=True)]
+    whole = [axes.mapped(each, lambda _, leaf: put(leaf)) for each in _systems(scene)]
+    systems = [_exported(part.name, each) for part, each in zip(scene.scene.parts, whole, strict=True)]
     vectors = [vectors_of(each) for each in systems]
     visible = [matrices.truncated(each, degree) for each in visibility_of(scene)]
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
@@ -106,11 +104,11 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
         made.append(CoarseSystem(seen, system.brdf))
     bits = bits_of(scene) if texels else None
     if bits is not None:
-        pairs = zip(made, whole, shadings, bits, strict=True)
+        pairs = zip(made, whole, scene.shading, bits, strict=True)
         made = [each if own is None else _with_texels(each, full, shading) for each, full, shading, own in pairs]
     counts = [len(part.mesh.position) for part in scene.scene.parts]
     alone = [[number] for number in range(len(counts))]
-    return RelitScene(parts, shadings, Place.of(counts, alone, [False] * len(counts)), made)
+    return RelitScene(scene.scene, scene.shading, Place.of(counts, alone, [False] * len(counts)), made)
 
 
 def _systems(scene: RelitScene) -> list[System]:

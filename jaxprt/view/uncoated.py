@@ -9,32 +9,32 @@ import jax.numpy as jnp
 from jaxprt.brdf.coat import ClearCoat
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit.channels import Shading
-from jaxprt.scene import Part, Scene, TexturedMaterial
+from jaxprt.relit.groups import Place
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Part, TexturedMaterial
 from jaxprt.systems import bright_texels, harmonic, lobe, standard
 from jaxprt.systems.protocol import Blend
 from jaxprt.systems.standard.coated import BASE
 
 
-def without_coats(scene: Scene, shadings: Any, systems: Any) -> tuple[Scene, list[Shading], list[Any]]:
-    """The parts of a relit scene with their bases alone, with one warning that names the parts with a coat.
+def without_coats(scene: RelitScene) -> RelitScene:
+    """A relit scene in direct light with the bases of its coated parts, with one warning that names these parts.
 
-    Args:
-        scene: The scene.
-        shadings: The `Shading` of each part.
-        systems: The system of each part.
+    A scene without clear coats is returned as it is.
     """
-    coated = [shading.table is standard.COATED for shading in shadings]
+    coated = [shading.table is standard.COATED for shading in scene.shading]
     if not any(coated):
-        return scene, list(shadings), list(systems)
-    names = ", ".join(repr(part.name) for part, has in zip(scene.parts, coated, strict=True) if has)
+        return scene
+    old = scene.scene
+    names = ", ".join(repr(part.name) for part, has in zip(old.parts, coated, strict=True) if has)
     warnings.warn(f"the page shows these parts without their clear coats: {names}", stacklevel=3)
-    parts = [_bare(part) if has else part for part, has in zip(scene.parts, coated, strict=True)]
-    pairs = list(zip(shadings, systems, coated, strict=True))
-    return (
-        dataclasses.replace(scene, parts=parts),
-        [_base(shading) if has else shading for shading, _, has in pairs],
-        [_alone(system) if has else system for _, system, has in pairs],
-    )
+    parts = [_bare(part) if has else part for part, has in zip(old.parts, coated, strict=True)]
+    shadings = [_base(each) if has else each for each, has in zip(scene.shading, coated, strict=True)]
+    systems = [scene.part_system(number) for number in range(len(parts))]
+    systems = [_alone(each) if has else each for each, has in zip(systems, coated, strict=True)]
+    counts, alone = [len(part.mesh.position) for part in parts], [[number] for number in range(len(parts))]
+    place = Place.of(counts, alone, [False] * len(counts))
+    return RelitScene(dataclasses.replace(old, parts=parts), shadings, place, systems)
 
 
 def _bare(part: Part) -> Part:

@@ -146,17 +146,15 @@ def test_relit_scenes_with_coats_are_the_exact_sum():
 
 
 def test_pages_show_the_base_with_a_warning():
-    scene = spheres(COATED)
-    shading = channels.of_part(scene.parts[0])
-    visible = prt.visibility.precompute(scene.parts[0].mesh, size=16, progress=False)
-    system = prt.lobe.LobeSystem(prt.lobe.compress(visible), standard.COATED.lobes(4))
+    relit = prt.precompute(spheres(COATED), system="lobe", size=16, progress=False)
     with pytest.warns(UserWarning, match="shows these parts without their clear coats: 'ball 0'"):
-        plain, shadings, systems = without_coats(scene, [shading], [system])
+        bare = without_coats(relit)
     alone = channels.of_part(spheres(dataclasses.replace(COATED, clearcoat=0.0)).parts[0])
-    np.testing.assert_allclose(shadings[0].blend.weight, alone.blend.weight, rtol=1e-4, atol=1e-6)
-    assert float(plain.parts[0].material.clearcoat) == 0
-    assert shadings[0].table is standard.METALLIC_ROUGHNESS
-    assert systems[0].brdf is standard.METALLIC_ROUGHNESS.lobes(4)
+    np.testing.assert_allclose(bare.shading[0].blend.weight, alone.blend.weight, rtol=1e-4, atol=1e-6)
+    assert float(bare.scene.parts[0].material.clearcoat) == 0
+    assert bare.shading[0].table is standard.METALLIC_ROUGHNESS
+    assert bare.part_system(0).system.brdf.lobes == relit.part_system(0).system.brdf.lobes // 2
+    assert without_coats(bare) is bare
 
 
 def test_materials_without_standard_tables_lose_their_coat_with_a_warning():
