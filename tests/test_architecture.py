@@ -51,6 +51,9 @@ ONLY_IN = {
     "IPython": "jaxprt.view.widget",
     "anywidget": "jaxprt.view.widget",
     "traitlets": "jaxprt.view.widget",
+    "DracoPy": "jaxprt.scene.formats.gltf_draco",
+    "meshopt": "jaxprt.scene.formats.gltf_meshopt",
+    "opengl_basisu": "jaxprt.files.ktx2",
     "fast_simplification": "jaxprt.scene.occluder",
 }
 

@@ -37,6 +37,7 @@ from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
 from jaxprt.scene.points import Points
+from jaxprt.scene.suns import Sun
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -116,6 +117,7 @@ HOST = {
     "decompose.tucker.hooi": "the same",
     "decompose.tucker.ranks_for": "chooses by values, on the host",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
+    "brdf.coat.coat_reflectance": "one formula for NumPy and JAX arrays",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
     "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
@@ -212,11 +214,16 @@ HOST = {
     "scene.formats.ply_table": "reads files",
     "scene.formats.stl": "reads files",
     "scene.formats.text": "reads files",
+    "scene.formats.gltf_animation": "reads files",
+    "scene.formats.gltf_draco": "reads files",
     "scene.formats.gltf_extensions": "reads files",
     "scene.formats.gltf_file": "reads files",
     "scene.formats.gltf_geometry": "reads files",
+    "scene.formats.gltf_lights": "reads files",
     "scene.formats.gltf_header": "reads files",
     "scene.formats.texture_images": "stores decoded images",
+    "scene.formats.gltf_meshopt": "reads files",
+    "scene.formats.gltf_morph": "reads files",
     "scene.formats.gltf_nodes": "reads files",
     "scene.formats.gltf_skin": "reads files",
     "scene.formats.gltf": "reads files",
@@ -581,7 +588,24 @@ EXAMPLES = {
     "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.light_probes.light_probe": example(lambda draw: call(draw.light()), tool="Unity"),
+    "scene.suns.with_suns": example(
+        lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
+    ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
+    "brdf.coat.ClearCoat": example(
+        lambda draw: call(
+            brdf.ClearCoat(
+                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(), draw.uniform()
+            ),
+            draw.upper(5),
+            draw.upper(5),
+        ),
+    ),
+    "brdf.coat.CoatedModel": example(
+        lambda draw: call(
+            brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True), draw.upper(5), draw.upper(5)
+        ),
+    ),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
         gradient=("self",),  # The value is the same for all directions.

@@ -452,7 +452,8 @@ def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -
     if rough is None:
         return look
     with compile_time(rough, points):
-        return look._replace(log_roughness=rough.at(points).log_roughness)
+        plain = rough.at(points)
+    return look._replace(log_roughness=plain.log_roughness, log_coat=plain.log_coat)
 
 
 @jit

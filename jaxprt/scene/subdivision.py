@@ -4,6 +4,7 @@ Edges are identified by the positions of their endpoints. Both sides of a seam a
 and so are parts of a scene that share a border. Subdivision opens no gaps in the surface.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -227,7 +228,7 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
     parts = [_subdivided_part(*each) for each in zip(scene.parts, parents, faces, strict=True)]
-    return Scene(parts, scene.cameras, scene.environments, scene.point_lights)
+    return dataclasses.replace(scene, parts=parts)
 
 
 def divide(scene: Scene, *, edge: float) -> Scene:
