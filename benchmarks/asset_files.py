@@ -57,7 +57,10 @@ class Map:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """What a file says about a surface. Factors multiply maps; colors are linear."""
+    """What a file says about a surface. Factors multiply maps; colors are linear.
+
+    Alpha covers by itself, or where it reaches `cutoff`.
+    """
 
     base_color: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(3))
     alpha: float = 1.0
@@ -67,7 +70,7 @@ class Material:
     specular: float = 1.0
     emissive: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
     normal_scale: float = 1.0
-    cutoff: float | None = None  # of alpha; None covers by alpha itself
+    cutoff: float | None = None
     opaque: bool = True
     double_sided: bool = False
     base_map: Map | None = None
@@ -134,6 +137,7 @@ class GltfFile:
         self._buffers: dict[int, bytes] = {}
         self._images: dict[int, np.ndarray] = {}
         self._worlds: dict[int, np.ndarray] = {}
+        self._materials: dict[int | None, Material] = {}
 
     def surfaces(self) -> Iterator[Surface]:
         """Primitives of all nodes of the scene."""
@@ -225,7 +229,9 @@ class GltfFile:
             color = np.ones((len(given), 4))
             color[:, : given.shape[1]] = given
         texture = {int(name[9:]): value for name, value in values.items() if name.startswith("TEXCOORD_")}
-        return Surface(placed, face, normal, texture, color, self._material(material))
+        if material not in self._materials:
+            self._materials[material] = self._material(material)
+        return Surface(placed, face, normal, texture, color, self._materials[material])
 
     def _material(self, index: int | None) -> Material:
         if index is None:
@@ -504,3 +510,54 @@ def _phong(value: dict[str, str], folder: pathlib.Path) -> Material:
         normal_map=image("norm", srgb=False),
         unjudged=tuple(sorted({"map_d", "map_Bump", "bump"} & value.keys())),
     )
+
+
+def write_small(path: pathlib.Path) -> None:
+    """Writes a small glTF file: a checkered ball on a ground with two sides and colors of vertices."""
+    rings, sectors = 8, 12
+    v, u = np.meshgrid(np.linspace(0, 1, rings + 1), np.linspace(0, 1, sectors + 1), indexing="ij")
+    across, turn = np.sin(np.pi * v), 2 * np.pi * u
+    ball = np.stack([across * np.sin(turn), np.cos(np.pi * v), across * np.cos(turn)], -1).reshape(-1, 3)
+    first = (np.arange(rings)[:, None] * (sectors + 1) + np.arange(sectors)).ravel()
+    below = first + sectors + 1
+    face = np.stack([first, below, below + 1, first, below + 1, first + 1], 1).ravel()
+    ground = np.array([[-2, 0, 2], [2, 0, 2], [2, 0, -2], [-2, 0, -2]])
+    arrays = [
+        *((ball, "VEC3", 5126), (np.stack([u, v], -1).reshape(-1, 2), "VEC2", 5126), (face, "SCALAR", 5123)),
+        *((ground, "VEC3", 5126), (np.array([[0.8, 0.2, 0.2]] * 2 + [[0.2, 0.2, 0.8]] * 2), "VEC3", 5126)),
+        (np.array([0, 1, 2, 0, 2, 3]), "SCALAR", 5123),
+    ]
+    check = PIL.Image.fromarray(np.uint8([[[230, 230, 230], [90, 60, 30]], [[90, 60, 30], [230, 230, 230]]]))
+    stream = io.BytesIO()
+    check.resize((64, 32), PIL.Image.Resampling.NEAREST).save(stream, "PNG")
+    content, views, accessors = b"", [], []
+    for values, kind, component in arrays:
+        data = np.ascontiguousarray(values, _KINDS[component]).tobytes()
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(data)})
+        accessor = {"bufferView": len(accessors), "componentType": component, "type": kind}
+        limits = {"min": np.min(values, 0).tolist(), "max": np.max(values, 0).tolist()} if kind == "VEC3" else {}
+        accessors.append({**accessor, "count": len(values), **limits})
+        content += data + bytes(-len(data) % 4)
+
+    def address(kind: str, data: bytes) -> str:
+        return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+    ball_of = {"attributes": {"POSITION": 0, "NORMAL": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+    ground_of = {"attributes": {"POSITION": 3, "COLOR_0": 4}, "indices": 5, "material": 1}
+    rough = {"metallicFactor": 0, "roughnessFactor": 0.6}
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0, "translation": [0, 1, 0]}, {"mesh": 1, "scale": [1, 1, -1]}],
+        "meshes": [{"primitives": [ball_of]}, {"primitives": [ground_of]}],
+        "materials": [
+            {"pbrMetallicRoughness": {**rough, "baseColorTexture": {"index": 0}}},
+            {"pbrMetallicRoughness": rough, "doubleSided": True},
+        ],
+        "textures": [{"source": 0}],
+        "images": [{"uri": address("image/png", stream.getvalue())}],
+        "buffers": [{"byteLength": len(content), "uri": address("application/octet-stream", content)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    path.write_text(json.dumps(document))

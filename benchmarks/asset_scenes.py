@@ -37,8 +37,9 @@ def load(surfaces: Sequence[Surface], light: pathlib.Path, camera: Any, *, model
     mitsuba.set_variant("llvm_ad_rgb" if path_tracing.available() else "scalar_rgb")
     sensor = path_tracing.sensor(mitsuba, camera)
     sensor["film"]["pixel_format"] = "rgba"
+    materials: dict[tuple, Any] = {}
     shapes = {
-        f"surface{number}": _shape(mitsuba, side, model)
+        f"surface{number}": _shape(mitsuba, side, model, materials)
         for number, side in enumerate(side for surface in surfaces for side in _sides(surface))
     }
     world = {"type": "scene", "sensor": sensor, "light": emitter(mitsuba, light), **shapes}
@@ -84,11 +85,15 @@ def _sides(surface: Surface) -> list[Surface]:
     return [part for part in parts if len(part.face)]
 
 
-def _shape(mitsuba: Any, surface: Surface, model: str) -> Any:
-    """Mitsuba's mesh with its material."""
+def _shape(mitsuba: Any, surface: Surface, model: str, materials: dict[tuple, Any]) -> Any:
+    """Mitsuba's mesh with its material, which surfaces share: Dr.Jit traces each of them."""
     material, flat = surface.material, surface.normal is None
+    key = id(material), surface.color is None, tuple(sorted(surface.texture))
+    if key not in materials:
+        material_of = _bsdf(mitsuba, surface, model)
+        materials[key] = mitsuba.load_dict(material_of) if isinstance(material_of, dict) else material_of
     props = mitsuba.Properties()
-    props["bsdf"] = mitsuba.load_dict(_bsdf(mitsuba, surface, model))
+    props["bsdf"] = materials[key]
     if material.emissive.any():
         props["emitter"] = mitsuba.load_dict({"type": "area", "radiance": _glow(mitsuba, surface)})
     count, uv = len(surface.position), _coordinates(surface)
@@ -127,7 +132,7 @@ def unjudged(surface: Surface) -> set[str]:
     return {*surface.material.unjudged, *missing, *mixed}
 
 
-def _bsdf(mitsuba: Any, surface: Surface, model: str) -> dict[str, Any]:
+def _bsdf(mitsuba: Any, surface: Surface, model: str) -> Any:
     """Mitsuba's material, or what loads as one."""
     material = surface.material
     base = _product(mitsuba, surface, material.base_color, material.base_map, _COLOR)
@@ -147,12 +152,14 @@ def _bsdf(mitsuba: Any, surface: Surface, model: str) -> dict[str, Any]:
         }
         core = plugins.metallic_roughness(parameters)
     if material.normal_map is not None and material.normal_map.coordinates in surface.texture:
-        core = {"type": "normalmap", "normalmap": _normal(mitsuba, material), "inner": core}
+        # Mitsuba's softened terminator is not part of the format.
+        options = {"use_shadowing_function": False}
+        core = {"type": "normalmap", "normalmap": _normal(mitsuba, material), "inner": core, **options}
     if material.double_sided:
         core = {"type": "twosided", "inner": core}
     if not material.opaque:
         core = {"type": "mask", "opacity": _opacity(mitsuba, surface), "inner": core}
-    return core if isinstance(core, dict) else {"type": "twosided", "inner": core}
+    return core
 
 
 def _constant(mitsuba: Any, value: np.ndarray | float) -> Any:

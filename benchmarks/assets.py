@@ -91,6 +91,20 @@ def _asked(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> tu
     return files, lights, {name: getattr(arguments, name) for name in names}
 
 
+def _quick(folder: pathlib.Path) -> tuple[list, list, dict[str, Any]]:
+    """A small file and a small light for `judge`, which are written into a folder."""
+    from jaxprt import files
+
+    file, light = folder / "small.gltf", folder / "small.exr"
+    asset_files.write_small(file)
+    radiance = np.full((16, 32, 3), 0.2, np.float32)
+    radiance[:8] = 1.0
+    radiance[3:5, 18:22] = 20.0
+    files.write_exr(light, radiance)
+    options = {"edge": 32, "samples": 64, "model": asset_scenes.MODELS[0], "warm": True, "limit": LIMIT, "size": 16}
+    return [file], [light], {**options, "store": None, "pictures": folder}
+
+
 def found(folders: Sequence[pathlib.Path]) -> list[pathlib.Path]:
     """glTF and OBJ files of folders, by name; files as they are."""
     result = []
