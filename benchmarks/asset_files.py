@@ -2,7 +2,7 @@
 
 A file becomes surfaces: triangles in world space with the material that the file gives them. Skins have the pose of the
 file's nodes, and morph targets their default weights. Images are decoded by Pillow. Section numbers are those of the
-glTF 2.0 specification. What a reader does not understand it raises as `Unreadable` if the geometry needs it; of a
+glTF 2.0 specification. What a reader does not understand it raises as `UnreadableError` if the geometry needs it; of a
 material it is named in `Material.unjudged`.
 """
 
@@ -28,7 +28,7 @@ _JUDGED = ("ior", "specular", "emissive_strength")  # extensions KHR_materials_ 
 _HARMLESS = ("KHR_materials_variants",)
 
 
-class Unreadable(ValueError):
+class UnreadableError(ValueError):
     """The judge does not understand a file."""
 
 
@@ -113,12 +113,12 @@ def read(path: pathlib.Path) -> list[Surface]:
     """Surfaces of a glTF, GLB or OBJ file.
 
     Raises:
-        Unreadable: It has no triangles, or geometry that the judge does not understand.
+        UnreadableError: It has no triangles, or geometry that the judge does not understand.
     """
     surfaces = _obj(path) if path.suffix.lower() == ".obj" else list(GltfFile(path).surfaces())
     surfaces = [surface for surface in surfaces if len(surface.face)]
     if not surfaces:
-        raise Unreadable(f"{path.name} has no triangles")
+        raise UnreadableError(f"{path.name} has no triangles")
     return surfaces
 
 
@@ -133,7 +133,7 @@ class GltfFile:
         self.json: dict[str, Any] = json.loads(content.decode("utf-8-sig"))
         compressed = {"EXT_meshopt_compression", "KHR_meshopt_compression"} & set(self.json.get("extensionsUsed", ()))
         if compressed:
-            raise Unreadable(f"{path.name} is compressed by {', '.join(compressed)}")
+            raise UnreadableError(f"{path.name} is compressed by {', '.join(compressed)}")
         self._buffers: dict[int, bytes] = {}
         self._images: dict[int, np.ndarray] = {}
         self._worlds: dict[int, np.ndarray] = {}
@@ -190,7 +190,7 @@ class GltfFile:
     def _attributes(self, primitive: dict[str, Any]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Attributes by name, and triangles."""
         if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
-            raise Unreadable("the geometry is compressed by KHR_draco_mesh_compression")
+            raise UnreadableError("the geometry is compressed by KHR_draco_mesh_compression")
         values = {name: self.accessor(index) for name, index in primitive["attributes"].items()}
         count = len(values["POSITION"])
         index = self.accessor(primitive["indices"]).ravel() if "indices" in primitive else np.arange(count)
@@ -278,7 +278,7 @@ class GltfFile:
         info = item[key]
         texture = self.json["textures"][info["index"]]
         if "source" not in texture:
-            raise Unreadable("a texture has neither PNG nor JPEG")
+            raise UnreadableError("a texture has neither PNG nor JPEG")
         sampler = self.json["samplers"][texture["sampler"]] if "sampler" in texture else {}
         image = self._image(texture["source"])
         if srgb:
@@ -431,13 +431,17 @@ def _obj(path: pathlib.Path) -> list[Surface]:
 def _corner(word: str, count: tuple[int, ...]) -> tuple[int, int, int]:
     """Indices of position, texture coordinates and normal, from zero; -1 for none."""
     index = [int(part) if part else 0 for part in word.split("/")] + [0, 0]
-    place = [value - 1 if value > 0 else size + value if value else -1 for value, size in zip(index, count, strict=False)]
+    place = [
+        value - 1 if value > 0 else size + value if value else -1 for value, size in zip(index, count, strict=False)
+    ]
     return place[0], place[1], place[2]
 
 
 def _smooth(position: np.ndarray, polygons: list[list[tuple[int, int, int]]]) -> np.ndarray:
     """Normals of positions, the mean of those of their triangles by area."""
-    face = np.array([[p[0][0], p[n][0], p[n + 1][0]] for p in polygons for n in range(1, len(p) - 1)], int).reshape(-1, 3)
+    face = np.array([[p[0][0], p[n][0], p[n + 1][0]] for p in polygons for n in range(1, len(p) - 1)], int).reshape(
+        -1, 3
+    )
     a, b, c = (position[face[:, corner]] for corner in range(3))
     total = np.zeros_like(position)
     for corner in range(3):

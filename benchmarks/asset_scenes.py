@@ -148,7 +148,7 @@ def _bsdf(mitsuba: Any, surface: Surface, model: str) -> Any:
             **{"base_color": base, "metallic": metallic, "roughness": roughness},
             "f0": _product(mitsuba, surface, material.f0, material.f0_map),
             "specular": _product(mitsuba, surface, material.specular, material.specular_map),
-            **dict.fromkeys(("anisotropy", "rotation"), {"type": "uniform", "value": 0.0}),
+            **{name: {"type": "uniform", "value": 0.0} for name in ("anisotropy", "rotation")},
         }
         core = plugins.metallic_roughness(parameters)
     if material.normal_map is not None and material.normal_map.coordinates in surface.texture:

@@ -10,10 +10,10 @@ jaxprt's code. Only the camera is jaxprt's: the first of the file, or the defaul
 default. `--model principled` judges by Mitsuba's own BSDF in place of the formula of the glTF specification.
 
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
-of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `mismatch` is the share of pixels in which
-the share that surfaces cover differs by more than a half. `backs` is the share of pixels that show the back of a surface
-of one side: black here, while glTF's viewers see through it. `precompute_seconds` and `picture_seconds` are
-processor seconds, the first with loading; `seconds` are those of the clock from the start of the process to the first picture.
+of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `mismatch` is the share of pixels in which the
+shares that surfaces cover differ by more than a half. `backs` is the share of pixels that show the back of a surface of
+one side: black here, while glTF's viewers see through it. `precompute_seconds` and `picture_seconds` are processor
+seconds, the first with loading; `seconds` are those of the clock from the start of the process to the first picture.
 `warnings` are jaxprt's. `unjudged` names what the judge leaves out of the materials. A file that is not drawn has
 `refused` (jaxprt's reason) or `unreadable` (the judge's), and no error.
 
@@ -25,7 +25,6 @@ import argparse
 import dataclasses
 import hashlib
 import inspect
-import json
 import os
 import pathlib
 import pickle
@@ -54,8 +53,12 @@ def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
     parser.add_argument("folder", nargs="*", type=pathlib.Path, help="folders or files")
     parser.add_argument("--only", metavar="TEXT", default="", help="files whose paths have TEXT")
-    parser.add_argument("--light", type=pathlib.Path, metavar="FILE", action="append", help="instead of a sun and a soft light")
-    parser.add_argument("--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given")
+    parser.add_argument(
+        "--light", type=pathlib.Path, metavar="FILE", action="append", help="instead of a sun and a soft light"
+    )
+    parser.add_argument(
+        "--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given"
+    )
     parser.add_argument("--samples", type=int, metavar="N", default=SAMPLES, help="of each of Mitsuba's two pictures")
     parser.add_argument("--model", choices=asset_scenes.MODELS, default=asset_scenes.MODELS[0], help="Mitsuba's BSDF")
     parser.add_argument("--warm", action="store_true", help="use and keep compiled programs")
@@ -106,7 +109,7 @@ def _quick(folder: pathlib.Path) -> tuple[list, list, dict[str, Any]]:
 
 
 def found(folders: Sequence[pathlib.Path]) -> list[pathlib.Path]:
-    """glTF and OBJ files of folders, by name; files as they are."""
+    """Files of folders, glTF and OBJ, by name; files as they are."""
     result = []
     for folder in folders:
         inside = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
@@ -163,7 +166,11 @@ def judge(
 
 
 def compared(
-    ours: dict[str, Any], theirs: dict[str, Any], lights: Sequence[str], path: pathlib.Path, pictures: pathlib.Path | None
+    ours: dict[str, Any],
+    theirs: dict[str, Any],
+    lights: Sequence[str],
+    path: pathlib.Path,
+    pictures: pathlib.Path | None,
 ) -> dict[str, Any]:
     """What our pictures are off."""
     rows, columns = [], {name: {} for name in ("errors", "flips", "biases", "noises")}
@@ -271,7 +278,9 @@ def relight(request: dict[str, Any]) -> dict[str, Any]:
         **{"pictures": pictures, "camera": camera, "covered": 1 - np.asarray(pixels.background)},
         **{"precompute_seconds": precomputed, "picture_seconds": drawn - precomputed, "seconds": seconds},
         **{"vertices": relit.vertices, "bytes": prt.memory(relit)},
-        "warnings": sorted({str(warning.message).replace(str(request["path"]), request["path"].name) for warning in shown}),
+        "warnings": sorted(
+            {str(warning.message).replace(str(request["path"]), request["path"].name) for warning in shown}
+        ),
     }
 
 

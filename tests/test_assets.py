@@ -105,7 +105,7 @@ def test_compressed_and_empty_files_are_unreadable(small, tmp_path):
     empty.write_text("v 0 0 0\n")
     edited(small, lambda document: document.update(extensionsUsed=["EXT_meshopt_compression"]))
     for path, reason in ((empty, "no triangles"), (small, "EXT_meshopt_compression")):
-        with pytest.raises(asset_files.Unreadable, match=reason):
+        with pytest.raises(asset_files.UnreadableError, match=reason):
             asset_files.read(path)
 
 
