@@ -23,29 +23,70 @@ _COLOR = "vertex_color"  # attributes of shapes
 _ALPHA = "vertex_alpha"
 
 
-def load(surfaces: Sequence[Surface], light: pathlib.Path, camera: Any, *, model: str) -> tuple[Any, Any]:
-    """Mitsuba's scene, and the integrator of its direct light.
+class View:
+    """Surfaces that Mitsuba sees from one camera, in direct light."""
 
-    Args:
-        surfaces: The surfaces.
-        light: The environment file.
-        camera: A `jaxprt.Camera`.
-        model: One of `MODELS`.
-    """
-    import mitsuba
+    def __init__(self, surfaces: Sequence[Surface], light: pathlib.Path, camera: Any, *, model: str):
+        """Loads the scene.
 
-    mitsuba.set_variant("llvm_ad_rgb" if path_tracing.available() else "scalar_rgb")
-    sensor = path_tracing.sensor(mitsuba, camera)
-    sensor["film"]["pixel_format"] = "rgba"
+        Args:
+            surfaces: The surfaces.
+            light: The environment file.
+            camera: A `jaxprt.Camera`.
+            model: One of `MODELS`.
+        """
+        import mitsuba
+
+        mitsuba.set_variant("llvm_ad_rgb" if path_tracing.available() else "scalar_rgb")
+        self._mitsuba = mitsuba
+        sensor = path_tracing.sensor(mitsuba, camera)
+        sensor["film"]["pixel_format"] = "rgba"
+        world = {"type": "scene", "sensor": sensor, "light": emitter(mitsuba, light)}
+        self._world = mitsuba.load_dict(world | _shapes(mitsuba, surfaces, model))
+        covering = all(surface.material.opaque for surface in surfaces)
+        direct = {"type": "direct"} if covering else {"type": "volpath", "max_depth": 2, "rr_depth": 100}
+        self._hidden = mitsuba.load_dict({**direct, "hide_emitters": True})
+        self._dark = None
+        if any(surface.material.emissive.any() for surface in surfaces):
+            # Where the light is hidden, surfaces that emit are hidden too. Coverage is that of the same surfaces, dark.
+            self._dark = mitsuba.load_dict(world | _shapes(mitsuba, [_unlit(surface) for surface in surfaces], model))
+            self._shown = mitsuba.load_dict(direct)
+
+    def picture(self, samples: int, seed: int) -> np.ndarray:
+        """Radiance and the share that surfaces cover [h w 4]; seeds give independent noise."""
+        if self._dark is None:
+            return self._render(self._world, self._hidden, samples, seed)
+        picture = self._render(self._world, self._shown, samples, seed)
+        picture[..., 3] = self._render(self._dark, self._hidden, samples, seed)[..., 3]
+        return picture
+
+    def _render(self, world: Any, integrator: Any, samples: int, seed: int) -> np.ndarray:
+        number = self._mitsuba.UInt32(seed)
+        return np.array(self._mitsuba.render(world, integrator=integrator, spp=samples, seed=number))
+
+    def backs(self) -> float:
+        """Share of pixels whose center shows the back of a surface that has one side."""
+        mitsuba, sensor = self._mitsuba, self._world.sensors()[0]
+        width, height = (int(size) for size in sensor.film().size())
+        row, column = np.indices((height, width)) + 0.5
+        place = mitsuba.Point2f(column.ravel() / width, row.ravel() / height)
+        ray, _ = sensor.sample_ray(0.0, 0.5, place, mitsuba.Point2f(0.5))
+        met = self._world.ray_intersect(ray)
+        two_sided = mitsuba.has_flag(met.bsdf().flags(), mitsuba.BSDFFlags.BackSide)
+        return float(np.mean(np.array(met.is_valid() & (met.wi.z < 0) & ~two_sided)))
+
+
+def _shapes(mitsuba: Any, surfaces: Sequence[Surface], model: str) -> dict[str, Any]:
     materials: dict[tuple, Any] = {}
-    shapes = {
-        f"surface{number}": _shape(mitsuba, side, model, materials)
-        for number, side in enumerate(side for surface in surfaces for side in _sides(surface))
-    }
-    world = {"type": "scene", "sensor": sensor, "light": emitter(mitsuba, light), **shapes}
-    covering = all(surface.material.opaque for surface in surfaces)
-    integrator = {"type": "direct"} if covering else {"type": "volpath", "max_depth": 2, "rr_depth": 100}
-    return mitsuba.load_dict(world), mitsuba.load_dict({**integrator, "hide_emitters": True})
+    sides = [side for surface in surfaces for side in _sides(surface)]
+    return {f"surface{number}": _shape(mitsuba, side, model, materials) for number, side in enumerate(sides)}
+
+
+def _unlit(surface: Surface) -> Surface:
+    """The surface without its light, and nothing of its material but alpha."""
+    given = surface.material
+    kept = {name: getattr(given, name) for name in ("alpha", "alpha_map", "cutoff", "opaque", "double_sided")}
+    return dataclasses.replace(surface, material=Material(**kept))
 
 
 def emitter(mitsuba: Any, path: pathlib.Path) -> dict[str, Any]:
@@ -248,16 +289,3 @@ def _texture() -> Any:
             return "Product"
 
     return Product
-
-
-def backs(world: Any) -> float:
-    """Share of pixels whose center shows the back of a surface that has one side."""
-    _, mitsuba = plugins.modules()
-    sensor = world.sensors()[0]
-    width, height = sensor.film().size()
-    row, column = np.indices((int(height), int(width))) + 0.5
-    place = mitsuba.Point2f(column.ravel() / int(width), row.ravel() / int(height))
-    ray, _ = sensor.sample_ray(0.0, 0.5, place, mitsuba.Point2f(0.5))
-    met = world.ray_intersect(ray)
-    two_sided = mitsuba.has_flag(met.bsdf().flags(), mitsuba.BSDFFlags.BackSide)
-    return float(np.mean(np.array(met.is_valid() & (met.wi.z < 0) & ~two_sided)))

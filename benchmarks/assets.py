@@ -314,14 +314,8 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
 
 def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, float]:
     """Two pictures [2 h w 4], and the share of pixels that show backs of surfaces with one side."""
-    import mitsuba
-
-    world, integrator = asset_scenes.load(surfaces, light, request["camera"], model=request["model"])
-    halves = [
-        np.array(mitsuba.render(world, integrator=integrator, spp=request["samples"], seed=mitsuba.UInt32(seed)))
-        for seed in (1, 2)
-    ]
-    return np.stack(halves), asset_scenes.backs(world)
+    view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"])
+    return np.stack([view.picture(request["samples"], seed) for seed in (1, 2)]), view.backs()
 
 
 def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> np.ndarray:

@@ -133,16 +133,13 @@ def picture(tmp_path):
     """Radiance and coverage in the middle of a picture, by light of some texels of a file."""
 
     def render(surfaces, texels, *, model="gltf", samples=1024, eye=(0.0, 0.0, 4.0)):
-        import mitsuba
-
         radiance = np.zeros((16, 32, 3), np.float32)
         radiance[texels] = 1.0
         path = tmp_path / "light.exr"
         files.write_exr(path, radiance)
         camera = Camera(eye, [0, 0, 0], [0, 1, 0], 0.1, 4, 4)
-        world, integrator = asset_scenes.load(surfaces, path, camera, model=model)
-        drawn = np.array(mitsuba.render(world, integrator=integrator, spp=samples))
-        return drawn.mean((0, 1)), asset_scenes.backs(world)
+        view = asset_scenes.View(surfaces, path, camera, model=model)
+        return view.picture(samples, 1).mean((0, 1)), view.backs()
 
     return render
 
@@ -203,3 +200,17 @@ def test_backs_are_black_unless_the_file_says_two_sides(picture):
         values, backs = picture([quad(double_sided=two)], EVERYWHERE, eye=behind)
         assert values[0] == pytest.approx(radiance, abs=0.02)
         assert backs == (0 if two else 1)
+
+
+@traced
+def test_surfaces_that_emit_are_seen_and_shine_on_others(picture):
+    lamp = quad(emissive=np.array([2.0, 1.0, 0.5]), base_color=np.zeros(3))
+    values, _ = picture([lamp], (slice(0, 0), slice(None)))
+    np.testing.assert_allclose(values, [2, 1, 0.5, 1], rtol=1e-3)
+    panel = CORNER * [9, 9, 1] + [0, 0, 6]  # behind the eye, towards the surface
+    above = asset_files.Surface(panel, FACE[:, ::-1], None, {0: PLACE}, None, lamp.material)
+    share = picture([quad(), above], (slice(0, 0), slice(None)), samples=4096)[0]
+    # The form factor of a square of half the edge a in the distance c, for a = 9 and c = 6.
+    part = 9 / np.hypot(9, 6)
+    factor = 4 / np.pi * part * np.arctan(part)
+    np.testing.assert_allclose(share[:3], factor * np.array([2, 1, 0.5]), rtol=0.03)
