@@ -531,7 +531,8 @@ def write_small(path: pathlib.Path) -> None:
         *((ground, "VEC3", 5126), (np.array([[0.8, 0.2, 0.2]] * 2 + [[0.2, 0.2, 0.8]] * 2), "VEC3", 5126)),
         (np.array([0, 1, 2, 0, 2, 3]), "SCALAR", 5123),
     ]
-    check = PIL.Image.fromarray(np.uint8([[[230, 230, 230], [90, 60, 30]], [[90, 60, 30], [230, 230, 230]]]))
+    light, dark = [230, 230, 230], [90, 60, 30]
+    check = PIL.Image.fromarray(np.array([[light, dark], [dark, light]], np.uint8))
     stream = io.BytesIO()
     check.resize((64, 32), PIL.Image.Resampling.NEAREST).save(stream, "PNG")
     content, views, accessors = b"", [], []

@@ -128,7 +128,7 @@ def _sides(surface: Surface) -> list[Surface]:
 
 def _shape(mitsuba: Any, surface: Surface, model: str, materials: dict[tuple, Any]) -> Any:
     """Mitsuba's mesh with its material, which surfaces share: Dr.Jit traces each of them."""
-    material, flat = surface.material, surface.normal is None
+    material, normal = surface.material, surface.normal
     key = id(material), surface.color is None, tuple(sorted(surface.texture))
     if key not in materials:
         material_of = _bsdf(mitsuba, surface, model)
@@ -138,15 +138,15 @@ def _shape(mitsuba: Any, surface: Surface, model: str, materials: dict[tuple, An
     if material.emissive.any():
         props["emitter"] = mitsuba.load_dict({"type": "area", "radiance": _glow(mitsuba, surface)})
     count, uv = len(surface.position), _coordinates(surface)
-    options = {"has_vertex_normals": not flat, "has_vertex_texcoords": uv is not None, "props": props}
-    if flat:
+    options = {"has_vertex_normals": normal is not None, "has_vertex_texcoords": uv is not None, "props": props}
+    if normal is None:
         props["face_normals"] = True
     mesh = mitsuba.Mesh("mesh", count, len(surface.face), **options)
     parameters = mitsuba.traverse(mesh)
     parameters["vertex_positions"] = surface.position.astype(np.float32).ravel()
     parameters["faces"] = surface.face.astype(np.uint32).ravel()
-    if not flat:
-        parameters["vertex_normals"] = surface.normal.astype(np.float32).ravel()
+    if normal is not None:
+        parameters["vertex_normals"] = normal.astype(np.float32).ravel()
     if uv is not None:
         parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
     attributes = {plugins.TANGENT: np.zeros((count, 3))}
@@ -192,10 +192,16 @@ def _bsdf(mitsuba: Any, surface: Surface, model: str) -> Any:
             **{name: {"type": "uniform", "value": 0.0} for name in ("anisotropy", "rotation")},
         }
         core = plugins.metallic_roughness(parameters)
-    if material.normal_map is not None and material.normal_map.coordinates in surface.texture:
+    normal = material.normal_map
+    if normal is not None and normal.coordinates in surface.texture:
         # Mitsuba's softened terminator is not part of the format.
         options = {"use_shadowing_function": False}
-        core = {"type": "normalmap", "normalmap": _normal(mitsuba, material), "inner": core, **options}
+        core = {
+            "type": "normalmap",
+            "normalmap": _normal(mitsuba, normal, material.normal_scale),
+            "inner": core,
+            **options,
+        }
     if material.double_sided:
         core = {"type": "twosided", "inner": core}
     if not material.opaque:
@@ -248,11 +254,11 @@ def _glow(mitsuba: Any, surface: Surface) -> Any:
     return _texture()([glow], varying=False) if surface.material.emissive_map is not None else glow
 
 
-def _normal(mitsuba: Any, material: Material) -> Any:
-    """The map with its scale (section 3.9.3)."""
-    way = (2 * material.normal_map.image[..., :3] - 1) * [material.normal_scale, material.normal_scale, 1]
+def _normal(mitsuba: Any, map: Map, scale: float) -> Any:
+    """A normal map with its scale (section 3.9.3)."""
+    way = (2 * map.image[..., :3] - 1) * [scale, scale, 1]
     way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
-    return _bitmap(mitsuba, material.normal_map, (way + 1) / 2)
+    return _bitmap(mitsuba, map, (way + 1) / 2)
 
 
 @plugins.per_variant

@@ -1,7 +1,7 @@
 """Are files that others made drawn right? README's ten lines beside Mitsuba 3, for all glTF and OBJ files of folders.
 
     python -m benchmarks.assets FOLDER... [--quick] [--only TEXT] [--light FILE] [--edge N] [--samples N]
-        [--model NAME] [--warm] [--limit SECONDS] [--store FOLDER] [--pictures FOLDER] [--output FILE]
+        [--model NAME] [--warm] [--limit SECONDS] [--store FOLDER] [--pictures FOLDER] [--table FILE] [--output FILE]
 
 Every file is relit by README's lines, with their defaults, in a process of its own with a time limit. It starts without
 compiled programs, unless `--warm` is given. The judge is Mitsuba in another process: `benchmarks.asset_files` reads the
@@ -65,6 +65,7 @@ def main(options: Sequence[str] | None = None) -> None:
     parser.add_argument("--limit", type=float, metavar="SECONDS", default=LIMIT, help="of each process")
     parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep Mitsuba's pictures")
     parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write ours, Mitsuba's, 4 x difference")
+    parser.add_argument("--table", type=pathlib.Path, metavar="FILE", help="write the lines as a table in Markdown")
     parser.add_argument("--process", nargs=2, metavar=("STEP", "FILE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args(options)
     if arguments.process:
@@ -79,6 +80,8 @@ def main(options: Sequence[str] | None = None) -> None:
             line = judge(path, lights, folder, **options_of)
             lines.append(harness.report(line, arguments.output))
     harness.report(summary(lines), arguments.output)
+    if arguments.table is not None:
+        arguments.table.write_text(table(lines, [light.stem for light in lights]))
 
 
 def _asked(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> tuple[list, list, dict[str, Any]]:
@@ -203,6 +206,23 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "loaded": sum(line["loaded"] for line in lines),
         **{"above": sum(error > LARGE for error in errors), "silent": len(silent), "silent_files": silent},
     }
+
+
+def table(lines: Sequence[dict[str, Any]], lights: Sequence[str]) -> str:
+    """The lines as a table in Markdown."""
+    names = ["file", "vertices", *lights, "FLIP", "precomputation, picture", "warnings"]
+    rows = [names, ["---"] * len(names)]
+    for line in lines:
+        row = [line["case"]]
+        if line["loaded"]:
+            seconds = f"{line['precompute_seconds']:.0f}, {line['picture_seconds']:.0f} s"
+            errors = [f"{line['errors'][light]:.1%}" if "errors" in line else "-" for light in lights]
+            flip = f"{max(line['flips'].values()):.3f}" if "flips" in line else "-"
+            row += [f"{line['vertices']:,}", *errors, flip, seconds, str(len(line["warnings"]) or "none")]
+        else:
+            row += ["-"] * (len(names) - 2) + [f"refused: {line['refused']}"]
+        rows.append([cell.replace("|", "\\|") for cell in row])
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def _readable(path: pathlib.Path) -> str | None:
