@@ -21,6 +21,7 @@ MODELS = "gltf", "principled"
 _HEIGHT = 1024  # rows of the light, about: texels of the file are boxes
 _COLOR = "vertex_color"  # attributes of shapes
 _ALPHA = "vertex_alpha"
+_PLACES = 4  # along the edge of a pixel, at which sides are looked at
 
 
 class View:
@@ -64,16 +65,24 @@ class View:
         number = self._mitsuba.UInt32(seed)
         return np.array(self._mitsuba.render(world, integrator=integrator, spp=samples, seed=number))
 
-    def backs(self) -> float:
-        """Share of pixels whose center shows the back of a surface that has one side."""
+    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [h w] that show the back of a surface of one side, and pixels whose radiance is not defined.
+
+        Interpolated normals may look away from an eye that sees the front of a triangle, at silhouettes of smooth
+        meshes. There BRDFs are not defined, and Mitsuba is black.
+        """
         mitsuba, sensor = self._mitsuba, self._world.sensors()[0]
         width, height = (int(size) for size in sensor.film().size())
-        row, column = np.indices((height, width)) + 0.5
-        place = mitsuba.Point2f(column.ravel() / width, row.ravel() / height)
+        row, column = (np.indices((_PLACES * height, _PLACES * width)).reshape(2, -1) + 0.5) / _PLACES
+        place = mitsuba.Point2f(np.float32(column / width), np.float32(row / height))
         ray, _ = sensor.sample_ray(0.0, 0.5, place, mitsuba.Point2f(0.5))
         met = self._world.ray_intersect(ray)
+        away, behind = met.wi.z < 0, plugins.modules()[0].dot(met.n, ray.d) > 0
         two_sided = mitsuba.has_flag(met.bsdf().flags(), mitsuba.BSDFFlags.BackSide)
-        return float(np.mean(np.array(met.is_valid() & (met.wi.z < 0) & ~two_sided)))
+        both = met.is_valid() & away & behind & ~two_sided, met.is_valid() & (away != behind)
+        shape = height, _PLACES, width, _PLACES
+        back, undefined = (np.array(each).reshape(shape).any((1, 3)) for each in both)
+        return back, undefined
 
 
 def _shapes(mitsuba: Any, surfaces: Sequence[Surface], model: str) -> dict[str, Any]:

@@ -12,7 +12,8 @@ default. `--model principled` judges by Mitsuba's own BSDF in place of the formu
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
 of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `mismatch` is the share of pixels in which the
 shares that surfaces cover differ by more than a half. `backs` is the share of pixels that show the back of a surface of
-one side: black here, while glTF's viewers see through it. `precompute_seconds` and `picture_seconds` are processor
+one side: black here, while glTF's viewers see through it. `undefined` is the share of pixels that are left out, because
+interpolated normals look away from the eye. `precompute_seconds` and `picture_seconds` are processor
 seconds, the first with loading; `seconds` are those of the clock from the start of the process to the first picture.
 `warnings` are jaxprt's. `unjudged` names what the judge leaves out of the materials. A file that is not drawn has
 `refused` (jaxprt's reason) or `unreadable` (the judge's), and no error.
@@ -177,9 +178,11 @@ def compared(
 ) -> dict[str, Any]:
     """What our pictures are off."""
     rows, columns = [], {name: {} for name in ("errors", "flips", "biases", "noises")}
+    backs, undefined = theirs["sides"]
     for light, drawn, halves in zip(lights, ours["pictures"], theirs["halves"], strict=True):
         try:
-            truth = denoised.Truth(halves, theirs["samples"])
+            kept = np.where(undefined[..., None], 0, halves)  # without coverage, they are not compared
+            truth = denoised.Truth(kept, theirs["samples"])
         except ValueError as error:
             return {"unreadable": str(error)}
         figures = truth.error(drawn), truth.flip(drawn), truth.bias(drawn), truth.noise
@@ -190,7 +193,8 @@ def compared(
         pictures.mkdir(parents=True, exist_ok=True)
         write(pictures / f"{path.parent.name}_{path.stem}.png", np.concatenate(rows))
     mismatch = np.abs(ours["covered"] - theirs["halves"][0].mean(0)[..., 3]) > 0.5
-    extra = {"mismatch": float(mismatch.mean()), "backs": theirs["backs"], "unjudged": theirs["unjudged"]}
+    shares = {"mismatch": mismatch, "backs": backs, "undefined": undefined}
+    extra = {name: float(value.mean()) for name, value in shares.items()} | {"unjudged": theirs["unjudged"]}
     return {"error": max(columns["errors"].values()), **columns, **extra}
 
 
@@ -314,28 +318,28 @@ def _processor_seconds() -> float:
 def trace(request: dict[str, Any]) -> dict[str, Any]:
     """Mitsuba's pictures, two of each light."""
     surfaces = asset_files.read(request["path"])
-    halves, backs = [], 0.0
+    halves, sides = [], np.zeros(())
     for light in request["lights"]:
         code = "".join(inspect.getsource(module) for module in (asset_files, asset_scenes))
         camera = [np.asarray(value).tolist() for value in vars(request["camera"]).values()]
         what = pickle.dumps((surfaces, light.read_bytes(), camera, request["samples"], request["model"], code))
         path = request["store"] and request["store"] / f"{hashlib.sha256(what).hexdigest()}.npz"
         if path is None or not path.is_file():
-            both, backs = _rendered(surfaces, light, request)
+            both, sides = _rendered(surfaces, light, request)
             if path is not None:
-                np.savez(path, both=both, backs=backs)
+                np.savez(path, both=both, sides=sides)
         else:
             with np.load(path) as kept:
-                both, backs = kept["both"], float(kept["backs"])
+                both, sides = kept["both"], kept["sides"]
         halves.append(both)
     unjudged = sorted(set().union(*map(asset_scenes.unjudged, surfaces)))
-    return {"halves": halves, "samples": 2 * request["samples"], "backs": backs, "unjudged": unjudged}
+    return {"halves": halves, "samples": 2 * request["samples"], "sides": sides, "unjudged": unjudged}
 
 
-def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, float]:
-    """Two pictures [2 h w 4], and the share of pixels that show backs of surfaces with one side."""
+def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Two pictures [2 h w 4], and the pixels [2 h w] of `asset_scenes.View.sides`."""
     view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"])
-    return np.stack([view.picture(request["samples"], seed) for seed in (1, 2)]), view.backs()
+    return np.stack([view.picture(request["samples"], seed) for seed in (1, 2)]), np.stack(view.sides())
 
 
 def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> np.ndarray:

@@ -139,7 +139,7 @@ def picture(tmp_path):
         files.write_exr(path, radiance)
         camera = Camera(eye, [0, 0, 0], [0, 1, 0], 0.1, 4, 4)
         view = asset_scenes.View(surfaces, path, camera, model=model)
-        return view.picture(samples, 1).mean((0, 1)), view.backs()
+        return view.picture(samples, 1).mean((0, 1)), [side.mean() for side in view.sides()]
 
     return render
 
@@ -153,9 +153,9 @@ ABOVE, BELOW = (slice(0, 8), slice(None)), (slice(8, 16), slice(None))
 @pytest.mark.parametrize("model", asset_scenes.MODELS)
 def test_a_white_surface_in_even_light_is_as_bright_as_the_light(picture, model):
     roughness = {"roughness": 0.5} if model == "principled" else {}  # at which its base is nearly Lambert's
-    (radiance, *_, coverage), backs = picture([quad(**roughness)], EVERYWHERE, model=model)
+    (radiance, *_, coverage), sides = picture([quad(**roughness)], EVERYWHERE, model=model)
     assert radiance == pytest.approx(1, abs=0.02 if model == "gltf" else 0.1)
-    assert (coverage, backs) == (1, 0)
+    assert (coverage, *sides) == (1, 0, 0)
 
 
 @traced
@@ -197,9 +197,16 @@ def test_alpha_covers_and_lets_light_through(picture):
 def test_backs_are_black_unless_the_file_says_two_sides(picture):
     behind = (0.0, 0.0, -4.0)
     for two, radiance in ((False, 0), (True, 1)):
-        values, backs = picture([quad(double_sided=two)], EVERYWHERE, eye=behind)
+        values, (backs, undefined) = picture([quad(double_sided=two)], EVERYWHERE, eye=behind)
         assert values[0] == pytest.approx(radiance, abs=0.02)
-        assert backs == (0 if two else 1)
+        assert (backs, undefined) == (0 if two else 1, 0)
+
+
+@traced
+def test_normals_that_look_away_from_the_front_are_told(picture):
+    normal = np.tile([0.6, 0, -0.8], (4, 1))
+    surface = asset_files.Surface(CORNER, FACE, normal, {}, None, quad().material)
+    assert picture([surface], EVERYWHERE, samples=1)[1] == [0, 1]
 
 
 @traced
