@@ -185,10 +185,11 @@ def compared(
             truth = denoised.Truth(kept, theirs["samples"])
         except ValueError as error:
             return {"unreadable": str(error)}
-        figures = truth.error(drawn), truth.flip(drawn), truth.bias(drawn), truth.noise
+        row, flip = sheet(drawn, halves.mean(0), truth.inside)
+        figures = truth.error(drawn), flip, truth.bias(drawn), truth.noise
         for name, value in zip(columns, figures, strict=True):
             columns[name][light] = round(value, 4)
-        rows.append(sheet(drawn, halves.mean(0), truth.inside))
+        rows.append(row)
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         write(pictures / f"{path.parent.name}_{path.stem}.png", np.concatenate(rows))
@@ -342,16 +343,26 @@ def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[n
     return np.stack([view.picture(request["samples"], seed) for seed in (1, 2)]), np.stack(view.sides())
 
 
-def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Ours, Mitsuba's, and four times the difference of the pixels that are compared, ready for a screen.
+def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float]:
+    """Ours, Mitsuba's, and four times the difference of the pixels that are compared; and FLIP over these pixels.
 
-    The exposure is Mitsuba's: a twentieth of the compared pixels are brighter than .8.
+    The exposure is Mitsuba's: the largest color of a twentieth of the compared pixels is above .8. FLIP is of what is displayed,
+    with black in place of other pixels.
     """
-    level = np.quantile(truth[inside][:, :3].mean(-1), 0.95)
+    import flip_evaluator
+
+    scale = 0.8 / max(float(np.quantile(truth[inside][:, :3].max(-1), 0.95)), 1e-6)
     difference = np.where(inside[..., None], 4 * np.abs(drawn[..., :3] - truth[..., :3]), 0)
-    row = np.concatenate([drawn[..., :3], truth[..., :3], difference], 1) * (0.8 / max(level, 1e-6))
-    row = np.clip(row, 0, 1)
-    return np.where(row <= 0.0031308, 12.92 * row, 1.055 * np.maximum(row, 0.0031308) ** (1 / 2.4) - 0.055)
+    shown = [_displayed(scale * picture) for picture in (drawn[..., :3], truth[..., :3], difference)]
+    mine, theirs = (np.ascontiguousarray(np.where(inside[..., None], picture, 0), np.float32) for picture in shown[:2])
+    flip, _, _ = flip_evaluator.evaluate(theirs, mine, "LDR", inputsRGB=True, applyMagma=False, parameters={})
+    return np.concatenate(shown, 1), float(np.squeeze(flip)[inside].mean())
+
+
+def _displayed(linear: np.ndarray) -> np.ndarray:
+    """Radiance up to 1 in sRGB."""
+    value = np.clip(linear, 0, 1)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def write(path: pathlib.Path, picture: np.ndarray) -> None:
