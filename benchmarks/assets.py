@@ -346,8 +346,8 @@ def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[n
 def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float]:
     """Ours, Mitsuba's, and four times the difference of the pixels that are compared; and FLIP over these pixels.
 
-    The exposure is Mitsuba's: the largest color of a twentieth of the compared pixels is above .8. FLIP is of what is displayed,
-    with black in place of other pixels.
+    The exposure is Mitsuba's: the largest color of a twentieth of the compared pixels is above .8. FLIP is of what is
+    displayed, with black in place of other pixels.
     """
     import flip_evaluator
 
