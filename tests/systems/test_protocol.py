@@ -165,6 +165,11 @@ def lobes(name: str, model: str) -> tuple[prt.System, Any]:
     return lobe.LobeSystem(lobe.compress(seen(name)), lobe_table(model)), None
 
 
+def mattes(name: str, model: str) -> tuple[prt.System, Any]:
+    transport = lobe.matte_transport(lobe.compress(seen(name)))
+    return lobe.MatteSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
+
+
 def bright(name: str, model: str) -> tuple[prt.System, Any]:
     system, _ = lobes(name, model)
     return bright_texels.BrightTexels(system, system.transport, MODELS[model], count=8), None
@@ -211,6 +216,7 @@ MADE = {
     "harmonic, clustered": Promise(clustered_matrices, 0.02, 0.25),
     "harmonic, diffuse": Promise(vectors, 0.02, None),
     "lobe": Promise(lobes, 0.02, 0.1),
+    "lobe, matte": Promise(mattes, 0.02, None),
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
     "dynamic": Promise(changing, 0.02, None, linear=False),
     "bounces": Promise(reflected, None, None),

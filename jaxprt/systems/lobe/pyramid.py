@@ -23,13 +23,12 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
-from jaxprt.systems import harmonic
+from jaxprt.systems.lobe import diffuse
 from jaxprt.visibility import StoredVisibility
 from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
-ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
-DEGREE = 6  # of the harmonics by which the diffuse part is lit
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 2}
 _BITS = 2  # number of finest scales, which are read from the bits
 _BLOCK = 1024
 
@@ -40,14 +39,14 @@ class LobeTransport(eqx.Module):
     Attributes:
         pyramid: For each vertex, first the bits of all texels, with 2 x 2 neighbors in each half of a byte; then the
             means at a quarter of the resolution and below, as bytes, each face with a border of its neighbors' texels.
-        vector: Transfer vectors: SH coefficients of visibility x cosine / pi.
+        vector: Transfer vectors for diffuse light, as bytes; see `jaxprt.systems.lobe.diffuse`.
         position: Vertex positions in world units.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         size: Edge of the cubemap faces in texels.
     """
 
     pyramid: UInt8[Array, "v n"]
-    vector: Float[Array, "lm v"]
+    vector: UInt8[Array, "h v"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     size: int = eqx.field(static=True)
@@ -275,7 +274,7 @@ def compress(direct: StoredVisibility) -> LobeTransport:
         part = np.arange(first, min(first + _BLOCK, len(frame)))
         seen = jax.device_put(direct.seen(part))
         pyramids.append(np.asarray(pyramid(seen)))
-        vectors.append(np.asarray(harmonic.transfer.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
+        vectors.append(np.asarray(diffuse.vectors(seen, direct.frame[part])))
     made, vector = jax.device_put(np.concatenate(pyramids)), jax.device_put(np.concatenate(vectors, 1))
     return LobeTransport(made, vector, direct.position, direct.frame, direct.size)
 
@@ -363,16 +362,16 @@ class _Job(visibility.rays.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return self.made_by("lobe", ALGORITHM, degree=DEGREE)
+        return self.made_by("lobe", ALGORITHM)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
         return {
             "pyramid": Layout((visibility.rays.BLOCK, scales(self.size).total), 0, "uint8"),
-            "vector": Layout(((DEGREE + 1) ** 2, visibility.rays.BLOCK), 1, "float32"),
+            "vector": Layout((diffuse.count(self.size), visibility.rays.BLOCK), 1, "uint8"),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
-        vector = harmonic.transfer.transfer_diffuse(seen, self.frame[self.part(block)], degree=DEGREE)
+        vector = diffuse.vectors(seen, self.frame[self.part(block)])
         return {"pyramid": np.asarray(pyramid(seen)), "vector": np.asarray(vector)}, count.rays

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import harmonic, lobe, visibility
+from jaxprt import lobe, visibility
 from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join
@@ -60,7 +60,7 @@ def test_single_texels_are_seen_where_at_least_half_of_them_is(compressed, seen)
 def test_every_texel_is_its_own_bit(seen):
     pyramid = lobe.pyramid.pyramid(jnp.asarray(seen))
     blank = lobe.LobeTransport(
-        pyramid, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
+        pyramid, jnp.zeros((0, len(seen)), jnp.uint8), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
     )
     every = jnp.arange(seen.shape[1])
     for each in (blank, lobe.texel_bits(blank)):
@@ -74,7 +74,7 @@ def test_a_pyramid_takes_six_kilobytes():
 @pytest.mark.parametrize("value", [0, 16])
 def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
     pyramid = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
-    transport = lobe.LobeTransport(pyramid, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
+    transport = lobe.LobeTransport(pyramid, jnp.zeros((0, 2), jnp.uint8), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
     for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
         for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
             visible, by_s, by_t = read(transport, direction, spread)
@@ -141,11 +141,6 @@ def test_visible_parts_are_continuous_over_the_edges_of_the_cube(compressed):
             np.testing.assert_allclose(first, second, atol=2e-3)
 
 
-def test_transfer_vectors_are_those_of_the_harmonic_system(compressed, visible, seen, close):
-    expected = harmonic.transfer.transfer_diffuse(jnp.asarray(seen), visible.frame, degree=lobe.pyramid.DEGREE)
-    close(compressed.vector, expected)
-
-
 def test_tracing_gives_what_compressing_known_visibility_gives(visible, compressed, close, tmp_path):
     ball = builtin.sphere(rings=8, sectors=10)
     scene = join([ball, ground_plane(ball, vertices=36)])
@@ -158,7 +153,7 @@ def test_tracing_gives_what_compressing_known_visibility_gives(visible, compress
         np.max(np.abs(np.asarray(traced.pyramid)[:, -96:].astype(int) - np.asarray(compressed.pyramid)[chosen, -96:]))
         <= 2
     )
-    close(traced.vector, compressed.vector[:, chosen], tolerance=1e-3)
+    assert np.max(np.abs(np.asarray(traced.vector).astype(int) - np.asarray(compressed.vector)[:, chosen])) <= 8
     np.testing.assert_array_equal(traced.pyramid, again.pyramid)
 
 
