@@ -29,7 +29,9 @@ from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 2}
-_BITS = 2  # number of finest scales, which are read from the bits
+_BITS = 2  # largest number of scales that are read from the bits
+# Fewest texels along an edge of such a scale. Bits have no border, so that slopes jump at the edges of the cube.
+_FINE = 16
 _TAPS = 3  # texels along an axis from which visibility is interpolated
 _BYTE = 255
 _BLOCK = 1024
@@ -41,6 +43,7 @@ class LobeTransport(eqx.Module):
     Attributes:
         pyramid: For each vertex, first the bits of all texels, with 2 x 2 neighbors in each half of a byte; then the
             means at a quarter of the resolution and below, as bytes, each face with a border of its neighbors' texels.
+            Scales with fewer than 16 texels along an edge are always bytes.
         vector: Transfer vectors for diffuse light, as bytes; see `jaxprt.systems.lobe.diffuse`.
         position: Vertex positions in world units.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
@@ -112,7 +115,7 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
     address, bit = [], []
     for step in (0, 1):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
-        in_bits, fine = number + step < _BITS, jnp.where(number + step == 0, 0, 1)
+        in_bits, fine = number + step < scale.bits, jnp.where(number + step == 0, 0, 1)
         place = []
         for center in (_nearest(edge, t), _nearest(edge, s)):
             rim = [center + offset for offset in (-1, 0, 1)]  # counted from the border
@@ -166,10 +169,12 @@ def _decoded(
 
         def seen(i, j, own=own, bit=first, number=number + step):
             place = bit[i] + bit[_TAPS + j]
-            value = [_seen(corner[_TAPS * i + j], place, number).astype(spread.dtype) for corner in own]
+            value = [
+                _seen(corner[_TAPS * i + j], place, number, bits=scale.bits).astype(spread.dtype) for corner in own
+            ]
             return value[0] if corner_weight is None else sum(x * w for x, w in zip(value, corner_weight, strict=True))
 
-        sums = _smooth(seen, edge, s, t, rim=number + step >= _BITS)
+        sums = _smooth(seen, edge, s, t, rim=number + step >= scale.bits)
         result = [total + value * part for total, value in zip(result, sums, strict=True)]
     return result[0], result[1], result[2]
 
@@ -219,23 +224,32 @@ def _nearest(edge: Array, x: Array) -> Int[Array, "..."]:
     return jnp.clip(place.astype(jnp.int32), 0, edge - 1) + 1
 
 
-def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array) -> Array:
-    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond."""
+def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array, *, bits: int) -> Array:
+    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond.
+
+    `bits` is the number of scales that are read from bits.
+    """
     value = byte.astype(jnp.int32)
+    if not bits:
+        return value.astype(jnp.float32) / _BYTE
     four = value >> bit & jnp.where(number == 0, 1, 15)
     pair = (four & 5) + (four >> 1 & 5)
     four = (pair & 3) + (pair >> 2)
-    factor = jnp.where(number == 0, 1.0, jnp.where(number < _BITS, 1 / 4, 1 / _BYTE)).astype(jnp.float32)
-    return jnp.where(number < _BITS, four, value) * factor
+    factor = jnp.where(number == 0, 1.0, jnp.where(number < bits, 1 / 4, 1 / _BYTE)).astype(jnp.float32)
+    return jnp.where(number < bits, four, value) * factor
 
 
 class Scales(NamedTuple):
-    """Scales of a pyramid: face edge, spread (mean of 1 - cos) and offset of each scale, and the total length."""
+    """Scales of a pyramid: face edge, spread (mean of 1 - cos) and offset of each scale, and the total length.
+
+    `bits` is the number of finest scales that are read from single bits.
+    """
 
     edge: np.ndarray
     spread: np.ndarray
     start: np.ndarray
     total: int
+    bits: int = 0
 
 
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
@@ -272,9 +286,10 @@ def scales(size: int) -> Scales:
     edge = np.array([size >> k for k in range(size.bit_length())], np.int32)
     # A texel's box and the spline together have a variance of a third of its solid angle along each axis.
     spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 3
-    count = 6 * (edge[_BITS:] + 2) ** 2
-    start = np.concatenate([[0] * _BITS, 6 * size * size // 8 + np.cumsum(count) - count])
-    return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()))
+    bits = int(np.sum(edge[:_BITS] >= _FINE))
+    count = 6 * (edge[bits:] + 2) ** 2
+    start = np.concatenate([[0] * bits, 6 * size * size // 8 + np.cumsum(count) - count])
+    return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()), bits)
 
 
 @require.arguments(**PRECOMPUTE)
@@ -399,7 +414,7 @@ def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     parts = [bits.reshape(count, -1)]
     area = cubemap.solid_angle(size=size)
     value = seen.reshape(count, 6, size, size).astype(area.dtype) * (area / visibility.LEVELS)
-    for edge in scale.edge.tolist()[_BITS:]:
+    for edge in scale.edge.tolist()[scale.bits :]:
         fold = size // edge
         mean, whole = (jnp.sum(x.reshape(-1, 6, edge, fold, edge, fold), (3, 5)) for x in (value, area[None]))
         faces = jnp.moveaxis(cubemap.pad(jnp.moveaxis(mean / whole, 0, -1)), -1, 0)
