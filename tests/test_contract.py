@@ -364,7 +364,7 @@ class Draw:
     def pyramid(self, size=8, *, vertices=3):
         """Visibility at all scales, for ``light`` of the same size."""
         pyramid = self.integer(256, vertices, lobe_system.pyramid.scales(size).total, dtype=jnp.uint8)
-        vector = self.normal((lobe_system.pyramid.DEGREE + 1) ** 2, vertices)
+        vector = self.integer(256, lobe_system.diffuse.count(size), vertices, dtype=jnp.uint8)
         return lobe_system.LobeTransport(pyramid, vector, self.normal(vertices, 3), self.rotation(vertices), size)
 
     def lobes(self, lobes=2):
@@ -391,7 +391,7 @@ class Draw:
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
         seen = self.pyramid(size, vertices=vertices)
-        small = lobe_system.LobeTransport(seen.pyramid, self.normal(0, vertices), seen.position, seen.frame, size)
+        small = lobe_system.LobeTransport(seen.pyramid, seen.vector[:0], seen.position, seen.frame, size)
         row = jax.device_put(np.arange(vertices, dtype=np.int32))
         terms = separable_system.ClusteredTransport(
             self.integer(6 * size * size, 1, 5, dtype=jnp.uint16),

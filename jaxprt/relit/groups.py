@@ -29,6 +29,7 @@ from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import DiffuseSystem
 from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.lobe import MatteSystem
 from jaxprt.systems.protocol import Blend, System
 
 _FEWEST = 64  # vertices of a group
@@ -69,7 +70,7 @@ class Surface(eqx.Module):
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
         own = self.system.system if isinstance(self.system, BrightTexels) else self.system
-        return isinstance(own, DiffuseSystem)
+        return isinstance(own, DiffuseSystem | MatteSystem)
 
     @property
     def channels(self) -> int:

@@ -42,7 +42,8 @@ float mean(int address) {
   uint word = texelFetch(pyramid, at(address >> 2), 0).r;
   return float((word >> uint(8 * (address & 3))) & 255u) / 255.;
 }
-// What a vertex sees of a lobe, and the slopes of that by s and t.
+vec3 spline(float off) { return vec3((.5 - off) * (.5 - off) / 2., .75 - off * off, (.5 + off) * (.5 + off) / 2.); }
+// What a vertex sees of a lobe, and the slopes of that by s and t: see jaxprt/systems/lobe/pyramid.py.
 vec3 visibility(int row, int face, float s, float t, float spread) {
   int number = 0;
   for (int i = 1; i < LEVELS - 1; i++) if (spread >= spreads[i]) number = i;
@@ -51,12 +52,19 @@ vec3 visibility(int row, int face, float s, float t, float spread) {
   for (int step = 0; step < min(2, LEVELS); step++) {
     int edge = edges[number + step];
     float middle = float(edge) / 2., share = step == 0 ? 1. - upper : upper;
-    vec2 part;
-    ivec2 low = corner(edge, s, t, part);
-    int base = row + starts[number + step] + (face * (edge + 2) + low.y) * (edge + 2) + low.x;
-    float a = mean(base), b = mean(base + 1), c = mean(base + edge + 2), d = mean(base + edge + 3);
-    result += share * vec3(mix(mix(a, b, part.x), mix(c, d, part.x), part.y),
-      middle * mix(b - a, d - c, part.y), middle * mix(c - a, d - b, part.x));
+    vec2 place = (vec2(s, t) + 1.) * middle;
+    ivec2 center = clamp(ivec2(place), 0, edge - 1) + 1;
+    vec2 off = place + .5 - vec2(center);
+    int base = row + starts[number + step] + (face * (edge + 2) + center.y - 1) * (edge + 2) + center.x - 1;
+    vec3 down = spline(off.y), byDown = vec3(off.y - .5, -2. * off.y, off.y + .5);
+    vec3 right = spline(off.x), byRight = vec3(off.x - .5, -2. * off.x, off.x + .5);
+    for (int j = 0; j < 3; j++) {
+      vec3 column = vec3(mean(base + j), mean(base + edge + 2 + j), mean(base + 2 * edge + 4 + j)), parts = column * byDown;
+      float total = dot(column, down), slope = parts.x + parts.y + parts.z;
+      float outside = (center.y == 1 ? parts.x : 0.) + (center.y == edge ? parts.z : 0.);
+      float across = total - ((j == 0 && center.x == 1) || (j == 2 && center.x == edge) ? slope * t / 2. : 0.);
+      result += share * vec3(total * right[j], middle * across * byRight[j], middle * (slope * right[j] - outside * byRight[j] * s / 2.));
+    }
   }
   return result;
 }
