@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from jaxprt import require
 from jaxprt.scene import Environment, Scene, subdivision
-from jaxprt.visibility import refinement
+from jaxprt.visibility import refinement, shown
 
 
 def refine(
@@ -45,5 +45,6 @@ def refine(
     require.number("error", error, 0.0)
     require.count("vertices", vertices, least=1)
     mesh = scene.mesh
+    views = shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
-    return subdivision.subdivide_scene(scene, refinement.divisions(mesh, mesh, **options))
+    return subdivision.subdivide_scene(scene, refinement.divisions(mesh, mesh, views=views, **options)[0])

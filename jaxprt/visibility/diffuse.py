@@ -35,7 +35,7 @@ class DiffuseTracer:
     double: Bool[np.ndarray, " f"]
 
     def __init__(self, mesh: Mesh, occluder: Mesh, samples: LightSamples, pool: ThreadPoolExecutor):
-        self._samples, self._pool = samples, pool
+        self._samples, self._pool, self._given = samples, pool, (mesh, occluder)
         # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
@@ -49,9 +49,16 @@ class DiffuseTracer:
         self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
         self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
 
-    def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
-        """Reflected radiance at the vertices of the surface, before subdivision."""
-        return self._light(start_points(self._mesh, self._rays), np.asarray(self._mesh.normal, np.float64))
+    def at_vertices(self, vertex: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "v l c"]:
+        """Reflected radiance at some vertices of the surface, before subdivision; 0 at others."""
+        result = np.zeros((len(self._mesh.position), *self._samples.weight.shape[1:]), np.float32)
+        start = start_points(self._mesh, self._rays)
+        result[vertex] = self._light(start[vertex], np.asarray(self._mesh.normal, np.float64)[vertex])
+        return result
+
+    def occluder(self, mesh: Mesh) -> Occluder:
+        """The triangles of a mesh for rays: those that cast shadows, if they are the same."""
+        return self._rays if mesh is self._given[0] and self._given[1] is mesh else Occluder(mesh)
 
     def at(
         self,
