@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
@@ -22,9 +22,10 @@ from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surfa
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import samples_of
+from jaxprt.relit.refinement import MeshDivision
 from jaxprt.relit.surface import combine, view_of
 from jaxprt.relit.tracing import Reflections
-from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, subdivision
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
@@ -85,6 +86,7 @@ class RelitScene(System):
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether reflections of each part are traced.
         rays: Number of reflection rays that each vertex or point of a sharp part sends.
+        division: How the meshes were divided; None for the meshes as they were.
     """
 
     scene: Scene
@@ -104,6 +106,7 @@ class RelitScene(System):
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     rays: int = eqx.field(static=True)
+    division: MeshDivision | None
 
     def __init__(
         self,
@@ -116,6 +119,7 @@ class RelitScene(System):
         lamps: SceneLamps | None = None,
         lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
+        division: MeshDivision | None = None,
     ):
         """Joins the parts.
 
@@ -129,8 +133,10 @@ class RelitScene(System):
             lobes: BRDF, as lobes, of each group with sharp parts, and None for other groups. None if no part is sharp.
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
+            division: How the meshes of the scene were divided; None if they were not.
         """
         tracing.check_rays(rays)
+        self.division = division
         # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
@@ -162,6 +168,25 @@ class RelitScene(System):
         curvature, samples, sharp = zip(*found, strict=True)
         self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
+
+    @property
+    def file_vertex(self) -> Int[np.ndarray, " _"]:
+        """Index in `mesh` of each vertex of the scene before its meshes were divided, part by part."""
+        own = [np.arange(count) for count in self._file_counts()]
+        return np.concatenate([first + index for first, index in zip(self.place.first, own, strict=True)])
+
+    def _file_counts(self) -> list[int]:
+        """Number of vertices of each part before its mesh was divided."""
+        return list(self.place.counts if self.division is None else self.division.counts)
+
+    def _divided(self, number: int, given: Blend | Appearance) -> Blend | Appearance:
+        """Materials at the vertices of a part, interpolated to the added vertices if they are of the file's."""
+        count = self._file_counts()[number]
+        rows = {len(leaf) for leaf in jax.tree.leaves(given) if np.ndim(leaf)}
+        if self.division is None or count == self.place.counts[number] or rows != {count}:
+            return given
+        parents = subdivision.part_parents(self._file_counts(), self.division.parent)[number]
+        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf, parents)), given)
 
     @property
     def direct(self) -> "RelitScene":
@@ -591,6 +616,8 @@ class RelitScene(System):
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
                 look = groups.look_at(table, rough, material_table.at_vertices(vertex))
                 given = appearance(part, shading, given, look=look)
+            else:
+                given = self._divided(number, given)
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
             _check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:

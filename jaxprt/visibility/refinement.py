@@ -27,6 +27,8 @@ from jaxprt.visibility import blocks, shown
 from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.diffuse import DiffuseTracer
 
+ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
+
 _DIRECTIONS = 1024  # per light: penumbrae have steps of a thousandth of its power
 _SIZE, _DEGREE = 8, 6  # texels along an edge and degree of harmonics, if no environments are given
 _UNSEEN = 0.2  # share of the error that belongs to the whole surface, and not to the pictures
