@@ -58,6 +58,7 @@ HOST = {
     "scene.material_table": "takes parts; what they look like at points is in tests/scene/test_material_table.py",
     "scene.mipmap.levels": "its number of results depends on the size",
     "scene.texture.bilinear": "gives numbers of texels",
+    "visibility.buried": "traces rays",
     "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
     "image.raster.front_faces": "the same",
