@@ -15,9 +15,9 @@ sun on smooth metal, are uncertain. `mismatch` is the share of pixels in which t
 more than a half. `backs` is the share of pixels that show the back of a surface of one side: black here, while glTF's
 viewers see through it. `undefined` is the share of pixels that are left out, because interpolated normals look away
 from the eye. `precompute_seconds` and `picture_seconds` are processor seconds, the first with loading; `seconds` are
-those of the clock from the start of the process to the first picture. `warnings` are jaxprt's. `unjudged` names what the judge
-leaves out of the materials. A file that is not drawn has `refused` (jaxprt's reason) or `unreadable` (the judge's), and
-no error.
+those of the clock from the start of the process to the first picture. `warnings` are jaxprt's. `unjudged` names what
+the judge leaves out of the materials. A file that is not drawn has `refused` (jaxprt's reason) or `unreadable` (the
+judge's), and no error.
 
 The last line counts files: `valid` can be read by the judge or by jaxprt, `loaded` are drawn, `judged` have errors,
 whose median is `error`; `silent` are those of more than 10 % of which nothing warned.
