@@ -10,13 +10,14 @@ jaxprt's code. Only the camera is jaxprt's: the first of the file, or the defaul
 default. `--model principled` judges by Mitsuba's own BSDF in place of the formula of the glTF specification.
 
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
-of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `mismatch` is the share of pixels in which the
-shares that surfaces cover differ by more than a half. `backs` is the share of pixels that show the back of a surface of
-one side: black here, while glTF's viewers see through it. `undefined` is the share of pixels that are left out, because
-interpolated normals look away from the eye. `precompute_seconds` and `picture_seconds` are processor
-seconds, the first with loading; `seconds` are those of the clock from the start of the process to the first picture.
-`warnings` are jaxprt's. `unjudged` names what the judge leaves out of the materials. A file that is not drawn has
-`refused` (jaxprt's reason) or `unreadable` (the judge's), and no error.
+of the lights; `errors`, `flips`, `biases` and `noises` have all of them. Errors far below the noise, as of glints of a
+sun on smooth metal, are uncertain. `mismatch` is the share of pixels in which the shares that surfaces cover differ by
+more than a half. `backs` is the share of pixels that show the back of a surface of one side: black here, while glTF's
+viewers see through it. `undefined` is the share of pixels that are left out, because interpolated normals look away
+from the eye. `precompute_seconds` and `picture_seconds` are processor seconds, the first with loading; `seconds` are
+those of the clock from the start of the process to the first picture. `warnings` are jaxprt's. `unjudged` names what
+the judge leaves out of the materials. A file that is not drawn has `refused` (jaxprt's reason) or `unreadable` (the
+judge's), and no error.
 
 The last line counts files: `valid` can be read by the judge or by jaxprt, `loaded` are drawn, `judged` have errors,
 whose median is `error`; `silent` are those of more than 10 % of which nothing warned.
@@ -45,6 +46,7 @@ from benchmarks import asset_files, asset_scenes, denoised, harness
 
 EDGE, SAMPLES = 512, 256
 LIGHTS = "polyhaven_sunrise_1k.exr", "polyhaven_courtyard_1k.exr"  # a sun, and a soft light
+NOISE, BLOCKS = 0.015, 16  # relative L2 of Mitsuba's pictures at which to stop, and so many times the samples at most
 LIMIT = 900.0  # seconds of the clock
 LARGE = 0.1  # error of which something should warn
 SUFFIXES = ".glb", ".gltf", ".obj"
@@ -60,7 +62,7 @@ def main(options: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given"
     )
-    parser.add_argument("--samples", type=int, metavar="N", default=SAMPLES, help="of each of Mitsuba's two pictures")
+    parser.add_argument("--samples", type=int, metavar="N", default=SAMPLES, help="of Mitsuba's pictures, at least")
     parser.add_argument("--model", choices=asset_scenes.MODELS, default=asset_scenes.MODELS[0], help="Mitsuba's BSDF")
     parser.add_argument("--warm", action="store_true", help="use and keep compiled programs")
     parser.add_argument("--limit", type=float, metavar="SECONDS", default=LIMIT, help="of each process")
@@ -142,7 +144,7 @@ def judge(
         lights: Environment files.
         folder: A folder for what processes hand over.
         edge: Pixels along an edge.
-        samples: Of each of Mitsuba's two pictures, which have independent noise.
+        samples: Of Mitsuba's two pictures, which have independent noise, at least; up to `BLOCKS` times as many.
         model: One of `asset_scenes.MODELS`.
         warm: Whether compiled programs may be there.
         limit: Seconds of the clock for each process.
@@ -340,7 +342,16 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
 def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Two pictures [2 h w 4], and the pixels [2 h w] of `asset_scenes.View.sides`."""
     view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"])
-    return np.stack([view.picture(request["samples"], seed) for seed in (1, 2)]), np.stack(view.sides())
+    sides = np.stack(view.sides())
+    total, noise, blocks = np.zeros(()), np.inf, 0
+    while noise > NOISE and blocks < BLOCKS:
+        seeds = (2 * blocks + 1, 2 * blocks + 2)
+        total = total + np.stack([view.picture(request["samples"], seed).astype(np.float64) for seed in seeds])
+        blocks += 1
+        seen = (total[..., 3] > 0).any(0)
+        one, other = (half[seen][:, :3] for half in total)
+        noise = float(np.linalg.norm(one - other) / max(np.linalg.norm(one + other), 1e-9))
+    return total / blocks, sides
 
 
 def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float]:
