@@ -400,13 +400,15 @@ def test_gradients_in_the_eye_are_finite(name):
     assert np.isfinite(slope).all()
 
 
-STEPS = (0.1, 0.03, 0.01, 0.003)
-SLOPE = 0.03  # largest deviation of central differences from gradients, over three directions together
+# Largest deviation of central differences from gradients for each step, over three directions together. Tables of eight
+# views and lights of eight texels bend within the longest one.
+SLOPE = {0.1: 0.06, 0.03: 0.03, 0.01: 0.03, 0.003: 0.03}
+OBLIQUE = jnp.array([1.537, 2.071, 2.483])  # from EYE, lobes of some vertices point exactly between texels
 
 
 def soft(angle) -> Environment:
     """Light of few, wide lamps that is turned about the vertical axis."""
-    x, y, z = np.moveaxis(np.asarray(cubemap.direction(size=SIZE)), -1, 0)
+    x, y, z = jnp.moveaxis(cubemap.direction(size=SIZE), -1, 0)
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     x, z = cosine * x + sine * z, cosine * z - sine * x
     return Environment(jnp.stack([1 + 0.5 * x + 0.3 * y * z, 1.2 + 0.4 * z * x, 1 + 0.5 * y + 0.3 * x], -1))
@@ -417,31 +419,31 @@ def hold_to_differences(function, start, directions) -> None:
     slope = np.asarray(jax.jit(jax.grad(function))(start), np.float64)
     value = jax.jit(function)
     expected = np.array([np.vdot(slope, direction) for direction in directions])
-    for step in STEPS:
+    for step, most in SLOPE.items():
         ends = [[float(value(start + sign * step * direction)) for sign in (1, -1)] for direction in directions]
         found = np.array([(high - low) / (2 * step) for high, low in ends])
-        assert np.linalg.norm(found - expected) <= SLOPE * np.linalg.norm(expected), (step, found, expected)
+        assert np.linalg.norm(found - expected) <= most * np.linalg.norm(expected), (step, found, expected)
 
 
 @each_system
 def test_gradients_in_the_eye_are_differences_over_long_and_short_steps(name):
     system, materials, of = made(name)
     lit = system.shade(system.light(soft(0.3)), materials)
-    to = np.asarray(EYE) - np.asarray(of.position)
+    to = np.asarray(OBLIQUE) - np.asarray(of.position)
     facing = np.sum(np.asarray(of.normal) * to, 1) > 0.3 * np.linalg.norm(to, axis=1)
 
     def total(eye):
         return jnp.sum(system.combine(lit, system.view(eye, materials)) * facing[:, None]) / facing.sum()
 
     directions = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0].astype(np.float32)
-    hold_to_differences(total, EYE, directions)
+    hold_to_differences(total, OBLIQUE, directions)
 
 
 @each_system
 def test_gradients_in_the_turn_of_the_light_are_differences_over_long_and_short_steps(name):
     system, materials, of = made(name)
-    weight = np.random.default_rng(0).uniform(size=len(of.position)).astype(np.float32)
-    weight[np.sum(np.asarray(of.normal) * (np.asarray(EYE) - np.asarray(of.position)), 1) < 0.3] = 0
+    # Of one side alone: all around, the radiance of a turned light hardly changes, and rounding would be measured.
+    weight = jnp.maximum(of.normal @ jnp.array([0.8, 0.0, 0.6]), 0)
     view = system.view(EYE, materials)
 
     def total(angle):

@@ -69,7 +69,7 @@ def irradiance(coefficient: Float[Array, "h c"], vector: Array) -> Float[Array, 
     return total(lambda row: row[0][:, None] * row[1].astype(coefficient.dtype), (coefficient, vector))
 
 
-def harmonics_of(vector: UInt8[Array, "h v"], *, size: int, degree: int) -> Float[Array, "lm v"]:
+def harmonics_of(vector: UInt8[Array | np.ndarray, "h v"], *, size: int, degree: int) -> Float[Array, "lm v"]:
     """Transfer vectors in spherical harmonics, from those in hat functions.
 
     Args:
@@ -78,7 +78,7 @@ def harmonics_of(vector: UInt8[Array, "h v"], *, size: int, degree: int) -> Floa
         degree: Highest degree of the harmonics.
     """
     basis = harmonics.evaluate(cubemap.direction(size=size), degree=degree)
-    return irradiance(coefficients(basis), vector)
+    return irradiance(coefficients(basis), jnp.asarray(vector))
 
 
 @functools.lru_cache(maxsize=8)
