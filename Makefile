@@ -36,7 +36,7 @@ test-long: $(VENV)/.setup-test ## what only a long run can show, with the optimi
 
 bench: $(VENV)/.setup-bench ## one benchmark: make bench NAME=relight_separable ARGS=--quick
 	@test -f "benchmarks/$(NAME).py" || { echo "NAME must be one of:" \
-		$(filter-out __init__ cubemap_light denoised harness path_tracing plugins prb,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
+		$(filter-out __init__ asset_files asset_scenes cubemap_light denoised harness path_tracing plugins prb,$(basename $(notdir $(wildcard benchmarks/*.py)))) >&2; exit 2; }
 	$(BIN)/python -m benchmarks.$(NAME) $(ARGS)
 
 tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half an hour: ARGS="--mesh stanford_bunny" for one

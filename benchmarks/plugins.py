@@ -50,6 +50,16 @@ def bsdf(material: CookTorrance | AshikhminShirley | BlinnPhong | Lambert | Meta
     raise ValueError(f"materials must be {kinds}, got {type(material).__name__}")
 
 
+def metallic_roughness(textures: dict[str, Any]) -> Any:
+    """Mitsuba's metallic-roughness material whose parameters are textures, or dictionaries that load as such.
+
+    Args:
+        textures: By the names of `jaxprt.brdf.MetallicRoughness`, with `f0` in place of `ior` and `specular_color`.
+            Its shape needs the attribute `TANGENT`.
+    """
+    return _metallic_roughness()(textures)
+
+
 def attributes(material: Any) -> dict[str, np.ndarray]:
     """Attributes [v c] that a shape needs for its material: the parameters of its vertices, if they have their own."""
     if not isinstance(material, PerVertex):
@@ -375,9 +385,11 @@ def _metallic_roughness() -> Any:
     class Model(_glossy()):
         colors, scalars = (), ()
 
-        def __init__(self, textures: dict[str, dict]):
+        def __init__(self, textures: dict[str, Any]):
             super().__init__(None)
-            self.parameter = {name: mitsuba.load_dict(each) for name, each in textures.items()}
+            self.parameter = {
+                name: mitsuba.load_dict(each) if isinstance(each, dict) else each for name, each in textures.items()
+            }
 
         def at(self, si):
             return Point(self.parameter, si)

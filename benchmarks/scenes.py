@@ -47,7 +47,6 @@ from jaxprt.scene import (
     subdivision,
 )
 from jaxprt.scene.camera import orbit
-from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import brush, grid_face, ground_plane, join, make_mesh
 from jaxprt.scene.texture import dpdu
 
@@ -160,7 +159,7 @@ def frames(scene: Scene, relit: Mapping[str, RelitScene], light: Environment, ca
     start = time.perf_counter()
     color = exact_radiance(scene, light, camera)
     timing = harness.Timing(time.perf_counter() - start, 0.0, 1)  # with compiling, since it is slow
-    sky = background(light, raster.ray_direction(finer(camera)))
+    sky = image.sky(light, finer(camera))
     drawn = render(scene.mesh, jnp.asarray(color), finer(camera), background=sky)
     yield "vertices", timing, averaged(drawn), color.nbytes
 

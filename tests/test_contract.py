@@ -37,6 +37,7 @@ from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
 from jaxprt.scene.points import Points
+from jaxprt.scene.suns import Sun
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -57,6 +58,7 @@ HOST = {
     "scene.material_table": "takes parts; what they look like at points is in tests/scene/test_material_table.py",
     "scene.mipmap.levels": "its number of results depends on the size",
     "scene.texture.bilinear": "gives numbers of texels",
+    "visibility.buried": "traces rays",
     "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
     "image.raster.front_faces": "the same",
@@ -116,6 +118,7 @@ HOST = {
     "decompose.tucker.hooi": "the same",
     "decompose.tucker.ranks_for": "chooses by values, on the host",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
+    "brdf.coat.coat_reflectance": "one formula for NumPy and JAX arrays",
     "brdf.measured.cell_angles": "a NumPy table of angles",
     "brdf.measured.lower_cosine": "a NumPy table of cosines",
     "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
@@ -212,11 +215,16 @@ HOST = {
     "scene.formats.ply_table": "reads files",
     "scene.formats.stl": "reads files",
     "scene.formats.text": "reads files",
+    "scene.formats.gltf_animation": "reads files",
+    "scene.formats.gltf_draco": "reads files",
     "scene.formats.gltf_extensions": "reads files",
     "scene.formats.gltf_file": "reads files",
     "scene.formats.gltf_geometry": "reads files",
+    "scene.formats.gltf_lights": "reads files",
     "scene.formats.gltf_header": "reads files",
     "scene.formats.texture_images": "stores decoded images",
+    "scene.formats.gltf_meshopt": "reads files",
+    "scene.formats.gltf_morph": "reads files",
     "scene.formats.gltf_nodes": "reads files",
     "scene.formats.gltf_skin": "reads files",
     "scene.formats.gltf": "reads files",
@@ -241,6 +249,13 @@ HOST = {
     "scene.environment.layout_of": "reads the shape of an image file",
     "scene.environment.resample": "NumPy in float64, where data enters",
     "scene.resampling": "the same",
+    "scene.panorama": "pixels of files, NumPy on the host",
+    "scene.panorama_loops": "the same, by numba",
+    "scene.environment.finer": "the same; the light itself without a file",
+    "scene.environment.add_disk": "NumPy on the host",
+    "scene.environment.sky": "the same; environment.background without a file",
+    "image.skies": "the same",
+    "image.tone_curves": "by NumPy or JAX, as the last argument says; image.tonemap.display is the function",
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",
     "sphere.harmonics.degree_of": "arithmetic on shapes",
@@ -350,7 +365,7 @@ class Draw:
     def pyramid(self, size=8, *, vertices=3):
         """Visibility at all scales, for ``light`` of the same size."""
         pyramid = self.integer(256, vertices, lobe_system.pyramid.scales(size).total, dtype=jnp.uint8)
-        vector = self.normal((lobe_system.pyramid.DEGREE + 1) ** 2, vertices)
+        vector = self.integer(256, lobe_system.diffuse.count(size), vertices, dtype=jnp.uint8)
         return lobe_system.LobeTransport(pyramid, vector, self.normal(vertices, 3), self.rotation(vertices), size)
 
     def lobes(self, lobes=2):
@@ -377,7 +392,7 @@ class Draw:
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
         seen = self.pyramid(size, vertices=vertices)
-        small = lobe_system.LobeTransport(seen.pyramid, self.normal(0, vertices), seen.position, seen.frame, size)
+        small = lobe_system.LobeTransport(seen.pyramid, seen.vector[:0], seen.position, seen.frame, size)
         row = jax.device_put(np.arange(vertices, dtype=np.int32))
         terms = separable_system.ClusteredTransport(
             self.integer(6 * size * size, 1, 5, dtype=jnp.uint16),
@@ -574,7 +589,24 @@ EXAMPLES = {
     "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.light_probes.light_probe": example(lambda draw: call(draw.light()), tool="Unity"),
+    "scene.suns.with_suns": example(
+        lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
+    ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
+    "brdf.coat.ClearCoat": example(
+        lambda draw: call(
+            brdf.ClearCoat(
+                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(), draw.uniform()
+            ),
+            draw.upper(5),
+            draw.upper(5),
+        ),
+    ),
+    "brdf.coat.CoatedModel": example(
+        lambda draw: call(
+            brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True), draw.upper(5), draw.upper(5)
+        ),
+    ),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
         gradient=("self",),  # The value is the same for all directions.
@@ -732,7 +764,7 @@ EXAMPLES = {
     "image.tonemap.automatic_exposure": example(lambda draw: call(draw.uniform(4, 5, 3))),
     "image.tonemap.encode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.decode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
-    "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2))),
+    "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2)), tone="filmic"),
     "systems.separable.wavelets.project": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()),
     ),

@@ -135,6 +135,10 @@ def methods(relit: prt.RelitScene, name: str) -> dict[str, Verb]:
         f"{name}.picture": Verb(
             relit.picture, environment=environment(), camera=camera(), materials=None, samples=1, between=None
         ),
+        f"{name}.coverage": Verb(relit.coverage, camera=camera(), samples=1),
+        f"{name}.exposure": Verb(
+            relit.exposure, picture=np.ones((camera().height, camera().width, 3)), camera=camera()
+        ),
         f"{name}.picture_view": Verb(relit.picture_view, camera=camera(), materials=None, samples=1),
         f"{name}.with_rays": Verb(relit.with_rays, rays=8),
         f"{name}.at": Verb(relit.at, points=[prt.scene.points.on_triangles(mesh().face, [0], [[0.2, 0.3, 0.5]])]),
@@ -332,6 +336,11 @@ def scene_verbs() -> dict[str, Verb]:
             prt.scene.environment.rotate, light=environment(), rotation=np.eye(3, dtype=np.float32), samples=1
         ),
         "environment.background": Verb(prt.scene.environment.background, light=environment(), direction=EYE),
+        "environment.sky": Verb(prt.scene.environment.sky, light=environment(), direction=EYE, angle=0.1),
+        "environment.add_disk": Verb(
+            prt.scene.environment.add_disk, light=environment(), direction=EYE, angle=0.1, radiance=1.0
+        ),
+        "environment.finer": Verb(prt.scene.environment.finer, light=environment(), size=8),
         "probes.sample": Verb(
             prt.relit.probes.sample,
             right=("materials",),
@@ -372,10 +381,12 @@ def image_verbs() -> dict[str, Verb]:
     image = np.full((8, 8, 3), 0.5, np.float32)
     return {
         "expose": Verb(prt.image.expose, radiance=image, stops=1.0),
-        "automatic_exposure": Verb(prt.image.automatic_exposure, image=image, percentile=99.0, white=0.9),
+        "automatic_exposure": Verb(
+            prt.image.automatic_exposure, image=image, coverage=image[..., 0], percentile=99.0, white=0.9
+        ),
         "encode_srgb": Verb(prt.image.encode_srgb, linear=image),
         "decode_srgb": Verb(prt.image.decode_srgb, encoded=image),
-        "display": Verb(prt.image.display, radiance=image),
+        "display": Verb(prt.image.display, radiance=image, tone="agx", stops=1.0),
         "psnr": Verb(prt.image.psnr, image=image, reference=image * 0.9, peak=1.0),
         "relative_l2": Verb(prt.image.relative_l2, image=image, reference=image * 0.9),
         "rasterize": Verb(prt.image.rasterize, mesh=mesh(), camera=camera(), samples=1),

@@ -1,6 +1,7 @@
 """BRDFs: analytic models, measured data, and families of BRDFs."""
 
-from jaxprt.brdf import cylinders, fitted, measured, microfacet, models, navigation, scattered
+from jaxprt.brdf import coat, cylinders, fitted, measured, microfacet, models, navigation, scattered
+from jaxprt.brdf.coat import ClearCoat, CoatedModel, coat_reflectance
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
 from jaxprt.brdf.fitted import load_lafortune, load_ngan
 from jaxprt.brdf.measured import load_merl, load_npf
@@ -21,6 +22,8 @@ __all__ = [
     "GGX",
     "AshikhminShirley",
     "BlinnPhong",
+    "ClearCoat",
+    "CoatedModel",
     "CookTorrance",
     "GGXInterface",
     "Lafortune",
@@ -32,6 +35,8 @@ __all__ = [
     "SchlickDiffuse",
     "Ward",
     "WardDuer",
+    "coat",
+    "coat_reflectance",
     "cylinders",
     "fitted",
     "load_lafortune",

@@ -133,10 +133,12 @@ def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bo
         camera = _swung(view.camera, _ORBIT * np.sin(2 * np.pi * turn))
         lamp = rotate(light, about(2 * np.pi * turn))
         now = materials(ready, view, turn=turn)
-        picture = regions.of_regions(system, mesh, camera, materials=now).picture(lamp)
-        stops = image.automatic_exposure(picture) if stops is None else stops
+        drawn = regions.of_regions(system, mesh, camera, materials=now)
+        picture = drawn.picture(lamp)
+        if stops is None:
+            stops = image.automatic_exposure(picture, coverage=1 - drawn.pixels.background)
         result.append(folder / f"frame_{number:04d}.png")
-        files.write_png(result[-1], np.asarray(image.display(image.expose(picture, stops=stops))))
+        files.write_png(result[-1], np.asarray(image.display(picture, tone=view.tone, stops=stops)))
     return result
 
 

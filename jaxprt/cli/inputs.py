@@ -77,7 +77,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     for name, material in options.material:
         number = _number([part.name for part in parts], name)
         parts[number] = dataclasses.replace(parts[number], material=material)
-    return Scene(parts, cameras=made.cameras)
+    return dataclasses.replace(made, parts=parts)
 
 
 def embedded(*, brdf: Any = None, playable: bool = False) -> Scene:
@@ -148,7 +148,8 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
     alone = not told_apart(options.files)[0]
     shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
     edge = {"width": options.size, "height": options.size}
-    return View(looked, lit, orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge))
+    camera = orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge)
+    return View(looked, lit, camera, tone=options.tone)
 
 
 def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
@@ -168,7 +169,12 @@ def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> 
         matte: Callable = _matte if playable else Lambert
         name = numbered([*names, "ground"])[-1]
         parts.append(Part(name, meshes.ground_plane(Scene(parts).mesh), matte(0.5)))
-    return Scene(parts, cameras=every[0].cameras if options.up == "y" else ())
+    if options.up != "y":
+        return Scene(parts)
+    lamps = [lamp for each in every for lamp in each.point_lights]
+    names = numbered([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
+    lamps = [dataclasses.replace(lamp, name=name) for name, lamp in zip(names, lamps, strict=True)]
+    return Scene(parts, every[0].cameras, point_lights=lamps)
 
 
 def _number(names: Sequence[str], name: str) -> int:

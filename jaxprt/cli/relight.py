@@ -18,6 +18,7 @@ from jaxprt.cli import animation, inputs, materials, options, report, sizes
 from jaxprt.cli.options import option
 from jaxprt.cli.report import Made, View
 from jaxprt.files import outputs
+from jaxprt.image.tone_curves import TONES
 from jaxprt.relit.planning import Plan
 from jaxprt.visibility import blocks
 
@@ -58,6 +59,14 @@ SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
     type=options.Whole(1),
     metavar="N",
     help="Report errors of each system at several sizes, on N vertices of the first part.",
+)
+@option(
+    "--tone",
+    group="Output",
+    type=click.Choice(TONES),
+    default="srgb",
+    show_default=True,
+    help="Tone curve of the PNG files: clamped radiance, or Hable's, AgX or ACES.",
 )
 @option("--part", group="Output", metavar="K/N", help="Only precompute the K-th of N parts into a shared --output.")
 @options.folder("Folder for pictures, report.json and precomputed data.", default="output")

@@ -24,7 +24,6 @@ from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene
-from jaxprt.scene.environment import background
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
 from jaxprt.systems.protocol import Blend, System
@@ -50,11 +49,13 @@ class View(NamedTuple):
         scene: The scene.
         lights: Lights by name.
         camera: The camera.
+        tone: Tone curve of pictures for display, as `jaxprt.image.display` takes it.
     """
 
     scene: Scene
     lights: dict[str, Environment]
     camera: Camera
+    tone: str = "srgb"
 
 
 class Made(NamedTuple):
@@ -246,15 +247,17 @@ def compare(
         alike = drawn[system] if camera.width == view.camera.width else each.pictures(lights, camera)
         for number, (name, picture) in enumerate(zip(view.lights, drawn[system], strict=True)):
             result[name][system] = _errors(view, name, each, picture, truth)
-            _write(output, f"{name}_{system}", picture, stops[name], 1.0)
-            _write(output, f"{name}_{system}_difference", jnp.abs(alike[number] - right[name]), stops[name], _AMPLIFY)
+            _write(output, f"{name}_{system}", picture, stops[name], tone=view.tone)
+            _write(
+                output, f"{name}_{system}_difference", jnp.abs(alike[number] - right[name]), stops[name], gain=_AMPLIFY
+            )
             rows[name].append(picture)
     for number, (name, each) in enumerate(right.items()):
         result[name]["exposure_stops"] = float(stops[name])
         result[name]["exact_pixels_error"] = float(truth.pixels.error[number])
-        _write(output, f"{name}_reference", each, stops[name], 1.0)
+        _write(output, f"{name}_reference", each, stops[name], tone=view.tone)
         row = jnp.concatenate([*rows[name], _enlarged(each, view.camera)], 1)
-        files.write_png(output / f"{name}.png", np.asarray(image.display(image.expose(row, stops=stops[name]))))
+        files.write_png(output / f"{name}.png", np.asarray(image.display(row, tone=view.tone, stops=stops[name])))
     return result
 
 
@@ -279,10 +282,10 @@ def reflect(view: View, system: str, made: Made, stops: dict[str, float], output
     lights, camera, mesh = list(view.lights.values()), view.camera, view.scene.mesh
     direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
     pixels = image.shading_points(image.rasterize(mesh, camera, samples=4), mesh, camera)
-    way, result = image.ray_direction(camera), {}
+    result = {}
     for name, light, first, both in zip(view.lights, lights, direct, whole, strict=True):
-        _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), 1.0)
-        total = float(jnp.sum(both - background(light, way) * pixels.background[..., None]))
+        _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), tone=view.tone)
+        total = float(jnp.sum(both - image.sky(light, camera) * pixels.background[..., None]))
         result[name] = float(jnp.sum(both - first)) / total if total > 0 else 0.0
     return result
 
@@ -293,9 +296,9 @@ def _enlarged(picture: Array, camera: Camera) -> Array:
     return picture[row][:, column]
 
 
-def _write(output: Path, name: str, picture: Array, stops: Array, gain: float) -> None:
+def _write(output: Path, name: str, picture: Array, stops: Array, *, gain: float = 1.0, tone: str = "srgb") -> None:
     files.write_exr(output / f"{name}.exr", np.asarray(picture))
-    shown = image.display(image.expose(picture * gain, stops=stops))
+    shown = image.display(picture * gain, tone=tone, stops=stops)
     files.write_png(output / f"{name}.png", np.asarray(shown))
 
 

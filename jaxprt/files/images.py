@@ -11,7 +11,7 @@ import OpenImageIO
 from jaxtyping import Float32
 
 from jaxprt import require
-from jaxprt.files import color_spaces, inputs, pixels
+from jaxprt.files import color_spaces, inputs, ktx2, pixels
 from jaxprt.files.exr import read_exr
 from jaxprt.files.radiance_hdr import read_radiance
 
@@ -25,7 +25,9 @@ _MAGIC = (
     (b"PF", "pnm"),
     (b"Pf", "pnm"),
     (b"BM", "bmp"),
+    (ktx2.MAGIC, "ktx2"),
 )
+_WEBP = b"RIFF", b"WEBP"  # the first four bytes, and those from the eighth on
 _PNG_START = 2**20  # Chunks before the pixels are within these bytes, apart from absurd ones.
 
 
@@ -33,9 +35,9 @@ _PNG_START = 2**20  # Chunks before the pixels are within these bytes, apart fro
 def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
     """Reads an image file as linear values.
 
-    The format (EXR, Radiance HDR, PNG, JPEG, TIFF, PFM or BMP) is recognized from the first bytes of the file, not from
-    its name. The pixels are turned as the file's orientation demands. Alpha is not applied; it is the last of two or
-    four channels.
+    The format (EXR, Radiance HDR, PNG, JPEG, TIFF, PFM, BMP, WebP or KTX 2) is recognized from the first bytes of the
+    file, not from its name. The pixels are turned as the file's orientation demands. Alpha is not applied; it is the
+    last of two or four channels.
 
     * Radiance HDR: pixels are divided by the exposures and color corrections of the header, and converted from its
       primaries to Rec. 709.
@@ -45,6 +47,7 @@ def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], 
       white (Bradford's matrix).
     * Integer formats (PNG, JPEG, ...): values are decoded from sRGB, unless a PNG file states another gamma, or the
       file states that it is linear. Other primaries and ICC profiles are not converted, with a warning.
+    * KTX 2: textures of Basis Universal, at the finest level, with the package opengl_basisu (`jaxprt[web]`).
     * Floating-point TIFF and PFM files: values are used as they are.
 
     Args:
@@ -56,6 +59,7 @@ def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], 
 
     Raises:
         FileNotFoundError: The file does not exist.
+        ImportError: The file is a KTX 2 texture, and the package opengl_basisu is missing.
         ValueError: The path is not a regular file, or the file is empty, damaged, of an unknown format, has other
             channels, or more than 2^28 pixels.
         MemoryError: The pixels do not fit into memory.
@@ -99,14 +103,18 @@ def _read(
     with path.open("rb") as file:
         start = file.read(16)
     form = next((form for magic, form in _MAGIC if start.startswith(magic)), None)
+    if (start[:4], start[8:12]) == _WEBP:
+        form = "webp"
     if form is None:
         got = f"one that starts with {start[:8]!r}" if start else "an empty file"
-        raise ValueError(f"{name} must be an EXR, HDR, PNG, JPEG, TIFF, PFM or BMP image, got {got}")
+        raise ValueError(f"{name} must be an EXR, HDR, PNG, JPEG, TIFF, PFM, BMP, WebP or KTX 2 image, got {got}")
     try:
         if form == "openexr":
             return read_exr(path, name)
         if form == "hdr":
             return read_radiance(path, name)
+        if form == "ktx2":
+            return ktx2.read_ktx2(inputs.content(path, "an image file"), name, decoded=decoded)
         return _read_other(path, name, form, decoded=decoded)
     except MemoryError as error:  # NumPy's does not name the file, where a process may use less than is free.
         raise error if name in str(error) else MemoryError(f"{name} must fit into memory, got: {error}") from error

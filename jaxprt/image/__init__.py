@@ -3,6 +3,7 @@
 from jaxprt.image.metrics import flip, psnr, relative_l2
 from jaxprt.image.pixels import Pixels, interpolate, render, resolve, shading_points
 from jaxprt.image.raster import Fragments, front, rasterize, ray_direction
+from jaxprt.image.skies import sky
 from jaxprt.image.tonemap import automatic_exposure, decode_srgb, display, encode_srgb, expose
 
 __all__ = [
@@ -23,4 +24,5 @@ __all__ = [
     "render",
     "resolve",
     "shading_points",
+    "sky",
 ]

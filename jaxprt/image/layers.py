@@ -63,6 +63,19 @@ def visible_points(
     return _joined(result)
 
 
+def coverage(
+    mesh: Mesh, camera: Camera, *, samples: int, hidden: Bool[np.ndarray, " f"] | None, occluder: Occluder | None
+) -> Float[Array, "h w"]:
+    """Share of each pixel that surfaces hide of the background; `visible_points` has the arguments and errors."""
+    if occluder is None or occluder.opacity is None:
+        fragments = raster.rasterize(seen_from_front(mesh, camera, hidden), camera, samples=samples)
+        seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
+        return seen if seen.ndim == 2 else jnp.mean(seen, -1)
+    slots = _slots(mesh, camera, samples, hidden, occluder)
+    empty = sum(np.mean(np.where(triangle < 0, share, 0), -1) for triangle, _, share in slots)
+    return jnp.asarray(1 - empty, jnp.result_type(float))
+
+
 def nearest_fragments(
     mesh: Mesh,
     camera: Camera,
@@ -89,7 +102,7 @@ def nearest_fragments(
 
 def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
     """The mesh without the triangles that the camera sees from behind and that are hidden there, `hidden`."""
-    if hidden is None or not np.any(hidden):
+    if hidden is None or (known(hidden) and not np.any(hidden)):
         return mesh
     away = _hidden_now(mesh, camera, hidden)
     xp = np if known(away, mesh.face) else jnp
@@ -99,8 +112,8 @@ def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
 def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
     """Triangles of which the camera sees a back that is hidden. Padding of the mesh is not."""
     front = raster.front_faces(mesh, camera)
-    padded = np.pad(hidden, (0, len(mesh.face) - len(hidden)))
-    return padded & ~np.asarray(front) if known(front) else padded & ~front
+    xp = np if known(front, hidden) else jnp
+    return xp.pad(hidden, (0, len(mesh.face) - len(hidden))) & ~xp.asarray(front)
 
 
 def _slots(

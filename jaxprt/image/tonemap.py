@@ -1,5 +1,6 @@
-"""Conversion from radiance to display values: exposure and the sRGB transfer function."""
+"""Conversion from radiance to display values: exposure, tone curves and the sRGB transfer function."""
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.image.arguments import STOPS, numbers
+from jaxprt.image.tone_curves import TONES, toned
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
@@ -36,28 +38,52 @@ def expose(radiance: Float[Array, "*b"], *, stops: Float[Array, ""] | float) -> 
     return radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype))
 
 
-@require.arguments(image=numbers("the image", "h w 3"), percentile=_percentile, white=_white)
-@jit
+def _coverage(value: Any) -> Any:
+    return value if value is None else numbers("the coverage", "h w")(value)
+
+
+@require.arguments(image=numbers("the image", "h w 3"), coverage=_coverage, percentile=_percentile, white=_white)
 def automatic_exposure(
-    image: Float[Array, "h w 3"], *, percentile: Float[Array, ""] | float = 99.0, white: Float[Array, ""] | float = 0.9
+    image: Float[Array, "h w 3"],
+    *,
+    coverage: Float[Array, "h w"] | None = None,
+    percentile: Float[Array, ""] | float = 99.0,
+    white: Float[Array, ""] | float = 0.9,
 ) -> Float[Array, ""]:
     """Exposure in stops that brings a high percentile of the luminance near white.
 
-    The percentile is taken over the pixels that are not black, so a black background does not matter. A black picture
-    gets 0 stops. The result is meant for display; its derivative is not useful.
+    The percentile is taken over the pixels that are not black, so a black background does not matter. With `coverage`
+    it is taken over the surfaces alone, so that an object before a bright window is not dark. A black picture gets 0
+    stops. The result is meant for display; its derivative is not useful.
 
     Args:
         image: Linear radiance.
+        coverage: Fraction of each pixel that shows surfaces, as `RelitScene.coverage` returns it. Only the pixels with
+            the largest fraction count, which is 1 where a surface fills a pixel. None, or 0 everywhere: all count.
         percentile: Percentage of the pixels that are not black which stays at or below `white`.
         white: Linear value to which the percentile is mapped; 1 is display white.
 
     Raises:
         TypeError: An argument does not consist of real numbers.
-        ValueError: The image is not [h, w, 3] or holds NaN, `percentile` is not from 0 to 100, or `white` is not
-            positive.
+        ValueError: The image is not [h, w, 3] or holds NaN, the coverage has another size, `percentile` is not from 0
+            to 100, or `white` is not positive.
     """
+    if coverage is not None and coverage.shape != image.shape[:2]:
+        raise ValueError(f"the coverage must be {list(image.shape[:2])} as the image is, got {list(coverage.shape)}")
+    return _exposure(image, coverage, percentile, white)
+
+
+@jit
+def _exposure(
+    image: Float[Array, "h w 3"],
+    coverage: Float[Array, "h w"] | None,
+    percentile: Float[Array, ""] | float,
+    white: Float[Array, ""] | float,
+) -> Float[Array, ""]:
     luminance = image @ jnp.asarray(LUMINANCE, image.dtype)
     lit = luminance > 0
+    if coverage is not None:
+        lit = lit & (coverage >= 0.999 * jnp.max(coverage))
     bright = jnp.nanpercentile(jnp.where(lit, luminance, jnp.nan), percentile)
     bright = jnp.where(jnp.any(lit), bright, white)
     return jnp.log2(white / bright)
@@ -87,8 +113,39 @@ def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, encoded / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
-@require.arguments(radiance=numbers("the radiance"))
-@jit
-def display(radiance: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Clamps exposed linear radiance to [0, 1] and encodes it as sRGB, for display or for files of 8 bits."""
-    return encode_srgb(jnp.clip(radiance, 0, 1))
+def _tone(value: Any) -> None:
+    if not isinstance(value, str) or value not in TONES:
+        raise ValueError(f"tone must be one of {', '.join(TONES)}, got {require.shown(value)}")
+
+
+@require.arguments(radiance=numbers("the radiance"), tone=_tone, stops=_stops)
+def display(
+    radiance: Float[Array, "*b"], *, tone: str = "srgb", stops: Float[Array, ""] | float = 0.0
+) -> Float[Array, "*b"]:
+    """Encodes linear radiance as sRGB, for display or for files of 8 bits.
+
+    Radiance is scaled by 2^stops, mapped to [0, 1] by a tone curve, and encoded by `encode_srgb`. Curves:
+
+    * "srgb": none. Values are clamped, so display values are radiance, and everything above 1 is white.
+    * "filmic": Hable 2010, the curve of Uncharted 2, with its exposure bias of 2 and its white of 11.2. For each color.
+    * "agx": Sobotka's AgX of Blender 4, base look, in the form of Filament and three.js. Bright colors become pale.
+    * "aces": Hill's fit of the ACES reference rendering transform, scaled by 1 / 0.6 as in three.js. Contrasty.
+
+    Args:
+        radiance: Linear radiance; the last axis is of three colors for "agx" and "aces".
+        tone: The curve.
+        stops: Exposure, such as `RelitScene.exposure` or `automatic_exposure` return it.
+
+    Raises:
+        TypeError: The radiance or `stops` does not consist of real numbers.
+        ValueError: The radiance holds NaN, has other than three colors for "agx" or "aces", `tone` is no curve's name,
+            or `stops` is not one number from -100 to 100.
+    """
+    if tone in ("agx", "aces") and radiance.shape[-1:] != (3,):
+        raise ValueError(f"the radiance must have three colors for the tone {tone!r}, got {list(radiance.shape)}")
+    return _displayed(radiance, stops, tone=tone)
+
+
+@functools.partial(jit, static_argnames="tone")
+def _displayed(radiance: Float[Array, "*b"], stops: Float[Array, ""] | float, *, tone: str) -> Float[Array, "*b"]:
+    return encode_srgb(toned(radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype)), tone, jnp))

@@ -11,7 +11,7 @@ import hashlib
 import pickle
 import threading
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -52,9 +52,9 @@ class Kept:
         option = {name: named[name] for name in self._static if name in named}
         operand = argument, {name: value for name, value in named.items() if name not in option}
         leaf, tree = jax.tree.flatten(operand)
-        if not (core.trace_state_clean() and _ordinary() and all(map(_concrete, leaf))):
+        if not (core.trace_state_clean() and _ordinary() and _concrete(leaf)):
             return self._compiled(*argument, **named)
-        aval = tuple((each.shape, str(each.dtype), getattr(each, "weak_type", False)) for each in leaf)
+        aval = tuple((each.shape, each.dtype, getattr(each, "weak_type", False)) for each in leaf)
         signature = tree, aval, tuple(sorted(option.items())), config.trace_context()
         try:
             executable = self._executables.get(signature)
@@ -79,6 +79,7 @@ class Kept:
     def _executable(self, operand: tuple, option: dict[str, Any], tree: Any, aval: tuple) -> Callable:
         """The executable from its file, or compiled and then kept."""
         argument, named = operand
+        aval = tuple((shape, str(dtype), weak) for shape, dtype, weak in aval)
         try:
             parts = (names.surroundings(), *map(names.described, (self._function, tree, aval, option)))
             name = hashlib.sha256("\n".join(parts).encode()).hexdigest()
@@ -111,15 +112,16 @@ def forget() -> None:
         each.forget()
 
 
-def _concrete(leaf: Any) -> bool:
-    """Whether a leaf is an array on the default device, with its values."""
-    if isinstance(leaf, np.ndarray | np.generic):
-        return jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype
-    return isinstance(leaf, jax.Array) and not isinstance(leaf, core.Tracer) and leaf.sharding == _place()
-
-
-def _place() -> SingleDeviceSharding:
-    return _place_of(jax.devices()[0])
+def _concrete(leaves: Sequence[Any]) -> bool:
+    """Whether all leaves are arrays on the default device, with their values."""
+    place = _place_of(jax.devices()[0])
+    for leaf in leaves:
+        if isinstance(leaf, np.ndarray | np.generic):
+            if jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
+                return False
+        elif not isinstance(leaf, jax.Array) or isinstance(leaf, core.Tracer) or leaf.sharding != place:
+            return False
+    return True
 
 
 @functools.cache

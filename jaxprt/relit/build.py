@@ -12,7 +12,7 @@ import tqdm
 from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import channels, groups, lamps, reflection, tracing, warn
+from jaxprt.relit import channels, groups, lamps, refinement, reflection, tracing, warn
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
@@ -37,6 +37,8 @@ def precompute(
     rate: float = 30.0,
     bounces: int | str | None = None,
     rays: int = RAYS,
+    refine: bool | float = True,
+    vertices: int | None = None,
     size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
@@ -44,11 +46,13 @@ def precompute(
 ) -> RelitScene:
     """Precomputes a scene for relighting: traces visibility at its vertices and fits the BRDFs of its parts.
 
-    All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all parts. Their colors
-    and strengths may change after precomputation. Holes, opacity and backs are those of the scene's materials.
+    Meshes are divided first where visibility needs it, as `jaxprt.refine` does, because visibility is interpolated
+    between vertices. All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all
+    parts. Their colors and strengths may change after precomputation. Holes, opacity and backs are those of the scene's
+    materials.
 
-    Parts with `back="lit"` get reversed copies of the faces whose backs can be seen (`jaxprt.scene.sides.two_sided`).
-    In `RelitScene.mesh` the copies of a part follow its vertices and faces.
+    Before that, parts with `back="lit"` get reversed copies of the faces whose backs can be seen
+    (`jaxprt.scene.sides.two_sided`). In `RelitScene.mesh` the copies of a part follow its vertices and faces.
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
@@ -66,6 +70,12 @@ def precompute(
             reflections are too sharp for the low-order harmonics that represent reflected light. 0 uses harmonics
             alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Only used with
             bounces; see `RelitScene.with_rays`.
+        refine: Largest relative L2 error that interpolation between vertices may cause in pictures, as `jaxprt.refine`
+            defines it; True for 0.015, False to keep the mesh. `RelitScene.mesh` is the divided mesh, and
+            `RelitScene.file_vertex` says which of its vertices are those of the scene. What is known of the lights,
+            `environments`, makes it sharper.
+        vertices: Largest number of vertices after division, with a warning where it is met. If None, twice as many as
+            the scene has, plus 10,000.
         size: Edge of the light's cubemap faces in texels, a power of two. If None, that of the plan's lights, or 64
             without a plan.
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.
@@ -88,7 +98,7 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    scene = sides.two_sided(scene)
+    scene, copied = sides.with_copies(scene)
     _check_options(size, error, rate, environments, rays, path, executor)
     reflection.check(bounces)
     folder = None if path is None else pathlib.Path(path)
@@ -96,6 +106,9 @@ def precompute(
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(f"path must name a folder, got the file {folder}")
         folder.mkdir(parents=True, exist_ok=True)
+    scene, divided = refinement.divided(
+        scene, refine, vertices=vertices, environments=environments, folder=folder, progress=progress
+    )
     if system is None:
         wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
         system, size = wanted.recipes, wanted.size if size is None else size
@@ -122,7 +135,8 @@ def precompute(
         target = Target(mesh, path=folder and folder / "scene", **options)
         reflected = reflection.make(shadings, place, bounces, target)
         lobes = reflection.lobes(shadings, place, systems) if rays else None
-    return RelitScene(scene, shadings, place, systems, reflected, lamps=lit, lobes=lobes, rays=rays)
+    given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
+    return RelitScene(scene, shadings, place, systems, reflected, **given)
 
 
 def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:

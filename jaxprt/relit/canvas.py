@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt.compile import jit, known, put
 from jaxprt.image.pixels import Pixels
-from jaxprt.scene import Environment
+from jaxprt.image.skies import pixel_angle
+from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
 
@@ -65,18 +66,32 @@ def points_of(
     return Points(corner, weight, slope), Points(of_group, weight, slope)
 
 
-@partial(jit, static_argnames="colors")
 def sky(
-    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+    environment: Environment, camera: Camera, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
 ) -> Float[Array, "h w _"]:
     """The environment where nothing hides it, in a number of colors.
 
     Args:
         environment: The light.
+        camera: The camera of the pixels.
         ray: Unit direction in world space from the eye through the center of each pixel.
         share: Fraction of each pixel that sees nothing else.
         colors: Number of colors of the picture.
     """
+    if environment.panorama is None or not known(environment, camera, ray, share):
+        return _texels_behind(environment, ray, share, colors=colors)
+    cover = np.asarray(share).reshape(-1)
+    seen = np.flatnonzero(cover > 0)
+    color = environment.panorama.sampled(np.asarray(ray).reshape(-1, 3)[seen], pixel_angle(camera).reshape(-1)[seen])
+    picture = np.zeros((len(cover), colors), environment.radiance.dtype)
+    picture[seen] = cover[seen, None] * color
+    return put(picture.reshape(*share.shape, colors))
+
+
+@partial(jit, static_argnames="colors")
+def _texels_behind(
+    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+) -> Float[Array, "h w _"]:
     behind = background(environment, ray)
     share = share.astype(behind.dtype)[..., None]
     picture = jnp.where(share > 0, share * behind, 0)

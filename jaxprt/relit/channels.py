@@ -3,7 +3,7 @@
 A metallic-roughness material is a sum of four fixed gray BRDFs whose weights are textures; see
 `jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, whose table over roughness all
 such materials share (`jaxprt.systems.standard`). An ideally diffuse material has one channel and no table. Parts of one
-`Kind` can share a system.
+`Kind` can share a system. A clear coat adds five channels, and the roughness of the coat as a second parameter.
 """
 
 import dataclasses
@@ -15,9 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness, grid
+from jaxprt.brdf import BlinnPhong, ClearCoat, Lambert, MetallicRoughness, grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit, known
 from jaxprt.scene import Mesh, Part, material_table
@@ -69,6 +70,13 @@ class Shading(eqx.Module):
         """Whether the surface is ideally diffuse."""
         return isinstance(self.brdf, Lambert)
 
+    @property
+    def smoothest(self) -> Any:
+        """Logarithm of the smallest roughness, as the standard table takes it: a tuple with that of the coat if any."""
+        assert self.blend is not None
+        least = tuple(float(np.min(np.asarray(each))) for each in self.blend.parameter)
+        return least if self.table is standard.COATED else least[0]
+
 
 class Appearance(eqx.Module):
     """A material evaluated at vertices or points, in the form that systems take.
@@ -92,6 +100,8 @@ def blend(look: Look, term: tuple[int, ...], scale: Float[Array | np.ndarray, " 
         varies: Whether the system takes the roughness of each point.
     """
     weight = look.coefficient[:, np.asarray(term)] / scale[:, None]
+    if term == standard.COATED.term:
+        return Blend(weight, (look.log_roughness, look.log_coat))
     return Blend(weight, (look.log_roughness,) if varies else ())
 
 
@@ -126,8 +136,15 @@ def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTa
         return Shading(part.mesh, brdf, brdf)
     look = _look(part) if look is None else look
     mesh, anisotropy = _framed(part)
-    exact = PerVertex(_metallic(look, anisotropy))
     emitted = look.emitted if np.any(look.emitted) else None
+    if look.coefficient.shape[1] > len(_NAMES) and np.any(look.coefficient[:, -1]):
+        table = standard.COATED
+        if anisotropy <= _EQUAL and takes(table):
+            exact = PerVertex(_coated(look))
+            own = blend(look, table.term, table.scale, varies=True)
+            return Shading(mesh, table.family, exact, table.knots, own, emitted, table.term, table.scale, table)
+        look = _without_coat(part.name, look)
+    exact = PerVertex(_metallic(look, anisotropy))
     needed = tuple(k for k in range(len(_NAMES)) if np.any(look.coefficient[:, k])) or _BARE
     if needed == _BARE:
         scale = np.ones(1, look.coefficient.dtype)
@@ -183,7 +200,12 @@ def rough(material: Any) -> Any:
     """A material of the same roughness as another, with everything else as by default."""
     if not isinstance(material, TexturedMaterial):
         return material
-    return TexturedMaterial(roughness=material.roughness, roughness_texture=material.roughness_texture)
+    return TexturedMaterial(
+        roughness=material.roughness,
+        roughness_texture=material.roughness_texture,
+        clearcoat_roughness=material.clearcoat_roughness,
+        clearcoat_roughness_texture=material.clearcoat_roughness_texture,
+    )
 
 
 def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
@@ -191,6 +213,24 @@ def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
     values = {name: value for name, value in look.values._asdict().items() if name != "emissive"}
     zero = 0 * values["roughness"]
     return MetallicRoughness(**values, anisotropy=zero + anisotropy, rotation=zero)
+
+
+def _coated(look: Look) -> ClearCoat:
+    """The BRDF of each vertex or point of a part with a clear coat."""
+    assert look.log_coat is not None
+    coat = look.coefficient[:, -1, 0]
+    return ClearCoat(_metallic(look, 0.0), coat, jnp.exp(look.log_coat))
+
+
+def _without_coat(name: str, look: Look) -> Look:
+    """The materials without their clear coats, with a warning."""
+    warnings.warn(
+        f"the clear coat of part {name!r} is left out: anisotropic materials, and systems without the standard tables, "
+        "have none",
+        stacklevel=3,
+    )
+    base = look.coefficient[:, : len(_NAMES)] + look.coefficient[:, len(_NAMES) : 2 * len(_NAMES)]
+    return look._replace(coefficient=np.concatenate([base, 0 * look.coefficient[:, len(_NAMES) :]], 1))
 
 
 def appearance(
@@ -229,6 +269,12 @@ def appearance(
 def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Part:
     """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
     shiny = shading.table is standard.BLINN_PHONG
+    coat = 0.0 if isinstance(material, BlinnPhong) else material.clearcoat
+    if shading.table is not standard.COATED and not isinstance(coat, Tracer) and float(coat):
+        raise ValueError(
+            f"part {part.name!r} was precomputed without a clear coat, got a material with one of weight "
+            f"{float(coat):g}: precompute it with a coat, of a weight of 1e-6 at least"
+        )
     if isinstance(material, BlinnPhong) != shiny:
         kind = "BlinnPhong" if shiny else "TexturedMaterial"
         raise TypeError(f"the material of part {part.name!r} must be a {kind}, got {type(material).__name__}")
@@ -283,7 +329,8 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
         values = look.values
         exponent = 2 / values.roughness**2 - 2
         return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
-    return own, PerVertex(_metallic(look, _anisotropy(shading)))
+    coated = shading.table is standard.COATED
+    return own, PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading)))
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None]:
@@ -294,7 +341,8 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None
     look = material_table.of_parts([part]).at(points)
-    return PerVertex(_metallic(look, _anisotropy(shading))), look.emitted
+    coated = shading.table is standard.COATED
+    return PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading))), look.emitted
 
 
 def _fits(name: str, shading: Shading, look: Look) -> Any:
@@ -363,6 +411,8 @@ def _check_frames(part: Part, shading: Shading, new: Part) -> None:
 
 def _anisotropy(shading: Shading) -> float:
     """The anisotropy that a part was precomputed with."""
+    if shading.table is standard.COATED:
+        return 0.0
     assert isinstance(shading.exact, PerVertex)
     assert isinstance(shading.exact.model, MetallicRoughness)
     return float(shading.exact.model.anisotropy[0])

@@ -16,11 +16,10 @@ from threadpoolctl import threadpool_limits
 from jaxprt.brdf import Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
-from jaxprt.image import Pixels, front, raster, relative_l2, resolve
+from jaxprt.image import Pixels, front, raster, relative_l2, resolve, skies
 from jaxprt.image.layers import nearest_fragments, visible_points
 from jaxprt.relit.channels import Shading, at_points, exact_at
-from jaxprt.scene import Camera, Environment, Mesh, Scene, sides
-from jaxprt.scene.environment import background
+from jaxprt.scene import Camera, Environment, Mesh, Scene, environment, sides
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.scene.scene import centered
 from jaxprt.systems import reference
@@ -116,8 +115,9 @@ def exact_pixels(
     pixel, weight = _chosen(shown, len(scene.parts), pixels, importance)
     triangle, barycentric, seen, owner = triangle[pixel], barycentric[pixel], seen[pixel], owner[pixel]
     way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
-    sky = np.stack([background(each, way) for each in environments])
-    mean = np.where((owner < 0)[..., None], sky, 0).mean(2)
+    angle = _squares(skies.pixel_angle(fine))[pixel]
+    behind = np.stack([environment.sky(each, way, angle=angle) for each in environments])
+    mean = np.where((owner < 0)[..., None], behind, 0).mean(2)
     half = np.zeros_like(mean)
     first = 0
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
@@ -201,9 +201,8 @@ def exact_picture(
             brdf, emitted = exact_at(part, shading, points)
             value = _sum(shading.mesh, brdf, lights, points, **options)
         color[:, index] = value if emitted is None else value + emitted
-    way = raster.ray_direction(camera)
-    skies = [background(each, way) for each in environments]
-    pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, skies, strict=True)]
+    behind = [skies.sky(each, camera) for each in environments]
+    pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     if (camera.width, camera.height) != (asked.width, asked.height):
         asked = dataclasses.replace(asked, width=camera.width, height=camera.height)
     return ExactPicture(asked, np.stack(pictures))

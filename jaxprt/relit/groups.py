@@ -5,7 +5,7 @@ another in their group, and where each part stands is known on the host.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -15,19 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh
 from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
-from jaxprt.scene.mesh import join
+from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import DiffuseSystem
 from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.lobe import MatteSystem
 from jaxprt.systems.protocol import Blend, System
 
 _FEWEST = 64  # vertices of a group
@@ -38,6 +40,9 @@ class Surface(eqx.Module):
 
     Attributes:
         system: The system of direct light from the environment.
+        position: Positions of the vertices.
+        frame: Their shading frames; rows are tangent, bitangent, normal.
+        brdf: The BRDF, with one channel for each weight of a blend.
         reflecting: How they reflect light from other surfaces; None without bounces.
         lit: How they reflect light from lamps; None without lamps.
         scale: Factor of each channel of the BRDF; None for a BRDF that cannot change.
@@ -46,6 +51,9 @@ class Surface(eqx.Module):
     """
 
     system: System
+    position: Float[Array, "v 3"]
+    frame: Float[Array, "v 3 3"]
+    brdf: Callable
     reflecting: ReflectingPart | None
     lit: LitByLamps | None
     scale: Float[Array, " k"] | None
@@ -62,7 +70,7 @@ class Surface(eqx.Module):
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
         own = self.system.system if isinstance(self.system, BrightTexels) else self.system
-        return isinstance(own, DiffuseSystem)
+        return isinstance(own, DiffuseSystem | MatteSystem)
 
     @property
     def channels(self) -> int:
@@ -250,11 +258,9 @@ class Stage(eqx.Module):
     hidden: tuple[bool, ...] = eqx.field(static=True)
 
     @property
-    def hidden_faces(self) -> Bool[np.ndarray, " f"] | None:
+    def hidden_faces(self) -> Bool[Array | np.ndarray, " f"] | None:
         """Triangles that cameras do not see from behind; None without."""
-        if not any(self.hidden):
-            return None
-        return np.asarray(self.hidden)[self.part[np.asarray(self.whole.face)[:, 0]]]
+        return None if not any(self.hidden) else faces_of(self.whole, np.asarray(self.hidden)[self.part])
 
     @property
     def face(self) -> Int[Array | np.ndarray, "f 3"]:
@@ -319,6 +325,11 @@ class Stage(eqx.Module):
 
 
 def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:
+    """Projects an environment for the systems of all groups and for bounces."""
+    return SceneLight(direct(surfaces, environment), None if bounces is None else bounces.light(environment))
+
+
+def direct(surfaces: Sequence[Surface], environment: Environment) -> tuple[PyTree, ...]:
     """Projects an environment for the systems of all groups. Systems with the same `shared_light` share one result."""
     made: dict[Any, PyTree] = {}
     result = []
@@ -328,7 +339,7 @@ def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment
         if key is not None:
             made[key] = lit
         result.append(lit)
-    return SceneLight(tuple(result), None if bounces is None else bounces.light(environment))
+    return tuple(result)
 
 
 def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]]:
@@ -356,6 +367,13 @@ def alike(one: Shading, other: Shading) -> bool:
     return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in zip(*leaves, strict=True))
 
 
+def faces_of(mesh: Mesh, vertex: Bool[np.ndarray, " v"]) -> Bool[Array | np.ndarray, " f"]:
+    """What holds for the first vertex of each triangle, in NumPy unless JAX traces the mesh."""
+    if known(mesh.face):
+        return vertex[np.asarray(mesh.face)[:, 0]]
+    return jnp.asarray(vertex)[mesh.face[:, 0]]
+
+
 def joined_mesh(shadings: Sequence[Shading]) -> Mesh:
     """The meshes of several parts as one mesh, whose regions are the parts."""
     meshes = [shading.mesh for shading in shadings]
@@ -373,14 +391,38 @@ def joined(shadings: Sequence[Shading]) -> Shading:
     return dataclasses.replace(first, blend=blend)
 
 
-def surface(shading: Shading, system: System, reflecting: ReflectingPart | None, lit: LitByLamps | None) -> Surface:
-    """The group of parts of which one is given."""
-    scale = (
-        None
-        if shading.scale is None or shading.blend is None
-        else jax.device_put(np.asarray(shading.scale, jnp.result_type(float)))
-    )
-    return Surface(system, reflecting, lit, scale, shading.term, bool(shading.knot))
+def surface(
+    number: int,
+    shadings: Sequence[Shading],
+    place: Place,
+    system: System,
+    reflecting: ReflectingPart | None,
+    lit: LitByLamps | None,
+) -> Surface:
+    """A group of a scene.
+
+    Args:
+        number: Index of the group.
+        shadings: The `Shading` of each part of the scene.
+        place: Where the vertices of the parts stand.
+        system: The system of direct light.
+        reflecting: How the group reflects light from other surfaces; None without bounces.
+        lit: How it reflects light from lamps; None without lamps.
+    """
+    members = [shadings[part] for part in place.parts[number]]
+    shading, dtype = members[0], jnp.result_type(float)
+    scale = None
+    if shading.scale is not None and shading.blend is not None:
+        scale = jax.device_put(np.asarray(shading.scale, dtype))
+    if isinstance(system, BrightTexels):
+        position, frame = system.visibility.position, system.visibility.frame
+    else:
+        pairs = [(np.asarray(own.mesh.position, dtype), frames(own.mesh.normal, own.mesh.tangent)) for own in members]
+        position, frame = (
+            jax.device_put(place.column(number, rows).astype(dtype)) for rows in zip(*pairs, strict=True)
+        )
+    brdf, varies = grid.as_argument(shading.brdf), bool(shading.knot)
+    return Surface(system, position, frame, brdf, reflecting, lit, scale, shading.term, varies)
 
 
 def spread(values: Sequence[Any], counts: Sequence[int], size: int, dtype: Any) -> Any:
@@ -425,7 +467,8 @@ def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -
     if rough is None:
         return look
     with compile_time(rough, points):
-        return look._replace(log_roughness=rough.at(points).log_roughness)
+        plain = rough.at(points)
+    return look._replace(log_roughness=plain.log_roughness, log_coat=plain.log_coat)
 
 
 @jit

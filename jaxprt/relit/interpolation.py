@@ -51,7 +51,7 @@ def curvature(shading: Shading, system: System) -> float:
     if shading.table is not None:
         assert shading.blend is not None
         weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
-        return shading.table.curvature(float(np.min(np.asarray(shading.blend.parameter[0]))), weight, degree_of)
+        return shading.table.curvature(shading.smoothest, weight, degree_of)
     brdf: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     wo = jnp.asarray(_VIEW)
     mirror = jnp.asarray(_VIEW * [-1, -1, 1])

@@ -61,9 +61,9 @@ def factored(shading: Shading) -> Path:
 
 @functools.cache
 def _standard(table: StandardTable) -> Path:
-    if table is standard.METALLIC_ROUGHNESS:
+    if table in (standard.METALLIC_ROUGHNESS, standard.COATED):
         return Path(*table.paths())
-    return _factored(table.family, table.family, (table.knot,))
+    return _factored(table.family, table.family, table.knots)
 
 
 def _factored(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
@@ -117,7 +117,7 @@ def still(shading: Shading) -> Callable:
     if not shading.knot:
         return shading.brdf
     assert shading.blend is not None
-    return shading.brdf(jnp.asarray(np.mean(shading.blend.parameter[0])))
+    return shading.brdf(*(jnp.asarray(np.mean(each)) for each in shading.blend.parameter))
 
 
 def widened(brdf: Callable) -> Callable:

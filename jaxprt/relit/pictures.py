@@ -18,10 +18,11 @@ from jaxprt.compile import Between, compile_time, finished, jit, known, promoted
 from jaxprt.image import raster
 from jaxprt.image.layers import visible_points
 from jaxprt.image.pixels import Pixels
-from jaxprt.relit import canvas, interpolation, tracing
+from jaxprt.relit import canvas, interpolation, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
-from jaxprt.relit.surface import Viewed, carried, lit, view
+from jaxprt.relit.shadows import TexelShares, TracedLight
+from jaxprt.relit.surface import Interpolated, Viewed, between, carried, from_texels, lit, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.material_table import Look
@@ -48,7 +49,7 @@ class Row(eqx.Module):
     samples: int = eqx.field(static=True)
     interpolated: bool = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
-    kept: Viewed | None
+    kept: Viewed | Interpolated | None
 
 
 class VertexRow(eqx.Module):
@@ -74,7 +75,8 @@ class PictureView(eqx.Module):
 
     Attributes:
         stage: The scene and its materials.
-        arriving: Function from an environment to the light that arrives at the scene.
+        arriving: Function from an environment to the light that arrives at the scene; its second argument, if it is not
+            None, takes the place of the environment in direct light.
         camera: The camera of the drawn pixels.
         pixels: The points of the picture.
         ray: Unit direction in world space from the eye through the center of each drawn pixel.
@@ -82,10 +84,13 @@ class PictureView(eqx.Module):
         vertices: Vertices between which radiance is interpolated, in rows that are shaded together.
         reflected: Traced reflections of the points of sharp groups, in the order of their rows; None without.
         fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
+        shadows: "rays" to trace the brightest texels of each light; "vertices" to interpolate them.
+        keep: Whether what does not depend on the light is kept.
+        shares: The texels that were traced when the view was made; None to choose them by each light.
     """
 
     stage: Stage
-    arriving: Callable[[Environment], Arriving]
+    arriving: Callable[[Environment, Environment | None], Arriving]
     camera: Camera
     pixels: Pixels
     ray: Float[Array, "h w 3"]
@@ -93,6 +98,9 @@ class PictureView(eqx.Module):
     vertices: tuple[VertexRow, ...]
     reflected: Reflections | None = None
     fold: int = eqx.field(static=True, default=1)
+    shadows: str = eqx.field(static=True, default="vertices")
+    keep: bool = eqx.field(static=True, default=False)
+    shares: TexelShares | None = None
 
     @promoted
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
@@ -108,67 +116,119 @@ class PictureView(eqx.Module):
         require.colors("the light", environment.radiance)
         if environment.radiance.ndim != 4:
             raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
-        arriving = finished(self.arriving(environment), between)
+        light = _traced_light(self, environment)
+        arriving = finished(self.arriving(environment, None if light is None else light.rest), between)
         vertices = _vertices(self, arriving, between)
-        traced = iter(()) if self.reflected is None else iter(self.reflected.radiance(self.stage, arriving))
+        reflected = iter(()) if self.reflected is None else iter(_reflections(self, environment, arriving, light))
         colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
         recompute = not known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = _color(self, row, arriving, vertices, recompute=recompute)
+            color = _color(self, row, arriving, light, vertices, recompute=recompute)
             if row.number in sharp:
-                color = color + next(traced)
+                color = color + next(reflected)
             rows.append((row.index, finished(color, between)))
             colors = max(colors, color.shape[-1])
-        picture = canvas.sky(environment, self.ray, self.pixels.background, colors=colors)
+        picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
         for index, color in rows:
             picture = canvas.drawn(picture, self.pixels, index, color)
         return picture if self.fold == 1 else _folded(picture, fold=self.fold)
 
 
+def _traced_light(picture: PictureView, environment: Environment) -> TracedLight | None:
+    """The light with traced texels; None if visibility of all texels is interpolated."""
+    if picture.shares is not None:
+        return shadows.fixed(environment, picture.shares)
+    if picture.shadows == "vertices":
+        return None
+    return shadows.trace(picture.stage.whole, picture.pixels, picture.camera.width, environment, keep=picture.keep)
+
+
+def _reflections(
+    picture: PictureView, environment: Environment, arriving: Arriving, light: TracedLight | None
+) -> list[Float[Array, "_ c"]]:
+    """Traced reflections, of the whole light: what rays hit is shaded with interpolated visibility."""
+    assert picture.reflected is not None
+    whole = arriving if light is None else picture.arriving(environment, None)
+    return picture.reflected.radiance(picture.stage, whole)
+
+
 def _color(
-    picture: PictureView, row: Row, arriving: Arriving, vertices: dict[int, Array], *, recompute: bool
+    picture: PictureView,
+    row: Row,
+    arriving: Arriving,
+    light: TracedLight | None,
+    vertices: dict[int, Array],
+    *,
+    recompute: bool,
 ) -> Float[Array, "*m p c"]:
     """Colors of the points of a row.
 
     Args:
         picture: The picture.
         row: The points.
-        arriving: The light that arrives at the scene.
+        arriving: The light that arrives at the scene, without what is taken out of traced texels.
+        light: The light with its traced texels; None without.
         vertices: Radiance of each channel at the vertices of groups that are interpolated.
         recompute: Whether derivatives compute again what depends on the view, which needs less memory.
     """
-    surface, stage = sampled(picture.stage.surfaces[row.number], row.samples), picture.stage
+    surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
-        return _color_of_some(picture, row, arriving)
+        return _color_of_some(picture, row, arriving, light)
     if row.interpolated:
-        points, on_group = _points(picture, row.index)
-        return carried(
-            surface, vertices[row.number], on_group, look_at(stage.table, stage.rough, points), stage.given[row.number]
-        )
+        seen = _between(picture.stage, row, picture.pixels, picture.camera) if row.kept is None else row.kept
+        color = carried(vertices[row.number], seen)
+        return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
     if row.kept is not None:
-        return lit(surface, arriving.at(row.number), row.kept)
-    shade = partial(_shaded, picture, surface, row.number, row.index)
-    return (jax.checkpoint(shade) if recompute else shade)(arriving)
+        return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
+    shade = partial(_shaded, picture, surface, row, row.index)
+    return (jax.checkpoint(shade) if recompute else shade)(arriving, light)
 
 
-def _shaded(picture: PictureView, surface: Surface, number: int, index: Any, arriving: Arriving) -> Float[Array, "p c"]:
+def _shaded(
+    picture: PictureView, surface: Surface, row: Row, index: Any, arriving: Arriving, light: TracedLight | None
+) -> Float[Array, "p c"]:
     points, on_group = _points(picture, index)
-    seen = _seen(picture.stage, surface, number, points, on_group, picture.camera)
-    return lit(surface, arriving.at(number), seen)
+    seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera)
+    return _lit(surface, row.samples, arriving.at(row.number), light, index, seen)
 
 
-def _color_of_some(picture: PictureView, row: Row, arriving: Arriving) -> Float[Array, "m p c"]:
+def _lit(
+    surface: Surface, samples: int, arriving: tuple, light: TracedLight | None, index: Any, seen: Viewed
+) -> Float[Array, "p c"]:
+    """Colors of points at which radiance is computed."""
+    color = lit(surface, arriving, seen)
+    return color if light is None else color + _from_texels(surface, samples, seen, light, index)
+
+
+def _from_texels(
+    surface: Surface, samples: int, seen: Viewed | Interpolated, light: TracedLight, index: Any
+) -> Float[Array, "p c"]:
+    """Radiance that points reflect from the traced texels of the light."""
+    size = light.rest.radiance.shape[-2]
+    return from_texels(surface, seen.sight, *light.row(index), size=size, samples=samples)
+
+
+def _color_of_some(
+    picture: PictureView, row: Row, arriving: Arriving, light: TracedLight | None
+) -> Float[Array, "m p c"]:
     """`_color` inside of `jax.jit`, where most rows may be padding alone."""
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
-    shape = jax.eval_shape(lambda: _shaded(picture, surface, row.number, row.index[0], arriving))
+    shape = jax.eval_shape(lambda: _shaded(picture, surface, row, row.index[0], arriving, light))
     none = jnp.zeros(shape.shape, shape.dtype)
 
     def some(index: Array) -> Array:
-        shade = jax.checkpoint(partial(_shaded, picture, surface, row.number, index))
-        return jax.lax.cond(jnp.any(index >= 0), shade, lambda _: none, arriving)
+        shade = jax.checkpoint(partial(_shaded, picture, surface, row, index))
+        return jax.lax.cond(jnp.any(index >= 0), shade, lambda *_: none, arriving, light)
 
     return jax.lax.map(some, row.index)
+
+
+def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera) -> Interpolated:
+    """What does not depend on the light, for a row of points to which radiance is interpolated."""
+    points, on_group = canvas.points_of(pixels, stage.face, stage.shift, row.index)
+    look = look_at(stage.table, stage.rough, points)
+    return between(stage.surfaces[row.number], on_group, look, jnp.asarray(camera.eye), stage.given[row.number])
 
 
 def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
@@ -182,35 +242,45 @@ def _vertices(picture: PictureView, arriving: Arriving, between: Between) -> dic
         surface = stage.surfaces[row.number]
         seen = _seen_alone(stage, row, picture.camera) if row.kept is None else row.kept
         lit_rows.append(finished(lit(surface, arriving.at(row.number), seen), between))
-    colors: dict[int, np.ndarray] = {}
-    for row, color in zip(picture.vertices, map(np.asarray, lit_rows), strict=True):
+    host = known(lit_rows)  # How many vertices are shaded depends on the view.
+    colors: dict[int, Any] = {}
+    for row, color in zip(picture.vertices, map(np.asarray, lit_rows) if host else lit_rows, strict=True):
         shape = (stage.surfaces[row.number].channels, stage.place.size[row.number], color.shape[1])
-        colors.setdefault(row.number, np.zeros(shape, color.dtype))[row.channel, row.vertex] = color
+        if row.number not in colors:
+            colors[row.number] = (np if host else jnp).zeros(shape, color.dtype)
+        if host:
+            colors[row.number][row.channel, row.vertex] = color
+        else:
+            colors[row.number] = colors[row.number].at[row.channel, row.vertex].set(color)
     return {number: put(color) for number, color in colors.items()}
 
 
 def make(
     stage: Stage,
-    arriving: Callable[[Environment], Arriving],
+    arriving: Callable[[Environment, Environment | None], Arriving],
     camera: Camera,
     *,
     samples: int,
     keep: bool,
+    shadow: str | Environment,
     between: Between,
 ) -> PictureView:
     """Finds the shaded points of a picture, and computes what depends on the camera and the materials.
 
     Args:
         stage: The scene and its materials.
-        arriving: Function from an environment to the light that arrives at the scene.
+        arriving: Function from an environment to the light that arrives at the scene; see `PictureView`.
         camera: The camera, relative to the origin of the scene.
         samples: Number of coverage samples of each pixel: 1, 4 or 16.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
+        shadow: "rays" or "vertices", or the light whose brightest texels are traced for all lights.
         between: Function that is called between steps of the work, as in `RelitScene.picture`.
 
     Raises:
-        ValueError: `samples` is not 1, 4 or 16.
+        ValueError: `samples` is not 1, 4 or 16, or `shadow` is another word.
     """
+    if not isinstance(shadow, Environment) and shadow not in ("rays", "vertices"):
+        raise ValueError(f'shadows must be "rays", "vertices" or an Environment, got {require.shown(shadow)}')
     if type(samples) is not int or samples not in SAMPLES:
         raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
     samples, fold = SAMPLES[samples]
@@ -220,7 +290,10 @@ def make(
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
         surface = sampled(stage.surfaces[row.number], row.samples)
-        stores = keep and not row.interpolated and not isinstance(row.index, Tracer)
+        stores = keep and not isinstance(row.index, Tracer)
+        if stores and row.interpolated:
+            row = dataclasses.replace(row, kept=_between(stage, row, pixels, camera))
+            stores = False
         if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
@@ -233,7 +306,13 @@ def make(
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
     vertices = tuple(_vertex_rows(stage, between_vertices, camera, keep=keep))
-    return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold)
+    shares, way = None, shadow
+    if isinstance(shadow, Environment):
+        traced, way = shadows.trace(stage.whole, pixels, camera.width, shadow, keep=False), "vertices"
+        shares = None if traced is None else put(traced.shares)
+    return PictureView(
+        stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold, way, keep, shares
+    )
 
 
 def _vertex_rows(
@@ -312,14 +391,14 @@ def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]
 def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera: Camera) -> tuple[tuple[int, ...], ...]:
     """Parts of each group whose radiance is interpolated between vertices: where that is accurate, and less work.
 
-    Not for ideally diffuse groups, whose radiance is linear in the interpolated transfer, nor where users give
-    materials at vertices, nor inside of `jax.jit`.
+    Ideally diffuse groups count as accurate: their radiance is linear in the light that arrives at the vertices. Not
+    where users give materials at vertices, nor inside of `jax.jit`.
     """
     nothing = ((),) * len(stage.surfaces)
     if not known(camera, stage.bend):
         return nothing
     place, seen = stage.place, np.bincount(owner[owner >= 0], minlength=len(stage.samples))
-    free = [not surface.matte and given is None for surface, given in zip(stage.surfaces, stage.given, strict=True)]
+    free = [given is None for given in stage.given]
     channels = [surface.channels for surface in stage.surfaces]
     may = [
         free[group] and count > channels[group] * n
@@ -329,7 +408,8 @@ def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera:
         return nothing
     wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
     square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
-    good = np.asarray(may) & (square <= _ERROR**2 * seen)
+    matte = np.asarray([stage.surfaces[group].matte for group in place.group])
+    good = np.asarray(may) & (matte | (square <= _ERROR**2 * seen))
     result = []
     for number, parts in zip(channels, place.parts, strict=True):
         accurate = tuple(part for part in parts if good[part])

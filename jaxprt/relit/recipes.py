@@ -136,17 +136,16 @@ class Lobes(eqx.Module):
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
         transport = _padded(_pyramid(shading.mesh, target), vertices)
         if isinstance(shading.brdf, Lambert):
-            vectors = harmonic.TransferVector(transport.vector[:, None], transport.position)
-            matte = harmonic.DiffuseSystem(vectors, shading.brdf.albedo)
+            matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.brdf.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
         table = lobe_table(shading, self.lobes)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
-        """Smallest number of bytes: the visibility pyramids, or bits and transfer vectors for a Lambertian part."""
+        """Smallest number of bytes: transfer vectors, and visibility as pyramids, or as bits for a Lambertian part."""
         if isinstance(shading.brdf, Lambert):
-            return vertices * (6 * size**2 // 8 + 4 * (lobe.pyramid.DEGREE + 1) ** 2)
-        return vertices * lobe.pyramid.scales(size).total
+            return vertices * (6 * size**2 // 8 + lobe.diffuse.count(size))
+        return vertices * (lobe.pyramid.scales(size).total + lobe.diffuse.count(size))
 
 
 class Harmonics(eqx.Module):
@@ -304,7 +303,7 @@ def samples_of(shading: Shading, size: int) -> int:
         return 1
     if shading.table is not None:
         assert shading.blend is not None
-        return shading.table.samples(float(np.min(np.asarray(shading.blend.parameter[0]))), size)
+        return shading.table.samples(shading.smoothest, size)
     sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     return bright_texels.samples_for(sharpest, size=size)
 

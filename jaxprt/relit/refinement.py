@@ -1,10 +1,48 @@
 """Refines the meshes of a scene where shadows are finer than the vertices."""
 
+import pathlib
 from collections.abc import Sequence
 
+import equinox as eqx
+import filelock
+import jax
+import numpy as np
+from jaxtyping import Int
+
 from jaxprt import require
+from jaxprt.brdf.varying import PerVertex
+from jaxprt.files import objects
 from jaxprt.scene import Environment, Scene, subdivision
-from jaxprt.visibility import refinement
+from jaxprt.scene.subdivision import Division
+from jaxprt.visibility import blocks, refinement, shown
+
+ERROR = 0.015  # of pictures, by default
+_ROOM = 10_000  # vertices that division may add to a scene of few, by default
+
+
+class MeshDivision(eqx.Module):
+    """How the meshes of a scene were divided.
+
+    Attributes:
+        key: Fingerprint of the scene before, and of the settings.
+        face: For each step, the triangles after it.
+        origin: For each step, the triangle from which each was cut.
+        parent: For each step, the two vertices between which each added vertex lies.
+        counts: Number of vertices of each part before.
+        error: Relative L2 error of pictures that is left, estimated.
+    """
+
+    key: str
+    face: tuple[Int[np.ndarray, "_ 3"], ...]
+    origin: tuple[Int[np.ndarray, " _"], ...]
+    parent: tuple[Int[np.ndarray, "_ 2"], ...]
+    counts: tuple[int, ...]
+    error: float
+
+    @property
+    def steps(self) -> list[Division]:
+        """The steps, for `subdivision`."""
+        return [Division(*step) for step in zip(self.face, self.origin, self.parent, strict=True)]
 
 
 def refine(
@@ -44,6 +82,90 @@ def refine(
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     require.number("error", error, 0.0)
     require.count("vertices", vertices, least=1)
-    mesh = scene.mesh
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
-    return subdivision.subdivide_scene(scene, refinement.divisions(mesh, mesh, **options))
+    return subdivision.subdivide_scene(scene, _divisions(scene, **options)[0])
+
+
+def divided(
+    scene: Scene,
+    wanted: bool | float,
+    *,
+    vertices: int | None,
+    environments: Sequence[Environment] | None,
+    folder: pathlib.Path | None,
+    progress: bool,
+) -> tuple[Scene, MeshDivision | None]:
+    """A scene divided as `jaxprt.precompute` asks for, and how; None if it stays as it is.
+
+    Args:
+        scene: The scene.
+        wanted: Largest relative L2 error; True for the default, False to keep the meshes.
+        vertices: Largest number of vertices; None for the default.
+        environments: Lights, as in `refine`.
+        folder: Folder in which the division is stored.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        TypeError: `wanted` is neither a number nor a truth value.
+        ValueError: `wanted` is negative, or the stored division is of another scene.
+    """
+    if isinstance(wanted, bool | np.bool_):
+        if not wanted:
+            return scene, None
+        wanted = ERROR
+    require.number("refine", wanted, 0.0)
+    count = sum(len(part.mesh.position) for part in scene.parts)
+    most = 2 * count + _ROOM if vertices is None else vertices
+    require.count("vertices", most, least=1)
+    if any(isinstance(part.material, PerVertex) for part in scene.parts) or not any(
+        len(part.mesh.face) for part in scene.parts
+    ):
+        return scene, None
+    options = {"error": float(wanted), "vertices": most, "environments": environments, "progress": progress}
+    division = _stored(scene, folder, options)
+    return (subdivision.subdivide_scene(scene, division.steps), division) if division.face else (scene, None)
+
+
+def _stored(scene: Scene, folder: pathlib.Path | None, options: dict) -> MeshDivision:
+    """The division of a scene, made once for a folder."""
+    if folder is None:
+        return _made(scene, "", options)
+    lights = [np.asarray(light.radiance) for light in options["environments"] or ()]
+    cameras = [np.concatenate([np.ravel(value) for value in (camera.eye, camera.target)]) for camera in scene.cameras]
+    settings = np.asarray([options["error"], options["vertices"], refinement.ALGORITHM], np.float64)
+    key = blocks.fingerprint(*(np.asarray(each) for each in (*_geometry(scene), settings, *cameras, *lights)))
+    with filelock.FileLock(folder / ".division.lock"):
+        path = folder / "division"
+        if path.exists():
+            found = objects.load(path)
+            if not isinstance(found, MeshDivision):
+                raise ValueError(f"{path} is damaged: it must hold a division, got a {type(found).__name__}")
+            if found.key != key:
+                raise ValueError(
+                    f"{path} divides another scene, or for other cameras, lights, `refine` or `vertices`: name another "
+                    "path or delete it"
+                )
+            return found
+        made = _made(scene, key, options)
+        objects.save(path, made)
+        return made
+
+
+def _geometry(scene: Scene) -> list[np.ndarray]:
+    mesh = scene.mesh
+    return [np.asarray(each) for each in (mesh.position, mesh.normal, mesh.face, mesh.region)] + [
+        np.asarray(each) for each in jax.tree.leaves(mesh.opacity)
+    ]
+
+
+def _made(scene: Scene, key: str, options: dict) -> MeshDivision:
+    steps, error = _divisions(scene, **options)
+    face, origin, parent = zip(*steps, strict=True) if steps else ((), (), ())
+    counts = tuple(len(part.mesh.position) for part in scene.parts)
+    return MeshDivision(key, face, origin, parent, counts, error)
+
+
+def _divisions(scene: Scene, **options) -> tuple[list[Division], float]:
+    mesh = scene.mesh
+    views = shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
+    return refinement.divisions(mesh, mesh, views=views, **options)

@@ -148,7 +148,7 @@ def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
     if shading.table is not None:
         assert shading.blend is not None
         weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
-        return shading.table.is_sharp(float(np.min(np.asarray(shading.blend.parameter[0]))), weight)
+        return shading.table.is_sharp(shading.smoothest, weight)
     return bool(traced.is_sharp(table))
 
 

@@ -51,7 +51,7 @@ class RegionsView(eqx.Module):
             view = system.view(jnp.asarray(self.camera.eye), self.materials) if self.kept is None else self.kept[number]
             colors.append(system.combine(arriving, view))
         most = max([environment.radiance.shape[-1], *(each.shape[-1] for each in colors)])
-        picture = canvas.sky(environment, self.ray, self.pixels.background, colors=most)
+        picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=most)
         for index, color in zip(self.index, colors, strict=True):
             picture = canvas.drawn(picture, self.pixels, index.reshape(-1), color)
         return picture

@@ -9,21 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
+from jaxprt.image import automatic_exposure, layers
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
+from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Shading, appearance
 from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surface
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import samples_of
+from jaxprt.relit.refinement import MeshDivision
 from jaxprt.relit.surface import combine, view_of
 from jaxprt.relit.tracing import Reflections
-from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, sides
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, sides, subdivision
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
@@ -84,6 +87,8 @@ class RelitScene(System):
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether reflections of each part are traced.
         rays: Number of reflection rays that each vertex or point of a sharp part sends.
+        division: How the meshes were divided; None for the meshes as they were.
+        copied: For each part, the vertices of the file that have a copy for their back. The copies follow the file's.
     """
 
     scene: Scene
@@ -103,6 +108,8 @@ class RelitScene(System):
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     rays: int = eqx.field(static=True)
+    division: MeshDivision | None
+    copied: tuple[Int[np.ndarray, " _"], ...]
 
     def __init__(
         self,
@@ -115,6 +122,8 @@ class RelitScene(System):
         lamps: SceneLamps | None = None,
         lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
+        division: MeshDivision | None = None,
+        copied: Sequence[Int[np.ndarray, " _"]] | None = None,
     ):
         """Joins the parts.
 
@@ -128,8 +137,12 @@ class RelitScene(System):
             lobes: BRDF, as lobes, of each group with sharp parts, and None for other groups. None if no part is sharp.
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
+            division: How the meshes of the scene were divided; None if they were not.
+            copied: For each part, the vertices that `sides.with_copies` has copied; None for none.
         """
         tracing.check_rays(rays)
+        self.division = division
+        self.copied = (np.zeros(0, np.int64),) * len(scene.parts) if copied is None else tuple(copied)
         # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
@@ -147,18 +160,41 @@ class RelitScene(System):
         self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
-                shading[members[0]],
+                number,
+                shading,
+                place,
                 system,
                 None if bounces is None else bounces.group[number],
                 None if lamps is None else lamps.group[number],
             )
-            for number, (members, system) in enumerate(zip(place.parts, systems, strict=True))
+            for number, system in enumerate(systems)
         )
         pairs = zip(shading, place.group, strict=True)
         found = [traits(each, systems[number], self.lobes[number]) for each, number in pairs]
         curvature, samples, sharp = zip(*found, strict=True)
         self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
+
+    @property
+    def file_vertex(self) -> Int[np.ndarray, " _"]:
+        """Index in `mesh` of each vertex of the scene before backs were copied and meshes divided, part by part."""
+        own = [np.arange(count - len(copies)) for count, copies in zip(self._whole_counts(), self.copied, strict=True)]
+        return np.concatenate([first + index for first, index in zip(self.place.first, own, strict=True)])
+
+    def _whole_counts(self) -> list[int]:
+        """Number of vertices of each part with copies for its back, before its mesh was divided."""
+        return list(self.place.counts if self.division is None else self.division.counts)
+
+    def _divided(self, number: int, given: Blend | Appearance) -> Blend | Appearance:
+        """Materials at the vertices of a part, copied and interpolated to the added ones if they are of the file's."""
+        counts, copies = self._whole_counts(), self.copied[number]
+        count = counts[number] - len(copies)
+        rows = {len(leaf) for leaf in jax.tree.leaves(given) if np.ndim(leaf)}
+        if count == self.place.counts[number] or rows != {count}:
+            return given
+        parents = [] if self.division is None else subdivision.part_parents(counts, self.division.parent)[number]
+        source = np.concatenate([np.arange(count), copies])
+        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), given)
 
     @property
     def direct(self) -> "RelitScene":
@@ -405,6 +441,7 @@ class RelitScene(System):
         *,
         materials: Mapping[str, Any] | None = None,
         samples: int = 4,
+        shadows: str = "rays",
         between: Between = None,
     ) -> Float[Array, "h w c"]:
         """Renders the scene under an environment, in linear radiance.
@@ -420,6 +457,9 @@ class RelitScene(System):
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
                 than 4, and matters where sharp highlights are smaller than a pixel.
+            shadows: "rays" traces shadows of the brightest texels from the points of the picture, so that they are
+                sharp on any mesh. "vertices" interpolates visibility between vertices, which is always done where JAX
+                traces the light or the camera. Rays are constants of derivatives.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
@@ -431,12 +471,19 @@ class RelitScene(System):
                 gives.
             ValueError: The environment is a batch, `samples` is another number, or for the reasons that `view` gives.
         """
-        view = self._picture_view(camera, materials, samples=samples, keep=False, between=between)
+        if not isinstance(shadows, str):
+            raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
+        view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
         return view.picture(environment, between=between)
 
     @promoted
     def picture_view(
-        self, camera: Camera | None = None, *, materials: Mapping[str, Any] | None = None, samples: int = 4
+        self,
+        camera: Camera | None = None,
+        *,
+        materials: Mapping[str, Any] | None = None,
+        samples: int = 4,
+        shadows: str | Environment = "rays",
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
@@ -448,8 +495,57 @@ class RelitScene(System):
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
                 than 4, and matters where sharp highlights are smaller than a pixel.
+            shadows: "rays" and "vertices" as in `picture`. With "rays", texels that earlier lights had in common are
+                not traced again. A light traces its brightest texels now, for all pictures of the view, also inside of
+                `jax.jit`.
         """
-        return self._picture_view(camera, materials, samples=samples, keep=True, between=None)
+        return self._picture_view(camera, materials, samples=samples, keep=True, shadow=shadows, between=None)
+
+    @promoted
+    def coverage(self, camera: Camera | None = None, *, samples: int = 4) -> Float[Array, "h w"]:
+        """Fraction of each pixel that shows surfaces and not the environment: the alpha channel of `picture`.
+
+        Args:
+            camera: The camera; `self.camera` if None.
+            samples: Samples of each pixel, 4 or 1.
+
+        Raises:
+            TypeError: `camera` is not a `Camera`.
+            ValueError: `samples` is another number.
+        """
+        camera = self.camera if camera is None else camera
+        require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        backs = sides.hidden_backs(self.scene)
+        hidden = groups.faces_of(self.mesh, np.repeat(backs, self.place.counts)) if backs.any() else None
+        occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
+        options = {"samples": samples, "hidden": hidden, "occluder": occluder}
+        return layers.coverage(self.drawn, camera.local(self.mesh.origin), **options)
+
+    @promoted
+    def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:
+        """Exposure of a picture in stops that brings the brightest surfaces near white, whatever is behind them.
+
+        `jaxprt.image.display(picture, stops=relit.exposure(picture))` shows the picture. It is
+        `jaxprt.image.automatic_exposure` with the scene's `coverage`.
+
+        Args:
+            picture: What `picture` has returned for the camera.
+            camera: The camera; `self.camera` if None.
+
+        Raises:
+            TypeError: `picture` does not consist of numbers, or `camera` is not a `Camera`.
+            ValueError: The picture has another size than the camera, or holds NaN.
+        """
+        require.array("the picture", picture, "h w 3", "h w 1")
+        camera = self.camera if camera is None else camera
+        require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"the picture must have the camera's {camera.height} x {camera.width} pixels (rows x columns), got "
+                f"{picture.shape[0]} x {picture.shape[1]}"
+            )
+        picture = jnp.broadcast_to(picture, (*picture.shape[:2], 3))
+        return automatic_exposure(picture, coverage=self.coverage(camera))
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera
@@ -531,6 +627,8 @@ class RelitScene(System):
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
                 look = groups.look_at(table, rough, material_table.at_vertices(vertex))
                 given = appearance(part, shading, given, look=look)
+            else:
+                given = self._divided(number, given)
             result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
             _check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
@@ -603,15 +701,21 @@ def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
 
 
 class _Lit(eqx.Module):
-    """The light that arrives at a scene with given materials, as a function of the environment."""
+    """The light that arrives at a scene with given materials, as a function of the environment.
+
+    Direct light may be that of another environment.
+    """
 
     scene: RelitScene
     materials: Any
     appearances: dict[str, Appearance]
 
-    def __call__(self, environment: Environment) -> Arriving:
+    def __call__(self, environment: Environment, direct: Environment | None = None) -> Arriving:
         lights = scene_lamps.split(self.scene.lamps, self.materials)[1]
-        return self.scene.shade(self.scene.light(environment), {**self.appearances, **lights})
+        light = self.scene.light(environment)
+        if direct is not None:
+            light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
+        return self.scene.shade(light, {**self.appearances, **lights})
 
 
 def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[float, int, bool]:

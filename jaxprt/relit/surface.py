@@ -7,15 +7,32 @@ from functools import partial, reduce
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt.compile import jit, kept
 from jaxprt.relit.groups import Given, Surface, material
 from jaxprt.scene.material_table import Look
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import directions
+from jaxprt.systems import bright_texels
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
+from jaxprt.visibility import texel_rays
+
+
+class Sight(eqx.Module):
+    """What the BRDF of points needs, apart from the direction of the light.
+
+    Attributes:
+        frame: Shading frames of the points; rows are tangent, bitangent, normal.
+        wo: Unit directions to the viewer in these frames.
+        blend: Weights and parameters of the BRDF's channels; None for a BRDF that cannot change.
+    """
+
+    frame: Float[Array, "p 3 3"]
+    wo: Float[Array, "p 3"]
+    blend: Blend | None
 
 
 class Viewed(eqx.Module):
@@ -25,11 +42,27 @@ class Viewed(eqx.Module):
         points: The points on the group.
         seen: The view of each system of the group: direct light, reflected light and lamps.
         emitted: Radiance that the points emit.
+        sight: What single texels of the light need.
     """
 
     points: Points
     seen: tuple[PyTree, PyTree, PyTree]
     emitted: Float[Array, "p 3"]
+    sight: Sight
+
+
+class Interpolated(eqx.Module):
+    """Points of a group to which radiance is interpolated from vertices, with all that does not depend on the light.
+
+    Attributes:
+        points: The points on the group.
+        emitted: Radiance that the points emit.
+        sight: Weights of the channels, and what single texels of the light need.
+    """
+
+    points: Points
+    emitted: Float[Array, "p 3"]
+    sight: Sight
 
 
 @partial(kept, static=("glows",))
@@ -59,7 +92,8 @@ def view(
     """
     blend, emitted = material(surface, points, look, given)
     seen = view_of(surface, eye, blend, points, sharp, variance=variance)
-    return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted))
+    sight = _sight(surface, points, eye, blend)
+    return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)
 
 
 @kept
@@ -74,16 +108,53 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
     return combine(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
 
 
-@jit
-def carried(
-    surface: Surface, vertices: Float[Array, "k v c"], points: Points, look: Look, given: Given | None
-) -> Float[Array, "p c"]:
-    """Colors of some points, interpolated from the radiance of each channel at the vertices."""
+@kept
+def between(surface: Surface, points: Points, look: Look, eye: Float[Array, "3"], given: Given | None) -> Interpolated:
+    """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
     blend, emitted = material(surface, points, look, given)
-    if blend is None:
-        return points.carry(vertices[0]) + emitted
-    weight = jnp.moveaxis(blend.weight, 1, 0)
-    return reduce(jnp.add, (points.carry(own) * each for own, each in zip(vertices, weight, strict=True))) + emitted
+    return Interpolated(points, emitted, _sight(surface, points, eye, blend))
+
+
+@kept
+def carried(vertices: Float[Array, "k v c"], points: Interpolated) -> Float[Array, "p c"]:
+    """Colors of some points, interpolated from the radiance of each channel at the vertices."""
+    radiance = [points.points.carry(channel) for channel in vertices]
+    if points.sight.blend is None:
+        return radiance[0] + points.emitted
+    weight = jnp.moveaxis(points.sight.blend.weight, 1, 0)
+    return reduce(jnp.add, (color * own for color, own in zip(radiance, weight, strict=True))) + points.emitted
+
+
+@partial(kept, static=("size", "samples"))
+def from_texels(
+    surface: Surface,
+    sight: Sight,
+    texel: Int[Array, " t"],
+    excess: Float[Array, "t c"],
+    share: UInt8[Array, "t p"],
+    *,
+    size: int,
+    samples: int,
+) -> Float[Array, "p c"]:
+    """Radiance that points reflect from single texels of the light.
+
+    Args:
+        surface: The group.
+        sight: The points.
+        texel: Indices of the texels.
+        excess: Their radiance.
+        share: Share of each texel that each point sees, in 255ths.
+        size: Edge of the cubemap faces in texels.
+        samples: Number of sample points along the edge of each texel.
+    """
+    light = texel, excess / texel_rays.FULL, share
+    options = {"size": size, "samples": samples}
+    return bright_texels.sent(surface.brdf, sight.frame, sight.wo, light, None, sight.blend, **options)
+
+
+def _sight(surface: Surface, points: Points, eye: Array, blend: Blend | None) -> Sight:
+    position, frame = placed(surface.position, surface.frame, points)
+    return Sight(frame, directions.view(frame, position, eye), blend)
 
 
 @jit

@@ -11,6 +11,7 @@ from jaxprt.scene import (
     mesh,
     occluder,
     subdivision,
+    suns,
     texture,
 )
 from jaxprt.scene.camera import Camera
@@ -20,6 +21,7 @@ from jaxprt.scene.light_probes import irradiance, light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, load_mesh
 from jaxprt.scene.scene import Part, PointLight, Scene
+from jaxprt.scene.suns import Sun, with_suns
 
 __all__ = [
     "Camera",
@@ -28,6 +30,7 @@ __all__ = [
     "Part",
     "PointLight",
     "Scene",
+    "Sun",
     "Texture",
     "TexturedMaterial",
     "builtin",
@@ -45,5 +48,7 @@ __all__ = [
     "mesh",
     "occluder",
     "subdivision",
+    "suns",
     "texture",
+    "with_suns",
 ]

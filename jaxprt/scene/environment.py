@@ -10,12 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
-from jaxprt.compile import jit
+from jaxprt.compile import jit, known, put
 from jaxprt.files import images
-from jaxprt.scene import resampling
+from jaxprt.scene import panorama, resampling
+from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 
 # Arrangement of the six faces in each layout: its height and width in faces; the row and column of each face (+x, -x,
@@ -44,6 +46,12 @@ class Environment(eqx.Module):
     environments too. `load_environment` sets negative pixels of files to zero. Inside `jax.jit` values are not known
     and not checked: a NaN then reaches every vertex that the texel lights.
 
+    A light that comes from a file also remembers the file's pixels, up to 8192 columns of them, as its `panorama`:
+    `sky` shows them behind objects, `rotate` turns them, and `finer` makes larger cubemaps of them. They belong
+    to this object on the host and are no part of the pytree, so lights of all files share programs. What `jax.jit`,
+    `jax.vmap`, `jax.grad`, `jax.tree.map`, `copy`, `pickle`, `jaxprt.files.load` and `Environment(light.radiance)`
+    return has the texels alone, and is shown by them.
+
     Attributes:
         radiance: Mean radiance over each texel in linear Rec. 709. Leading axes, if any, are a batch of lights.
 
@@ -51,6 +59,10 @@ class Environment(eqx.Module):
         TypeError: The radiance does not consist of real numbers, or is a masked array.
         ValueError: The radiance has another shape, is not finite, or is above 1e32.
     """
+
+    # Not a field: as a leaf of the pytree, files of unlike sizes would need programs of their own, and as static data
+    # every file would. Not in __dict__ either, of which equinox makes pytrees.
+    __slots__ = ("_panorama",)
 
     radiance: Float[Array, "*l 6 n n c"] = eqx.field(converter=require.floating)
 
@@ -61,6 +73,23 @@ class Environment(eqx.Module):
         if len(shape) < 4 or shape[-4] != 6 or shape[-3] != shape[-2] or 0 in shape[-3:]:
             raise ValueError(f"the light's radiance must be [..., 6, n, n, c], got {list(shape)}")
         require.finite("the light's radiance", self.radiance)
+
+    @property
+    def panorama(self) -> Panorama | None:
+        """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
+        return getattr(self, "_panorama", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and pickled: the texels alone."""
+        return dict(self.__dict__)
+
+
+def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
+    """A light that remembers the pixels of its file."""
+    light = Environment(radiance)
+    if panorama is not None:
+        object.__setattr__(light, "_panorama", panorama)  # of a new object, before others see it
+    return light
 
 
 def _size(value: object) -> None:
@@ -127,7 +156,12 @@ def environment_from_image(
         raise TypeError(f"layout must be one of {', '.join(LAYOUTS)}, got {require.shown(layout)}")
     layout = layout or layout_of(image, {}, name)
     _check_layout(image, layout, name)
-    return Environment(jnp.asarray(resample(_clean(image, name), layout=layout, size=size)))
+    image = _clean(image, name)
+    light = jnp.asarray(resample(image, layout=layout, size=size))
+    on_edge = layout.startswith("openexr")
+    if layout in _CUBES:
+        return _with_panorama(light, panorama.from_faces(_cut_faces(image, layout), on_edge=on_edge))
+    return _with_panorama(light, panorama.from_latlong(image, on_edge=on_edge))
 
 
 def resample(
@@ -179,24 +213,26 @@ def _environment(value: object) -> None:
     rotation=functools.partial(require.rotation, "rotation"),
     samples=functools.partial(require.count, "samples", least=1),
 )
-@functools.partial(jit, static_argnames="samples")
 def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 2) -> Environment:
     """Rotates distant light: radiance from direction s arrives from direction R s afterwards.
+
+    A light with the pixels of a file (`Environment.panorama`) is made of these anew, in the same number of texels, so
+    that turning it often or by little does not blur it. Inside `jax.jit`, and for other lights, the texels are turned:
 
     Each texel is the mean of ``samples`` x ``samples`` parts. The value of a part is interpolated bilinearly, with a
     transition between texels that is as wide as a part. The mean then approximates the overlap of rotated texels with
     those of the cube. A sun in one texel therefore moves smoothly instead of flickering, and rotations that map the
     cube onto itself permute the texels. Parts cover some texels of the original light more than others; its values are
-    weighted to compensate. Each color is scaled so that its integral over the sphere is conserved. Constant light does
-    not change. The light should not be negative.
+    weighted to compensate. The light should not be negative.
 
-    The result is differentiable in both arguments. At the identity the gradient is the central one of a piecewise
-    smooth function.
+    Both ways, each color is scaled so that its integral over the sphere is conserved, and constant light does not
+    change. When texels are turned, the result is differentiable in both arguments. At the identity the gradient is the
+    central one of a piecewise smooth function.
 
     Args:
         light: One light, or a batch of them.
         rotation: A proper rotation matrix. Inside `jax.jit` it is not checked, and others give wrong results.
-        samples: Parts along the edge of a texel.
+        samples: Parts along the edge of a texel, when texels are turned.
 
     Returns:
         The rotated light.
@@ -208,6 +244,15 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
 
     Reference: the weights are one step of the balancing in Sinkhorn and Knopp 1967.
     """
+    if light.panorama is None or not known(light, rotation):
+        return _rotated_texels(light, rotation, samples=samples)
+    turned = light.panorama.rotated(np.asarray(rotation))
+    radiance = turned.cubemap(light.radiance.shape[-2]).astype(light.radiance.dtype)
+    return _with_panorama(put(radiance), turned)
+
+
+@functools.partial(jit, static_argnames="samples")
+def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, samples: int) -> Environment:
     radiance = light.radiance
     n = radiance.shape[-2]
     # Points on the cube have coordinates in fractions of texels, which quarter turns preserve exactly.
@@ -233,12 +278,92 @@ def rotate(light: Environment, rotation: Float[Array, "3 3"], *, samples: int = 
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
+def _toward(value: Any) -> np.ndarray:
+    require.finite("direction", value)
+    direction = np.asarray(value, np.float64)
+    if direction.shape != (3,) or not direction.any():
+        raise ValueError(f"direction must be one direction, [3], and not zero, got {require.shown(value)}")
+    return direction / np.linalg.norm(direction)
+
+
+def _colors(value: Any) -> np.ndarray:
+    require.finite("radiance", value)
+    color = np.asarray(value, np.float64)
+    if color.shape not in ((), (1,), (3,)):
+        raise ValueError(f"radiance must be one number or three, got an array of shape {list(color.shape)}")
+    return np.broadcast_to(color, (3,))
+
+
+@require.arguments(
+    light=_environment,
+    direction=_toward,
+    angle=functools.partial(require.number, "angle", low=1e-4, high=np.pi),
+    radiance=_colors,
+)
+def add_disk(light: Environment, direction: ArrayLike, *, angle: float, radiance: ArrayLike) -> Environment:
+    """Adds a round lamp to distant light, such as a sun. It adds to the light that is behind it.
+
+    A lamp of irradiance E on a surface that faces it has about the radiance E / (pi angle^2). Lamps that are smaller
+    than a texel keep their flux: the texel around their center has it. Pictures show lamps as disks if the light has
+    the pixels of a file (`Environment.panorama`). Not for use inside `jax.jit`.
+
+    Args:
+        light: One light, not a batch. The result has three colors.
+        direction: Direction towards the lamp, in world coordinates.
+        angle: Angular radius in radians; the sun's is 0.00465.
+        radiance: Radiance of the lamp, one number or three colors.
+
+    Returns:
+        The light with the lamp.
+
+    Raises:
+        TypeError: The light is not an `Environment`, or the lamp does not consist of real numbers.
+        ValueError: The light is a batch or has other colors than one or three, the direction is zero, the angle is not
+            between 1e-4 and pi, or the radiance is not finite.
+    """
+    require.colors("the light", light.radiance)
+    require.array("the light's radiance", light.radiance, "6 n n c")
+    texels = panorama.disk_texels(np.asarray(direction), float(angle), light.radiance.shape[-2])
+    total = np.asarray(light.radiance, np.float64) + texels[..., None] * np.asarray(radiance)
+    pixels = light.panorama
+    if pixels is not None:
+        pixels = pixels.with_disk(np.concatenate([np.asarray(direction), [float(angle)], np.asarray(radiance)]))
+    return _with_panorama(put(total.astype(light.radiance.dtype)), pixels)
+
+
 def _direction(value: Any) -> Array:
     require.finite("direction", value)
     direction = require.floating(value)
     if direction.shape[-1:] != (3,):
         raise ValueError(f"direction must be [..., 3], got an array of shape {list(direction.shape)}")
     return direction
+
+
+@require.arguments(light=_environment, size=_size)
+def finer(light: Environment, *, size: int = 256) -> Environment:
+    """The same light in texels of another size, from the pixels of its file.
+
+    Texels are area means over the pixels, turned as `rotate` has turned the light, and the integral over the sphere is
+    conserved. Use it where the texels of the light are too coarse, as for shadow rays towards a small sun.
+
+    Args:
+        light: One light, not a batch.
+        size: Texels along the edge of a cube face.
+
+    Returns:
+        The light with faces of size x size texels; or the given light itself if it does not have the pixels of a file
+        (`Environment.panorama` is None).
+
+    Raises:
+        TypeError: The light is not an `Environment`, or the size is not a whole number.
+        ValueError: The size is below 1.
+        MemoryError: The cubemap does not fit into memory.
+    """
+    pixels = light.panorama
+    if pixels is None or size == light.radiance.shape[-2]:
+        return light
+    require.memory(f"a cubemap of 6 x {size} x {size} texels", 100 * 6 * size**2, "choose a smaller size")
+    return _with_panorama(put(pixels.cubemap(size).astype(light.radiance.dtype)), pixels)
 
 
 @require.arguments(light=_environment, direction=_direction)
@@ -254,6 +379,40 @@ def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Arr
         Radiance for each direction, in the units of the light.
     """
     return cubemap.lookup(light.radiance, direction)
+
+
+def _angle(value: Any) -> Any:
+    require.at_least("angle", value, 0.0)
+    return value
+
+
+@require.arguments(light=_environment, direction=_direction, angle=_angle)
+def sky(
+    light: Environment,
+    direction: Float[Array | np.ndarray, "*b 3"],
+    *,
+    angle: Float[Array | np.ndarray, "*b"] | float = 0.0,
+) -> Float[Array, "*b c"]:
+    """Radiance that a picture shows in given directions, from the pixels of the light's file.
+
+    It is interpolated bilinearly between pixels, and averaged over the pixels of the picture by mip maps. A light
+    without the pixels of a file (`Environment.panorama` is None) has the radiance of `background`; so has every light
+    inside `jax.jit` and for derivatives.
+
+    Args:
+        light: One light, not a batch.
+        direction: Directions of any length, in world coordinates.
+        angle: Width in radians of the pixel of the picture that looks in each direction; 0 does not average.
+
+    Returns:
+        Radiance for each direction, in the units of the light.
+    """
+    if light.panorama is None or not known(light, direction, angle):
+        return background(light, direction)
+    ray = np.asarray(direction).reshape(-1, 3)
+    width = np.broadcast_to(np.asarray(angle, ray.dtype), direction.shape[:-1]).reshape(-1)
+    color = light.panorama.sampled(ray, width).astype(light.radiance.dtype)
+    return put(color.reshape(*direction.shape[:-1], 3))
 
 
 def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) -> str:

@@ -124,3 +124,40 @@ def _on_curve(fraction: Float[np.ndarray, " d"]) -> Float[np.ndarray, "2 d"]:
         fraction = 4 * fraction - quarter
         place += np.stack([quarter % 2, quarter // 2]) / 2**level
     return place
+
+
+def in_texels(
+    texel: Int[np.ndarray, " t"], radiance: Float[np.ndarray, "6 m m c"], *, size: int, count: int
+) -> Float32[np.ndarray, "t n 3"]:
+    """Directions within some texels of a light, drawn by the flux of the same light at a finer resolution.
+
+    Each direction stands for the same flux. They follow a space-filling curve, so that consecutive ones are neighbors.
+
+    Args:
+        texel: Indices of the texels.
+        radiance: The light at the finer resolution, whose edge is a multiple of `size`. In a texel without flux,
+            directions are even.
+        size: Edge of the cubemap faces in texels.
+        count: Number of directions in each texel.
+    """
+    factor = radiance.shape[1] // size
+    order = _curve(factor)[: factor * factor]
+    down, across = np.divmod(order, factor)
+    face, row, column = texel // size**2, texel // size % size, texel % size
+    here = face[:, None], factor * row[:, None] + down, factor * column[:, None] + across
+    area = np.asarray(cubemap.solid_angle(size=factor * size), np.float64)[here]
+    flux = np.maximum(radiance[here].astype(np.float64).sum(-1), 0) * area
+    flux = np.where(flux.sum(1, keepdims=True) > 0, flux, area)
+    total = np.cumsum(flux, 1)
+    reached = (np.arange(count) + 0.5) / count * total[:, -1:]
+    cell = np.stack([np.searchsorted(*pair) for pair in zip(total, reached, strict=True)])
+    cell = np.minimum(cell, factor * factor - 1)
+    own = np.arange(len(texel))[:, None]
+    inside = _on_curve(np.clip(1 - (total[own, cell] - reached) / flux[own, cell], 0, 1).ravel()).reshape(
+        2, *cell.shape
+    )
+    start = np.stack([factor * column[:, None] + across[cell], factor * row[:, None] + down[cell]])
+    s, t = 2 * (start + inside) / (factor * size) - 1
+    axis = cubemap.axes()[face][:, None]
+    way = s[..., None] * axis[:, :, 0] + t[..., None] * axis[:, :, 1] + axis[:, :, 2]
+    return (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)

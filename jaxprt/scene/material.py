@@ -124,6 +124,14 @@ class TexturedMaterial(eqx.Module):
         anisotropy_texture: Texture [h w 3] with the direction, as (direction + 1) / 2, in the first two channels, and
             a factor on the strength in the third.
         normal_texture: Normal map [h w 3], as (normal + 1) / 2 in the frame of tangent, bitangent and normal.
+        clearcoat: Weight of a clear coat, from 0 to 1; see KHR_materials_clearcoat and `jaxprt.brdf.ClearCoat`.
+        clearcoat_roughness: Perceptual roughness of the coat, from 0 to 1.
+        transmission: Fraction of the light under the surface that passes through in place of being reflected
+            diffusely, from 0 to 1; see KHR_materials_transmission. Surfaces reflect less by it. Nothing is seen through
+            them, and no light passes through them.
+        clearcoat_texture: Texture [h w 1] that multiplies `clearcoat`.
+        clearcoat_roughness_texture: Texture [h w 1] that multiplies `clearcoat_roughness`.
+        transmission_texture: Texture [h w 1] that multiplies `transmission`.
         alpha: Opacity, from 0 for a surface that is not there to 1. Ignored if `alpha_mode` is "opaque".
         alpha_texture: Texture [h w 1] that multiplies `alpha`.
         alpha_cutoff: Opacity from which on a surface is there, for "mask"; at least 0. It is absent below.
@@ -137,7 +145,8 @@ class TexturedMaterial(eqx.Module):
         ValueError: A factor is not finite or out of its range, or `alpha_mode` or `back` is another word.
 
     Reference: Khronos glTF 2.0 specification, section 3.9 and appendix B; its extensions KHR_materials_ior,
-    KHR_materials_specular, KHR_materials_anisotropy and KHR_materials_emissive_strength.
+    KHR_materials_specular, KHR_materials_anisotropy, KHR_materials_emissive_strength, KHR_materials_clearcoat and
+    KHR_materials_transmission.
     """
 
     base_color: Float[Array, "3"] = eqx.field(converter=_color, default=1.0)
@@ -158,6 +167,12 @@ class TexturedMaterial(eqx.Module):
     specular_color_texture: Texture | None = None
     anisotropy_texture: Texture | None = None
     normal_texture: Texture | None = None
+    clearcoat: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    clearcoat_roughness: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    transmission: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    clearcoat_texture: Texture | None = None
+    clearcoat_roughness_texture: Texture | None = None
+    transmission_texture: Texture | None = None
     alpha: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
     alpha_texture: Texture | None = None
     alpha_cutoff: Float[Array, ""] = eqx.field(converter=_scalar, default=0.5)
@@ -171,7 +186,8 @@ class TexturedMaterial(eqx.Module):
                 raise ValueError(
                     f"{name} of TexturedMaterial must be one of {', '.join(words)}, got {getattr(self, name)!r}"
                 )
-        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", "alpha"):
+        layers = "clearcoat", "clearcoat_roughness", "transmission"
+        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", "alpha", *layers):
             require.within(f"{name} of TexturedMaterial", getattr(self, name), 0, 1)
         for name in ("emissive", "specular_color", "ior", "alpha_cutoff"):
             require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0.0)

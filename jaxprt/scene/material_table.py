@@ -32,6 +32,8 @@ TEXTURES = (
     "anisotropy_texture",
     "normal_texture",
 )
+# Textures of materials with further layers, which only scenes with such materials have columns for.
+LAYER_TEXTURES = ("clearcoat_texture", "clearcoat_roughness_texture", "transmission_texture")
 COLORS = 6  # of these determine the colors and the roughness of points; the others turn the frames of vertices
 _FACTORS = (
     ("base_color", 3),
@@ -42,6 +44,8 @@ _FACTORS = (
     ("specular_color", 3),
     ("ior", 1),
 )
+_SHINY = sum(width for _, width in _FACTORS)  # column that is 1 for `BlinnPhong`
+_LAYERS = ("clearcoat", "clearcoat_roughness", "transmission")  # columns after it, in scenes that have them
 ROW = 1 << 12  # number of points that are evaluated together
 SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
 _LEVELS = 16  # of a mip map at most: images of up to 32,768 texels along an edge
@@ -67,16 +71,20 @@ class Look(NamedTuple):
 
     Attributes:
         coefficient: Weights of the four terms of `jaxprt.brdf.MetallicRoughness`. Those of `BlinnPhong` are its colors:
-            diffuse, specular, 0 and 0.
+            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat
+            and by that of the coat, as `jaxprt.systems.standard.coated` has them; without a coat the first four are
+            those of the material.
         log_roughness: Logarithm of the roughness; that of metallic-roughness materials is at least `SMOOTHEST`.
         emitted: Radiance that the surface emits.
         values: The parameters themselves.
+        log_coat: Logarithm of the roughness of the clear coat; None in scenes without layers.
     """
 
-    coefficient: Float[Array | np.ndarray, "p 4 3"]
+    coefficient: Float[Array | np.ndarray, "p k 3"]
     log_roughness: Float[Array | np.ndarray, " p"]
     emitted: Float[Array | np.ndarray, "p 3"]
     values: Values
+    log_coat: Float[Array | np.ndarray, " p"] | None = None
 
 
 class Texels(eqx.Module):
@@ -120,6 +128,11 @@ class MaterialTable(eqx.Module):
     coordinate: Float[Array | np.ndarray, "v 4"]
     color: Float[Array | np.ndarray, "v 3"]
 
+    @property
+    def layered(self) -> bool:
+        """Whether it has columns for layers: clear coats and transmission."""
+        return self.image.shape[1] > len(TEXTURES)
+
     def at(self, points: Points) -> Look:
         """The materials at points. Textures are averaged over the pixels of points that have slopes.
 
@@ -150,17 +163,28 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 
 @kept
 def _looked(table: MaterialTable, points: Points) -> Look:
-    values = _values(table, points)
-    shiny = table.factor[:, -1][table.part[points.corner[0]]] > 0
+    values, layers = _values(table, points)
+    shiny = table.factor[:, _SHINY][table.part[points.corner[0]]] > 0
     none = jnp.zeros_like(values.base_color)
     colors = jnp.stack([values.base_color, values.specular_color, none, none], 1)
     material = MetallicRoughness(**{name: value for name, value in values._asdict().items() if name != "emissive"})
     coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
     least = jnp.where(shiny, 0, SMOOTHEST)
-    return Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values)
+    look = Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values)
+    return look if layers is None else _layered(look, *layers)
 
 
-def _values(table: MaterialTable, points: Points) -> Values:
+def _layered(look: Look, coat: Array, roughness: Array, transmission: Array) -> Look:
+    """The materials with their layers: what is under a clear coat, and less diffuse light where light passes."""
+    passing = jnp.stack([1 - transmission, jnp.ones_like(coat), jnp.ones_like(coat), 1 - transmission], 1)[..., None]
+    base, coat = look.coefficient * passing, coat[:, None, None]
+    above = jnp.broadcast_to(coat, (len(coat), 1, 3))
+    coefficient = jnp.concatenate([(1 - coat) * base, coat * base, above], 1)
+    return look._replace(coefficient=coefficient, log_coat=jnp.log(jnp.maximum(roughness, SMOOTHEST)))
+
+
+def _values(table: MaterialTable, points: Points) -> tuple[Values, tuple[Array, ...] | None]:
+    """The parameters at points, and those of their layers; None in scenes without."""
     part = table.part[points.corner[0]]
     factor = table.factor[part]
     place = points.carry(table.coordinate)
@@ -182,10 +206,14 @@ def _values(table: MaterialTable, points: Points) -> Values:
         return jax.lax.cond(jnp.any(image >= 0), found, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
 
     base, metallic, roughness, emissive, specular, tint = jax.lax.map(read, jnp.arange(COLORS))
+    layers = None
+    if table.layered:
+        scale = jax.lax.map(read, len(TEXTURES) + jnp.arange(len(_LAYERS)))
+        layers = tuple(factor[:, _SHINY + 1 + row] * scale[row, :, 0] for row in range(len(_LAYERS)))
     color = points.carry(table.color)
     first = np.cumsum([0, *(width for _, width in _FACTORS)])
     each = {name: factor[:, begin : begin + width] for (name, width), begin in zip(_FACTORS, first, strict=False)}
-    return Values(
+    values = Values(
         each["base_color"] * base * color,
         each["metallic"][:, 0] * metallic[:, 0],
         each["roughness"][:, 0] * roughness[:, 0],
@@ -194,6 +222,7 @@ def _values(table: MaterialTable, points: Points) -> Values:
         each["specular_color"] * tint,
         each["ior"][:, 0],
     )
+    return values, layers
 
 
 def _looked_up(
@@ -293,7 +322,8 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     part = np.repeat(np.arange(len(parts), dtype=np.int32), count)
     columns = np.pad(part, (0, room)), both, column([each.color for each in parts], 1.0, 3)
     held: dict[str, Any] = dict(zip(("part", "coordinate", "color"), columns, strict=True))
-    return MaterialTable(**_rows(materials, dtype), **held)
+    layered = any(has_layers(material) for material in materials)
+    return MaterialTable(**_rows(materials, dtype, layered=layered), **held)
 
 
 def with_materials(
@@ -313,12 +343,22 @@ def with_materials(
     """
     held: dict[str, Any] = {"part": table.part, "coordinate": table.coordinate, "color": table.color}
     old = _images(before)
-    return MaterialTable(**_rows(materials, table.factor.dtype, old=old, texels=table.texels), **held)
+    layered = table.layered or any(has_layers(material) for material in materials)
+    rows = _rows(materials, table.factor.dtype, layered=layered, old=old, texels=table.texels)
+    return MaterialTable(**rows, **held)
+
+
+def has_layers(material: Any) -> bool:
+    """Whether a material has a clear coat or lets light pass. Values that JAX traces may be anything."""
+    if not isinstance(material, TexturedMaterial):
+        return False
+    layers = (material.clearcoat, material.transmission)
+    return any(isinstance(each, Tracer) or bool(np.asarray(each) != 0) for each in layers)
 
 
 def _images(materials: Sequence[TexturedMaterial | Callable]) -> list[Any]:
     """The images of the textures of some materials, each once."""
-    own = (getattr(material, name, None) for material in materials for name in TEXTURES)
+    own = (getattr(material, name, None) for material in materials for name in (*TEXTURES, *LAYER_TEXTURES))
     return list({id(each.image): each.image for each in own if each is not None}.values())
 
 
@@ -326,6 +366,7 @@ def _rows(
     materials: Sequence[TexturedMaterial | Callable],
     dtype: Any,
     *,
+    layered: bool,
     old: Sequence[Any] = (),
     texels: Texels | None = None,
 ) -> dict[str, Any]:
@@ -338,11 +379,12 @@ def _rows(
         texels = _texels(images, dtype, texels)
     else:
         images = old
-    number, image = {id(each): n for n, each in enumerate(images)}, np.full((rows, len(TEXTURES)), -1, np.int32)
+    names = (*TEXTURES, *LAYER_TEXTURES) if layered else TEXTURES
+    number, image = {id(each): n for n, each in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
     transform: Any = np.zeros((*image.shape, 2, 3), dtype)
     sets, wrap = np.zeros(image.shape, np.int32), np.zeros((*image.shape, 2), np.int32)
     for row, material in enumerate(materials):
-        for column, name in enumerate(TEXTURES):
+        for column, name in enumerate(names):
             own: Texture | None = getattr(material, name, None)
             if own is None:
                 continue
@@ -350,7 +392,7 @@ def _rows(
             sets[row, column] = own.set
             wrap[row, column] = [texture.WRAPS.index(mode) for mode in own.wrap]
             transform = _placed(transform, (row, column), own.transform)
-    factor = _concatenated([_factors(material)[None] for material in materials], dtype)
+    factor = _concatenated([_factors(material, layered)[None] for material in materials], dtype)
     padding = np.zeros((rows - len(materials), factor.shape[1]), dtype)
     made = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
     return {"factor": _concatenated([factor, padding], dtype), **made}
@@ -365,15 +407,17 @@ def _placed(array: Any, place: tuple[int, int], value: Any) -> Any:
     return array
 
 
-def _factors(material: TexturedMaterial | Callable) -> Any:
-    """The factors of a material as one row, whose last entry is 1 for `BlinnPhong`."""
+def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
+    """The factors of a material as one row: `_FACTORS`, 1 for `BlinnPhong`, and those of layers."""
     textured = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
     xp = np if known(material, textured) else jnp  # a material that is made while JAX traces has traced factors
     if isinstance(material, BlinnPhong):
         colors = {"base_color": material.diffuse, "specular_color": material.specular}
         factor: dict[str, Any] = vars(textured) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
-        return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), 1])
-    return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0])
+        rest = [0] * len(_LAYERS) if layered else []
+        return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), 1, *rest])
+    rest = [getattr(textured, name) for name in _LAYERS] if layered else []
+    return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0, *rest])
 
 
 def _concatenated(rows: Sequence[Any], dtype: Any) -> Any:

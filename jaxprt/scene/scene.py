@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
@@ -19,6 +20,10 @@ from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.suns import Sun
+
+_EDGE = 1e-3  # smallest difference of the cosines of a cone's angles, as in KHR_lights_punctual
+_ROUNDING = 1e-6  # by which float32 may round pi upward
 
 
 class Part(eqx.Module):
@@ -114,23 +119,34 @@ def _three(value: Any) -> Any:
     return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
+def _axis(value: Any) -> Any:
+    """A direction as an array; None stays."""
+    return None if value is None else require.floating(value)
+
+
 class PointLight(eqx.Module):
-    """A point light near the objects that emits equally in all directions.
+    """A point light near the objects that emits equally in all directions, or a spot that emits into a cone.
 
     Attributes:
         name: Name of the light, different from those of all parts and other point lights of the scene.
         position: Position in world units, in the coordinates of the scene's file. Coordinates above 64 that float32
             would round stay in a NumPy array in float64.
-        intensity: Radiant intensity, in units of radiance times squared world units.
+        intensity: Radiant intensity, in units of radiance times squared world units. That of a spot is along its axis.
+        axis: Direction into which a spot shines, of any length; None for light into all directions.
+        cone: Angles from the axis in radians: up to the first one a spot has its whole intensity, from the second one
+            on none.
 
     Raises:
         TypeError: The name is not a string.
-        ValueError: The position or the intensity is not finite, or the intensity is negative.
+        ValueError: The position, the intensity or the axis is not finite, the intensity is negative, the axis is zero,
+            or the angles are not ascending from 0 to pi.
     """
 
     name: str = eqx.field(static=True)
     position: Float[Array | np.ndarray, "3"] = eqx.field(converter=_place)
     intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+    axis: Float[Array, "3"] | None = eqx.field(converter=_axis, default=None)
+    cone: tuple[float, float] = eqx.field(static=True, default=(0.0, np.pi / 4))
 
     def __check_init__(self):
         """Refuses values that are not finite."""
@@ -141,14 +157,36 @@ class PointLight(eqx.Module):
         if jnp.shape(self.intensity) != (3,):
             got = list(jnp.shape(self.intensity))
             raise ValueError(f"the intensity of point light {self.name!r} must be one number or a color [3], got {got}")
+        if self.axis is not None:
+            require.finite(f"the axis of point light {self.name!r}", self.axis)
+            if jnp.shape(self.axis) != (3,) or not (isinstance(self.axis, Tracer) or np.any(self.axis)):
+                raise ValueError(f"the axis of point light {self.name!r} must be a direction, got {self.axis}")
+        angles = self.cone
+        if len(angles) != 2 or not 0 <= angles[0] <= angles[1] <= np.pi + _ROUNDING or not angles[1] > 0:
+            must = f"the cone of point light {self.name!r} must be two ascending angles from 0 to pi"
+            raise ValueError(f"{must}, got {angles}")
+
+    def share(self, direction: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+        """The intensity into some directions, relative to that along the axis: 1 for all without an axis.
+
+        Between the two angles of the cone it is the square of a line in the cosine, as KHR_lights_punctual recommends.
+
+        Args:
+            direction: Unit directions from the light.
+        """
+        if self.axis is None:
+            return np.ones(direction.shape[:-1], direction.dtype)
+        inner, outer = np.cos(self.cone)
+        axis = np.asarray(self.axis, np.float64)
+        cosine = direction @ (axis / np.linalg.norm(axis)).astype(direction.dtype)
+        return np.clip((cosine - outer) / max(inner - outer, _EDGE), 0, 1) ** 2
 
 
 def _tuple(items: Any) -> tuple:
     """A sequence as a tuple."""
     if isinstance(items, eqx.Module | str | bytes) or not isinstance(items, Iterable):
-        raise TypeError(
-            f"a scene takes lists of parts, cameras, environments and point_lights, got one {type(items).__name__}"
-        )
+        lists = "parts, cameras, environments, point_lights and suns"
+        raise TypeError(f"a scene takes lists of {lists}, got one {type(items).__name__}")
     return tuple(items)
 
 
@@ -174,6 +212,8 @@ class Scene(eqx.Module):
         cameras: The cameras; may be empty.
         environments: The distant lights; may be empty.
         point_lights: The point lights; may be empty. Parts that emit light are area lights.
+        suns: Distant lights of one direction each; may be empty. They are no part of any environment: `with_suns` adds
+            them to one.
 
     Raises:
         TypeError: A field holds an object of another class.
@@ -184,6 +224,7 @@ class Scene(eqx.Module):
     cameras: tuple[Camera, ...] = eqx.field(converter=_tuple, default=())
     environments: tuple[Environment, ...] = eqx.field(converter=_tuple, default=())
     point_lights: tuple[PointLight, ...] = eqx.field(converter=_tuple, default=())
+    suns: tuple[Sun, ...] = eqx.field(converter=_tuple, default=())
 
     def __check_init__(self):
         """Refuses scenes without parts, equal names, and objects of other classes."""
@@ -192,6 +233,7 @@ class Scene(eqx.Module):
             ("cameras", Camera, "scene.Camera"),
             ("environments", Environment, "load_environment"),
             ("point_lights", PointLight, "scene.PointLight"),
+            ("suns", Sun, "scene.Sun"),
         ):
             for each in getattr(self, name):
                 require.kind(f"each of the scene's {name}", each, kind, source=source)
@@ -242,7 +284,7 @@ def centered(scene: Scene) -> Scene:
         )
         for lamp in scene.point_lights
     ]
-    return Scene(parts, [camera.local(origin) for camera in scene.cameras], scene.environments, lamps)
+    return Scene(parts, [camera.local(origin) for camera in scene.cameras], scene.environments, lamps, scene.suns)
 
 
 def default_camera(scene: Scene, mesh: Mesh) -> Camera:

@@ -32,12 +32,22 @@ def two_sided(scene: Scene) -> Scene:
     Args:
         scene: The scene.
     """
+    return with_copies(scene)[0]
+
+
+def with_copies(scene: Scene) -> tuple[Scene, tuple[Int[np.ndarray, " _"], ...]]:
+    """The result of `two_sided`, and for each part, the vertices of which the added ones are copies.
+
+    Args:
+        scene: The scene.
+    """
+    none = np.zeros(0, np.int64)
     lit = [isinstance(part.material, TexturedMaterial) and part.material.back == "lit" for part in scene.parts]
     if not any(lit):
-        return scene
-    seen = _seen_backs(centered(scene))
-    parts = [_doubled(part, own) if wanted else part for part, own, wanted in zip(scene.parts, seen, lit, strict=True)]
-    return Scene(parts, scene.cameras, scene.environments, scene.point_lights)
+        return scene, (none,) * len(lit)
+    rows = zip(scene.parts, _seen_backs(centered(scene)), lit, strict=True)
+    parts, copied = zip(*(_doubled(part, own) if wanted else (part, none) for part, own, wanted in rows), strict=True)
+    return dataclasses.replace(scene, parts=list(parts)), copied
 
 
 def hidden_backs(scene: Scene) -> Bool[np.ndarray, " n"]:
@@ -123,17 +133,19 @@ def _has_twin(corner: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     return sides[number.reshape(-1), 1 - odd.astype(int)]
 
 
-def _doubled(part: Part, copied: Bool[np.ndarray, " f"]) -> Part:
-    """The part with reversed copies of some faces. The frame of a copy is the opposite of that of its face.
+def _doubled(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.ndarray, " _"]]:
+    """The part with reversed copies of some faces, and the vertices that were copied.
+
+    The frame of a copy is the opposite of that of its face.
 
     Normal maps then bend the normals of both sides as one surface: a bump of the front is a dent of the back.
     """
     assert isinstance(part.material, TexturedMaterial)
     material = dataclasses.replace(part.material, back="hidden")
-    if not copied.any():
-        return dataclasses.replace(part, material=material)
     mesh, count = part.mesh, len(part.mesh.position)
     vertex, corner = np.unique(np.asarray(mesh.face)[copied], return_inverse=True)
+    if not len(vertex):
+        return dataclasses.replace(part, material=material), vertex
 
     def rows(value: Array | np.ndarray | None, sign: float = 1.0) -> Array | None:
         """Values of all vertices and of their copies."""
@@ -144,4 +156,5 @@ def _doubled(part: Part, copied: Bool[np.ndarray, " f"]) -> Part:
     frame = rows(mesh.normal, -1.0), rows(mesh.tangent, -1.0)
     whole = Mesh(rows(mesh.position), face, *frame, region, rows(mesh.texture), mesh.origin)
     side = np.ones(count, np.float32) if part.handedness is None else part.handedness
-    return Part(part.name, whole, material, rows(part.color), rows(part.second), rows(side, -1.0), rows(part.alpha))
+    colors = rows(part.color), rows(part.second), rows(side, -1.0), rows(part.alpha)
+    return Part(part.name, whole, material, *colors), vertex

@@ -4,17 +4,20 @@ Edges are identified by the positions of their endpoints. Both sides of a seam a
 and so are parts of a scene that share a border. Subdivision opens no gaps in the surface.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, Integer
 
 from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
+from jaxprt.compile import known
 from jaxprt.scene.mesh import Mesh, make_mesh
 from jaxprt.scene.scene import Part, Scene
 
@@ -214,20 +217,38 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
     if not divisions:
         return scene
     counts = [len(part.mesh.position) for part in scene.parts]
-    owner = np.repeat(np.arange(len(counts)), counts)
-    number = np.concatenate([np.arange(count) for count in counts])
-    parents: list[list[np.ndarray]] = [[] for _ in counts]
-    for division in divisions:
-        of_added, place = owner[division.parent[:, 0]], np.empty(len(division.parent), np.int64)
-        for part, all_parents in enumerate(parents):
-            own = np.flatnonzero(of_added == part)
-            place[own] = np.count_nonzero(owner == part) + np.arange(len(own))
-            all_parents.append(number[division.parent[own]])
-        owner, number = np.concatenate([owner, of_added]), np.concatenate([number, place])
+    parents, owner, number = _of_parts(counts, [division.parent for division in divisions])
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
     parts = [_subdivided_part(*each) for each in zip(scene.parts, parents, faces, strict=True)]
-    return Scene(parts, scene.cameras, scene.environments, scene.point_lights)
+    return dataclasses.replace(scene, parts=parts)
+
+
+def part_parents(counts: Sequence[int], parents: Sequence[Int[np.ndarray, "_ 2"]]) -> list[list[np.ndarray]]:
+    """For each part and each step, the two vertices of the part between which each added vertex lies.
+
+    Args:
+        counts: Number of vertices of each part before the steps.
+        parents: The two vertices of the whole scene between which each added vertex lies, for each step.
+    """
+    return _of_parts(counts, parents)[0]
+
+
+def _of_parts(
+    counts: Sequence[int], parents: Sequence[np.ndarray]
+) -> tuple[list[list[np.ndarray]], np.ndarray, np.ndarray]:
+    """The result of `part_parents`, the part of each vertex in the end, and its index in this part."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    number = np.concatenate([np.arange(count) for count in counts])
+    result: list[list[np.ndarray]] = [[] for _ in counts]
+    for parent in parents:
+        of_added, place = owner[parent[:, 0]], np.empty(len(parent), np.int64)
+        for part, all_parents in enumerate(result):
+            own = np.flatnonzero(of_added == part)
+            place[own] = np.count_nonzero(owner == part) + np.arange(len(own))
+            all_parents.append(number[parent[own]])
+        owner, number = np.concatenate([owner, of_added]), np.concatenate([number, place])
+    return result, owner, number
 
 
 def divide(scene: Scene, *, edge: float) -> Scene:
@@ -270,7 +291,7 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
     if not any(len(each) for each in parents):
         return eqx.tree_at(lambda each: each.face, mesh, triangle)
     count = len(mesh.position)
-    position, tangent = _rows(mesh.position, parents), _rows(np.asarray(mesh.tangent, np.float64), parents)
+    position, tangent = spread(mesh.position, parents), spread(np.asarray(mesh.tangent, np.float64), parents)
     normal = np.asarray(mesh.normal, np.float64)
     for parent in parents:
         normal = np.concatenate([normal, middle_normal(normal, parent)])
@@ -280,7 +301,7 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
     def appended(old, rows):
         return jax.device_put(np.concatenate([old, np.asarray(rows).astype(np.asarray(old).dtype)]))
 
-    texture = None if mesh.texture is None else jax.device_put(_rows(mesh.texture, parents))
+    texture = None if mesh.texture is None else jax.device_put(spread(mesh.texture, parents))
     frame = appended(mesh.normal, new.normal), appended(mesh.tangent, new.tangent)
     region = jax.device_put(_first(mesh.region, parents))
     return Mesh(jax.device_put(position), triangle, *frame, region, texture, mesh.origin)
@@ -289,17 +310,19 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
 def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
     """The part with added vertices, each between two earlier ones."""
     color, second, alpha = (
-        None if each is None else jax.device_put(_rows(each, parents)) for each in (part.color, part.second, part.alpha)
+        None if each is None else jax.device_put(spread(each, parents))
+        for each in (part.color, part.second, part.alpha)
     )
     handedness = None if part.handedness is None else jax.device_put(_first(part.handedness, parents))
     return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness, alpha)
 
 
-def _rows(value, parents: Sequence[np.ndarray]) -> np.ndarray:
-    """Values of all vertices. Added vertices get the mean of their two parents."""
-    value = np.asarray(value)
+def spread(value: Any, parents: Sequence[np.ndarray]) -> Any:
+    """Values of all vertices, given those before division. Added vertices get the mean of their two parents."""
+    xp = np if known(value) else jnp
+    value = xp.asarray(value)
     for parent in parents:
-        value = np.concatenate([value, middle(value, parent)])
+        value = xp.concatenate([value, value[parent].mean(1)])
     return value
 
 

@@ -1,6 +1,17 @@
 """Functions on the sphere and hemisphere: directions, hemisphere maps, cubemaps, wavelets, spherical harmonics."""
 
-from jaxprt.sphere import conventions, cubemap, directions, haar, harmonics, hemisphere, lighting, products, rotation
+from jaxprt.sphere import (
+    conventions,
+    cubemap,
+    directions,
+    haar,
+    harmonics,
+    hats,
+    hemisphere,
+    lighting,
+    products,
+    rotation,
+)
 
 __all__ = [
     "conventions",
@@ -8,6 +19,7 @@ __all__ = [
     "directions",
     "haar",
     "harmonics",
+    "hats",
     "hemisphere",
     "lighting",
     "products",

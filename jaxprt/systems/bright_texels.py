@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree, UInt8
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.brdf import grid
@@ -132,8 +132,8 @@ class BrightTexels(VertexSystem):
         texels = light.texel, light.excess / LEVELS, seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
-        sent = _sent(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
-        return self.system.combine(light.rest, view.rest) + sent
+        bright = sent(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
+        return self.system.combine(light.rest, view.rest) + bright
 
     def at(self, points: Points) -> "BrightTexels":
         """The system at points; see `System.at`."""
@@ -184,6 +184,50 @@ def split(light: Environment, *, count: int) -> tuple[Int[Array, " t"], Float[Ar
     return texel, excess, Environment(rest)
 
 
+@partial(jit, static_argnames=("count", "rank"))
+def brightest(
+    light: Environment, *, count: int, rank: int, least: Float[ArrayLike, ""]
+) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
+    """Takes the radiance of the brightest texels out of a light, as far as they are brighter than many others.
+
+    Unlike with `split`, some brighter texels stay in the rest, which another system may split again.
+
+    Args:
+        light: One environment.
+        count: Number of texels.
+        rank: What exceeds the flux of so many brighter texels is taken out.
+        least: Smallest share of the light's flux that is taken out of a texel; others keep their radiance.
+
+    Returns:
+        Indices of the texels with the most flux, radiance times solid angle, the most first; the radiance taken out of
+        each, in its color; and the rest of the environment.
+    """
+    flux = _flux_of(light)
+    texel = _largest(flux, min(count, len(flux)))
+    return texel, *without(light, texel, rank=rank, least=least)
+
+
+@partial(jit, static_argnames=("rank",))
+def without(
+    light: Environment, texel: Int[Array, " t"], *, rank: int, least: Float[ArrayLike, ""]
+) -> tuple[Float[Array, "t c"], Environment]:
+    """The radiance taken out of given texels, and the rest of the environment: see `brightest`."""
+    flux = _flux_of(light)
+    level = flux[_largest(flux, min(rank + 1, len(flux)))[-1]]
+    own = flux[texel]
+    fraction = jnp.maximum(1 - level / jnp.where(own > 0, own, 1), 0)
+    fraction = jnp.where(own * fraction >= least * jnp.sum(flux), fraction, 0)
+    radiance = light.radiance.reshape(-1, light.radiance.shape[-1])
+    excess = radiance[texel] * fraction[:, None].astype(radiance.dtype)
+    return excess, Environment(radiance.at[texel].add(-excess).reshape(light.radiance.shape))
+
+
+def _flux_of(light: Environment) -> Float[Array, " d"]:
+    size, colors = light.radiance.shape[-2:]
+    flux = jnp.sum(light.radiance.reshape(-1, colors), -1) * cubemap.solid_angle(size=size).ravel()
+    return jax.lax.stop_gradient(flux)
+
+
 def radiance(
     transport: Visibility,
     brdf: Callable,
@@ -227,7 +271,7 @@ def radiance(
     eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
-    return _sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
+    return sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
 
 
 def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -239,7 +283,7 @@ def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
 
 
 @partial(jit, static_argnames=("size", "samples"))
-def _sent(
+def sent(
     brdf: Callable,
     frame: Float[Array, "p 3 3"],
     wo: Float[Array, "p 3"],
@@ -258,7 +302,7 @@ def _sent(
         wo: Unit directions to the viewer in these frames.
         light: Indices of the texels, their radiance, and their visible share at the vertices. Only the product of the
             last two matters, so shares may be in sixteenths if the radiance is divided by 16.
-        points: Points at which radiance is evaluated; None for the vertices.
+        points: Points to which the shares are interpolated; None for shares of the vertices or points themselves.
         blend: Weights of the BRDF's channels, and parameters; None for the BRDF as it is.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
@@ -278,10 +322,10 @@ def _sent(
     def lit(argument):
         direction, area, excess, visible = argument
         share = visible.astype(wo.dtype) if points is None else points.carry(visible)
-        sent = total(point, (direction, area)) * share
+        reflected = total(point, (direction, area)) * share
         if weight is not None:
-            sent = jnp.sum(sent[:, None] * weight, 0)
-        return sent * excess[:, None]
+            reflected = jnp.sum(reflected[:, None] * weight, 0)
+        return reflected * excess[:, None]
 
     def point(argument):
         direction, area = argument

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxprt import require
+from jaxprt.image.tone_curves import toned
 
 MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
 _MOST_JSON = 1 << 24  # bytes of the JSON of a message; it takes many times its size in memory
@@ -216,13 +217,14 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
+def encode(color: ArrayLike, *, stops: float | None, tone: str = "srgb") -> tuple[bytes, float]:
     """Encodes linear colors as bytes.
 
     Args:
         color: Linear colors with three channels in the last axis.
         stops: Exposure in stops. Colors are then exposed, encoded as 8-bit sRGB and compressed with zlib. None encodes
             half floats.
+        tone: Tone curve of the bytes, as `jaxprt.image.display` takes it. Half floats are linear.
 
     Returns:
         The bytes, and the factor by which half floats must be multiplied. It is 1 unless the brightest color exceeds
@@ -233,7 +235,7 @@ def encode(color: ArrayLike, *, stops: float | None) -> tuple[bytes, float]:
     if stops is None:
         scale = max(1.0, float(np.max(np.abs(value), initial=0.0)) / _LARGEST_HALF)
         return np.clip(value / np.float32(scale), -_LARGEST_HALF, _LARGEST_HALF).astype("<f2").tobytes(), scale
-    exposed = np.clip(value * np.float32(2.0**stops), 0, 1)
+    exposed = toned(value * np.float32(2.0**stops), tone, np)
     display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
     level = np.round(255 * display).astype(np.uint8)
     # Differences between successive entries of a channel compress better, because neighbors are similar.

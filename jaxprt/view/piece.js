@@ -42,7 +42,8 @@ float mean(int address) {
   uint word = texelFetch(pyramid, at(address >> 2), 0).r;
   return float((word >> uint(8 * (address & 3))) & 255u) / 255.;
 }
-// What a vertex sees of a lobe, and the slopes of that by s and t.
+vec3 spline(float off) { return vec3((.5 - off) * (.5 - off) / 2., .75 - off * off, (.5 + off) * (.5 + off) / 2.); }
+// What a vertex sees of a lobe, and the slopes of that by s and t: see jaxprt/systems/lobe/pyramid.py.
 vec3 visibility(int row, int face, float s, float t, float spread) {
   int number = 0;
   for (int i = 1; i < LEVELS - 1; i++) if (spread >= spreads[i]) number = i;
@@ -51,12 +52,19 @@ vec3 visibility(int row, int face, float s, float t, float spread) {
   for (int step = 0; step < min(2, LEVELS); step++) {
     int edge = edges[number + step];
     float middle = float(edge) / 2., share = step == 0 ? 1. - upper : upper;
-    vec2 part;
-    ivec2 low = corner(edge, s, t, part);
-    int base = row + starts[number + step] + (face * (edge + 2) + low.y) * (edge + 2) + low.x;
-    float a = mean(base), b = mean(base + 1), c = mean(base + edge + 2), d = mean(base + edge + 3);
-    result += share * vec3(mix(mix(a, b, part.x), mix(c, d, part.x), part.y),
-      middle * mix(b - a, d - c, part.y), middle * mix(c - a, d - b, part.x));
+    vec2 place = (vec2(s, t) + 1.) * middle;
+    ivec2 center = clamp(ivec2(place), 0, edge - 1) + 1;
+    vec2 off = place + .5 - vec2(center);
+    int base = row + starts[number + step] + (face * (edge + 2) + center.y - 1) * (edge + 2) + center.x - 1;
+    vec3 down = spline(off.y), byDown = vec3(off.y - .5, -2. * off.y, off.y + .5);
+    vec3 right = spline(off.x), byRight = vec3(off.x - .5, -2. * off.x, off.x + .5);
+    for (int j = 0; j < 3; j++) {
+      vec3 column = vec3(mean(base + j), mean(base + edge + 2 + j), mean(base + 2 * edge + 4 + j)), parts = column * byDown;
+      float total = dot(column, down), slope = parts.x + parts.y + parts.z;
+      float outside = (center.y == 1 ? parts.x : 0.) + (center.y == edge ? parts.z : 0.);
+      float across = total - ((j == 0 && center.x == 1) || (j == 2 && center.x == edge) ? slope * t / 2. : 0.);
+      result += share * vec3(total * right[j], middle * across * byRight[j], middle * (slope * right[j] - outside * byRight[j] * s / 2.));
+    }
   }
   return result;
 }
@@ -487,10 +495,28 @@ function toCubemap({ pixel, width, height }, edge) {
   return result;
 }
 
+// A latitude-longitude image of at most 2048 columns as a picture of a light: half floats, and its mip maps.
+function toSky({ pixel, width, height }) {
+  const levels = [];
+  for (;;) {
+    if (width <= 2048 || width % 2 || height % 2) levels.push({ pixel, width, height });
+    if (height <= 128 || width % 2 || height % 2) break;
+    const coarse = new Float32Array((3 * width * height) / 4), from = (x, y, c) => pixel[3 * (y * width + x) + c];
+    for (let y = 0, to = 0; y < height; y += 2) for (let x = 0; x < width; x += 2) for (let c = 0; c < 3; c++) coarse[to++] = (from(x, y, c) + from(x + 1, y, c) + from(x, y + 1, c) + from(x + 1, y + 1, c)) / 4;
+    [pixel, width, height] = [coarse, width / 2, height / 2];
+  }
+  const data = new Uint16Array(levels.reduce((total, level) => total + level.pixel.length, 0)), [first] = levels;
+  let brightest = 1, place = 0;
+  for (const value of first.pixel) brightest = Math.max(brightest, value);
+  const scale = Math.max(1, brightest / 65504);
+  for (const level of levels) for (const value of level.pixel) data[place++] = toHalf(value / scale);
+  return { content: { kind: "sky", scale, width: first.width, height: first.height, levels: levels.length }, buffers: [new DataView(data.buffer)] };
+}
+
 class Piece {
   constructor(content, buffers) {
     this.content = content;
-    const next = (() => { let i = 0; return (kind) => { const each = buffers[i++]; return new kind(each.buffer, each.byteOffset, each.byteLength / kind.BYTES_PER_ELEMENT); }; })();
+    const next = (() => { let i = 0; return (kind) => { const each = buffers[i++]; return new kind(each.buffer, each.byteOffset, each.byteLength / (kind.BYTES_PER_ELEMENT ?? 1)); }; })();
     this.position = next(Float32Array);
     this.face = next(Uint32Array);
     this.normal = next(Int16Array);
@@ -503,6 +529,7 @@ class Piece {
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = content.scene.lights.map(() => next(Float32Array));
     this.names = [...content.scene.lights];
+    this.skies = (content.skies ?? []).map((sky) => sky && { content: sky, buffers: [next(DataView)] });
     this.canvas = document.createElement("canvas");
     this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     this.build();
@@ -758,6 +785,8 @@ class Piece {
     part.written = key;
   }
   sky(message) {
+    const fine = this.skies[message.light];
+    if (message.rows > 1 && fine && !message.lamps.length) return { ...fine, content: { ...fine.content, seq: message.seq } };
     const edge = this.content.mips[0], light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
     const rim = new Float32Array(24 * (edge + 2) ** 2), index = this.index.get(edge), m = edge + 2;
     rimmed(light, edge, index, rim, 0);
@@ -776,7 +805,9 @@ class Piece {
     return { content: { kind: "sky", seq: message.seq, scale: 1, width, height }, buffers: [new DataView(result.buffer)] };
   }
   drop(message, data) {
-    this.lights.push(toCubemap(readHdr(new Uint8Array(data)), this.content.mips[0]));
+    const image = readHdr(new Uint8Array(data));
+    this.lights.push(toCubemap(image, this.content.mips[0]));
+    this.skies[this.lights.length - 1] = toSky(image);
     this.names.push(message.name.replace(/\.[^.]*$/, ""));
     return { content: { kind: "lights", lights: [...this.names], light: this.names.length - 1 }, buffers: [] };
   }

@@ -6,7 +6,7 @@ import itertools
 import os
 import pathlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,11 +20,15 @@ from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
 from jaxprt.systems import harmonic, lobe
 from jaxprt.view import matrices, messages, parts, stages
+from jaxprt.view.messages import Reply
 from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of, systems_of
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
+from jaxprt.view.uncoated import without_coats
 
 _MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
+_SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
+_SPARE_OF_SKIES = 4096  # bytes for what the page says of them
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _FIRST = 2  # finest scale of visibility that is stored as bytes
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
@@ -81,7 +85,7 @@ def export(
     bytes. Other parts use lobes and averaged visibility. All are stored as finely as `most` permits. If they fit, the
     brightest texels of the light are summed one by one on the parts that support it. As in the viewer, the user can
     rotate or replace the light, add lamps, and change materials that are constant over a part. A Radiance HDR file that
-    is dropped on the page becomes a light.
+    is dropped on the page becomes a light. Clear coats are left out, with a warning.
 
     Args:
         scene: The result of `jaxprt.precompute`, with the systems "lobe" and "harmonic".
@@ -91,7 +95,7 @@ def export(
 
     Returns:
         A description of the page, with its size and its error against the scene. If the scene has bounces, the error
-        includes that they are missing in the page.
+        includes that they are missing in the page, and so it does with clear coats.
 
     Raises:
         TypeError: `scene` is not a relit scene, `path` is not a path, `most` is not a number, or `environments` holds
@@ -106,12 +110,13 @@ def export(
     scene = scene.centered()
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
-    bits = bits_of(scene)
+    bare = without_coats(scene)
+    bits = bits_of(bare)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
     fits = bits is not None and sum(each.size for each in bits if each is not None) <= _MOST_BITS
     least = 0
-    for texels, size in itertools.product([True, False] if fits else [False], _sizes(scene)):
-        reduced = coarse(scene, size.level, texels=texels, degree=size.degree)
+    for texels, size in itertools.product([True, False] if fits else [False], _sizes(bare)):
+        reduced = coarse(bare, size.level, texels=texels, degree=size.degree)
         kept = parts.content(reduced, size.level)
         least = len(_page(session, reduced, lights, kept, error=0.0, title=path.stem))
         if least > most + _SPARE:
@@ -120,6 +125,10 @@ def export(
         page = _page(session, reduced, lights, kept, error=error, title=path.stem)
         least = len(page)
         if least <= most:
+            skies = _skies(session, most - least - _SPARE_OF_SKIES)
+            if any(sky is not None for sky in skies):
+                page = _page(session, reduced, lights, kept, skies, error=error, title=path.stem)
+                least = len(page)
             outputs.write(path, page)
             return Piece(path, least, size.edge, texels, size.degree, error)
     raise ValueError(
@@ -174,6 +183,7 @@ def _page(
     reduced: RelitScene,
     lights: Mapping[str, Environment],
     kept: tuple[dict[str, Any], list[bytes]],
+    skies: Sequence[Reply | None] = (),
     *,
     error: float,
     title: str,
@@ -195,12 +205,14 @@ def _page(
         "note": f"no Python; {100 * error:.1f} % off the whole system",
     }
     rims = sorted({mips[0], *blurring["edges"]}, reverse=True)
+    content = content | {"skies": [None if sky is None else sky.content for sky in skies]}
     content = content | {"scene": head, "light": blurring, "mips": mips, "rims": rims, "glossy": bool(size)}
     buffers = [
         *reply.buffers,
         *arrays,
         *(cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims),
         *(_colored(each, mips[0]).astype("<f4").tobytes() for each in lights.values()),
+        *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
     data = base64.b64encode(zlib.compress(messages.pack(content, buffers), 6)).decode()
     modules = {
@@ -208,6 +220,27 @@ def _page(
         for name in ("viewer", "piece")
     }
     return _PAGE.format(title=html.escape(title), data=data, **modules).encode()
+
+
+def _skies(session: Session, room: int | float) -> list[Reply | None]:
+    """Pictures of the lights for the background, as fine as their files and the room in the page permit.
+
+    Args:
+        session: The session of the page.
+        room: Bytes of the page that the pictures may take.
+
+    Returns:
+        One for each light; None for a light without the pixels of a file, whose texels are shown.
+    """
+    shown = [light.panorama is not None for light in session.stages.lights]
+    rows = _SKY_ROWS if any(shown) else 0
+    while rows > _LEAST_SKY_ROWS:
+        skies = [session.sky(number, rows=rows) if own else None for number, own in enumerate(shown)]
+        data = b"".join(bytes(buffer) for sky in skies if sky is not None for buffer in sky.buffers)
+        if 4 / 3 * len(zlib.compress(data, 6)) <= room:
+            return skies
+        rows //= 2
+    return [None] * len(shown)
 
 
 def _free(free: dict[str, Any]) -> dict[str, Any]:

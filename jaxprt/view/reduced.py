@@ -20,6 +20,7 @@ from jaxprt.view import matrices
 
 _LIGHT = 32  # texels along a face's edge of the light that lobes are looked up in
 _TEXELS = 64  # number of brightest texels that are summed one by one
+_DEGREE = 6  # of the harmonics by which diffuse parts are lit
 _GRAZING = 1e-3
 _KNOTS = 64  # most knots of a table's parameter
 
@@ -30,10 +31,12 @@ class CoarseTransport(lobe.LobeTransport):
     """Visibility without its finest scales, for a light of another size.
 
     Attributes:
+        vector: Transfer vectors in spherical harmonics.
         edge: Texels along a face's edge of the visibility.
         spread: Width of the finest remaining scale.
     """
 
+    vector: Float[Array, "lm v"]
     edge: int = eqx.field(static=True)
     spread: float = eqx.field(static=True)
 
@@ -44,11 +47,13 @@ class CoarseTransport(lobe.LobeTransport):
 
 
 class CoarseSystem(lobe.LobeSystem):
-    """A lobe system that reduces the resolution of its light."""
+    """A lobe system that reduces the resolution of its light, and lights diffuse parts by harmonics."""
 
     def light(self, environment: Environment) -> lobe.LobeLight:
         """The light at reduced resolution, blurred for lobes."""
-        return super().light(resized(environment, size=self.transport.size))
+        light = super().light(resized(environment, size=self.transport.size))
+        coefficient = harmonic.project(environment, degree=_DEGREE)
+        return dataclasses.replace(light, coefficient=coefficient)
 
 
 class CentralTexels(bright_texels.BrightTexels):
@@ -172,6 +177,9 @@ def systems_of(scene: RelitScene) -> list[Exported]:
 
 def _exported(name: str, system: System) -> Exported:
     own = system.system if isinstance(system, bright_texels.BrightTexels) else system
+    if isinstance(own, lobe.MatteSystem):
+        vector = lobe.diffuse.harmonics_of(own.transport.vector, size=own.transport.size, degree=_DEGREE)
+        own = harmonic.DiffuseSystem(harmonic.TransferVector(vector[:, None], own.transport.position), own.albedo)
     if not isinstance(own, Exported):
         raise ValueError(
             f"part {name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got "
@@ -217,6 +225,8 @@ def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
     if isinstance(system, harmonic.HarmonicSystem):
         return np.zeros((0, system.vertices))
     found = system.transport.vector
+    if isinstance(system, lobe.LobeSystem) and not isinstance(system.transport, CoarseTransport):
+        found = lobe.diffuse.harmonics_of(found, size=system.transport.size, degree=_DEGREE)
     if isinstance(system, harmonic.DiffuseSystem):
         if found.shape[1] != 1:
             raise ValueError(f"transfer vectors must be gray to be exported, got {found.shape[1]} colors")

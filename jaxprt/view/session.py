@@ -15,23 +15,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxprt import require
-from jaxprt.image import display, ray_direction, render
+from jaxprt.image import display, render, sky
 from jaxprt.image.layers import seen_from_front
+from jaxprt.image.tone_curves import TONES
 from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, load_environment, sides
-from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
-from jaxprt.view.messages import Look, Reply
+from jaxprt.view.messages import Lamp, Look, Reply
 from jaxprt.view.stages import Stages
 
 _LARGEST = 2048.0  # most pixels along an edge of a picture
 _PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
 _PIXELS = 400  # pixels of a picture at which the exact sum is compared
 _COARSE = {"still": 2, "exact": 4}  # downscaling factor of coarse pictures
+_SKY_ROWS = 2048.0  # most rows of the picture of a light
 _VIEWERS = 64  # most viewers whose newest look is remembered
 
 
@@ -117,9 +118,16 @@ class Session:
         scene = self.stages.scene
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
-        sky = background(self.stages.lights[0], ray_direction(camera))
+        behind = sky(self.stages.lights[0], camera)
         mesh = seen_from_front(scene.mesh, camera, self._hidden_faces())
-        return np.asarray(display(render(mesh, color, camera, background=sky)))
+        return np.asarray(display(render(mesh, color, camera, background=behind)))
+
+    def sky(self, number: int, lamps: tuple[Lamp, ...] = (), *, rows: int) -> Reply:
+        """Pictures of a light before rotation, as `Stages.sky` makes them, in half floats one after another."""
+        levels = self.stages.sky(number, lamps, rows=rows)
+        height, width, _ = levels[0].shape
+        data, scale = messages.encode(np.concatenate([level.reshape(-1, 3) for level in levels]), stops=None)
+        return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
 
     def _hidden_faces(self) -> Bool[np.ndarray, " f"]:
         """Triangles that cameras do not see from behind."""
@@ -171,7 +179,9 @@ class Session:
         self.stages.view_side(look)
         viewed = time.perf_counter()
         color, which = self.stages.color(look), self._which(message, look)
-        data, scale = messages.encode(color if which is None else color[which], stops=_stops(message))
+        data, scale = messages.encode(
+            color if which is None else color[which], stops=_stops(message), tone=_tone(message)
+        )
         done = time.perf_counter()
         spent = {"light": lit - began, "view": viewed - lit, "combine": done - viewed}
         times = {name: 1000 * each for name, each in spent.items()}
@@ -194,7 +204,7 @@ class Session:
         began, between = time.perf_counter(), self._between(message, seq)
         between()
         picture = self.stages.picture(look, width, height, samples=1 if coarse else 4, between=between)
-        data, scale = messages.encode(picture, stops=_stops(message))
+        data, scale = messages.encode(picture, stops=_stops(message), tone=_tone(message))
         spent = 1000 * (time.perf_counter() - began)
         size = {"width": width, "height": height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
@@ -213,17 +223,16 @@ class Session:
             error, spread = pixels.relative_l2(self.stages.direct_picture(look, width, height, between=between))
             told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
         truth = exact.exact_picture(*given, between=between)
-        data, scale = messages.encode(truth.color[0], stops=_stops(message))
+        data, scale = messages.encode(truth.color[0], stops=_stops(message), tone=_tone(message))
         size = {"width": truth.camera.width, "height": truth.camera.height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
 
     def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """A picture of a light before rotation."""
+        """Pictures of a light before rotation, each of half as many rows as the one before."""
         look, seq = self._parse(message)
-        sky = np.asarray(self.stages.sky(look.light, look.lamps))
-        data, scale = messages.encode(np.broadcast_to(sky, (*sky.shape[:2], 3)), stops=None)
-        size = {"width": sky.shape[1], "height": sky.shape[0]}
-        return Reply({"kind": "sky", "seq": seq, "scale": scale, **size}, [data])
+        rows = int(messages.number(message, "rows", 1.0, _SKY_ROWS)) if "rows" in message else 1
+        reply = self.sky(look.light, look.lamps, rows=rows)
+        return Reply(reply.content | {"seq": seq}, reply.buffers)
 
     def _drop(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """Adds a light from a file that was dropped on the viewer."""
@@ -280,6 +289,13 @@ def _named(lights: Sequence[Environment]) -> dict[str, Environment]:
 
 def _stops(message: Mapping[str, Any]) -> float | None:
     return None if message.get("stops") is None else messages.number(message, "stops", -60.0, 60.0)
+
+
+def _tone(message: Mapping[str, Any]) -> str:
+    tone = message.get("tone", "srgb")
+    if tone not in TONES:
+        raise ValueError(f"tone must be one of {', '.join(TONES)}, got {str(tone)[:80]!r}")
+    return tone
 
 
 def _check_lights(lights: Mapping[str, Environment]) -> None:

@@ -16,13 +16,11 @@ from jaxprt.compile import Between
 from jaxprt.relit.channels import Appearance, Shading, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
-from jaxprt.scene.environment import background, rotate
-from jaxprt.sphere import cubemap
+from jaxprt.scene.environment import add_disk, rotate, sky
 from jaxprt.systems import standard
 from jaxprt.view.messages import Lamp, Look
 
 _KEPT = 4  # cached results of each stage
-_FINE = 4  # subdivisions along a texel's edge, to resolve the rim of a lamp
 _SKY = 128  # height of the picture of an environment in pixels
 
 Made = TypeVar("Made")
@@ -75,13 +73,21 @@ class Stages:
         key = look.light, look.lamps, look.turn
         return self._once("environment", key, lambda: rotate(unturned, about(look.turn)))
 
-    def sky(self, number: int, lamps: tuple[Lamp, ...]) -> Float[Array, "h w 3"]:
-        """A latitude-longitude picture of a light before rotation: +y on top, +z in the center."""
-        latitude = np.pi * (0.5 - (np.arange(_SKY) + 0.5) / _SKY)[:, None]
-        longitude = np.pi * (1 - 2 * (np.arange(2 * _SKY) + 0.5) / (2 * _SKY))
-        ring = np.cos(latitude)
-        way = [ring * np.sin(longitude), np.sin(latitude) + 0 * longitude, ring * np.cos(longitude)]
-        return background(self.unturned(number, lamps), jnp.asarray(np.stack(way, -1), jnp.result_type(float)))
+    def sky(self, number: int, lamps: tuple[Lamp, ...], *, rows: int = _SKY) -> list[Float[np.ndarray, "_ _ 3"]]:
+        """Latitude-longitude pictures of a light before rotation: +y on top, +z in the center.
+
+        Args:
+            number: Index of the light.
+            lamps: Lamps that are added to it.
+            rows: Most rows of the first picture; 128 at least, and no more than the file of the light has.
+
+        Returns:
+            Pictures of rows, half as many, and so on to 128.
+        """
+        light = self.unturned(number, lamps)
+        finest = _SKY if light.panorama is None else light.panorama.rows
+        heights = [_SKY << level for level in range(10) if level == 0 or _SKY << level <= min(rows, finest)]
+        return [_latlong(light, height) for height in reversed(heights)]
 
     def materials(self, look: Look) -> dict[str, TexturedMaterial | BlinnPhong]:
         """The materials that a look changes, by part."""
@@ -191,6 +197,16 @@ def about(angle: float) -> Float[Array, "3 3"]:
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
 
+def _latlong(light: Environment, rows: int) -> Float[np.ndarray, "h w 3"]:
+    """A latitude-longitude picture of a light."""
+    latitude = np.pi * (0.5 - (np.arange(rows) + 0.5) / rows)[:, None]
+    longitude = np.pi * (1 - 2 * (np.arange(2 * rows) + 0.5) / (2 * rows))
+    ring = np.cos(latitude)
+    way = [ring * np.sin(longitude), np.sin(latitude) + 0 * longitude, ring * np.cos(longitude)]
+    color = np.asarray(sky(light, np.stack(way, -1).astype(np.float32), angle=np.pi / rows))
+    return np.broadcast_to(color, (*color.shape[:2], 3))
+
+
 def camera(look: Look, width: int, height: int) -> Camera:
     """The camera of a look."""
     return Camera(list(look.eye), list(look.target), [0.0, 1.0, 0.0], look.field_of_view, width, height)
@@ -259,20 +275,7 @@ def _f0(material: TexturedMaterial) -> float:
 
 
 def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
-    """A light with lamps added as disks. A disk smaller than a texel keeps its flux."""
-    size = light.radiance.shape[-2]
-    radiance = np.asarray(light.radiance, np.float64)
-    if not lamps:
-        return light
-    radiance = np.broadcast_to(radiance, (*radiance.shape[:-1], 3)).copy()
-    area = np.asarray(cubemap.solid_angle(size=size), np.float64)
-    part = np.asarray(cubemap.direction(size=size * _FINE), np.float64)
-    part_area = np.asarray(cubemap.solid_angle(size=size * _FINE), np.float64)
-    for each in lamps:
-        middle = np.asarray(each.direction) / np.linalg.norm(each.direction)
-        toward = part @ middle
-        inside = part_area * (toward >= min(np.cos(each.angle), toward.max()))
-        flux = inside.reshape(6, size, _FINE, size, _FINE).sum((2, 4))
-        flux *= 2 * np.pi * (1 - np.cos(each.angle)) / flux.sum()
-        radiance += (flux / area)[..., None] * np.asarray(each.radiance)
-    return Environment(jnp.asarray(radiance, jnp.result_type(light.radiance)))
+    """A light with lamps added as disks."""
+    for lamp in lamps:
+        light = add_disk(light, np.asarray(lamp.direction), angle=lamp.angle, radiance=np.asarray(lamp.radiance))
+    return light

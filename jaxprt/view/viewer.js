@@ -10,8 +10,21 @@ const VERTEX = `#version 300 es
 layout(location=0) in vec3 position; layout(location=1) in vec3 color; uniform mat4 matrix; out vec3 c;
 void main(){ c = color; gl_Position = matrix * vec4(position, 1); }`;
 const DISPLAY = `
-uniform float gain; uniform bool encoded;
-vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1.);
+uniform float gain; uniform bool encoded; uniform int tone;
+vec3 hable(vec3 x){ return (x * (.15 * x + .05) + .004) / (x * (.15 * x + .5) + .06) - .02 / .3; }
+vec3 aces(vec3 x){ x = x / .6 * mat3(.59719, .35458, .04823, .076, .90834, .01566, .0284, .13383, .83777);
+  x = (x * (x + .0245786) - .000090537) / (x * (.983729 * x + .432951) + .238081);
+  return x * mat3(1.60475, -.53108, -.07367, -.10208, 1.10813, -.00605, -.00327, -.07276, 1.07602); }
+vec3 agx(vec3 x){
+  const mat3 back = mat3(1.6605, -.5876, -.0728, -.1246, 1.1329, -.0083, -.0182, -.1006, 1.1187);
+  x = max(x * inverse(back), 0.) * mat3(.856627153, .0951212405, .0482516061, .137318973, .761241991, .101439036, .111898213, .0767994186, .811302368);
+  x = clamp((log2(max(x, 1e-10)) + 12.47393) / 16.499999, 0., 1.);
+  x = (((((15.5 * x - 40.14) * x + 31.96) * x - 6.868) * x + .4298) * x + .1191) * x - .00232;
+  x = x * inverse(mat3(.899796956, .0871996192, .0130034249, .111420989, .875575586, .0130034249, .111420989, .0871996192, .801379392));
+  return pow(max(x, 1e-6), vec3(2.2)) * back; }
+// The curves of jaxprt/image/tone_curves.py. Matrices stand in rows, to the right of vectors.
+vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6);
+  x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : x, 0., 1.);
   return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;
 const MESH = `#version 300 es
 precision highp float; in vec3 c; out vec4 o; ${DISPLAY}
@@ -19,14 +32,16 @@ void main(){ o = vec4(gl_FrontFacing ? display(c) : vec3(0), 1); } // backs are 
 const QUAD = `#version 300 es
 out vec2 at; void main(){ at = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(at * 2. - 1., .99999, 1); }`;
 const SKY = `#version 300 es
-precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform mat3 ray; uniform float turn; ${DISPLAY}
+precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform mat3 ray; uniform float turn, lod; ${DISPLAY}
 void main(){ vec3 d = normalize(ray * vec3(at * 2. - 1., 1));
   float lon = atan(d.x, d.z) - turn; vec2 uv = vec2(.5 - lon / 6.283185307, .5 - asin(clamp(d.y, -1., 1.)) / 3.141592654);
-  o = vec4(display(textureLod(image, uv, 0.).rgb), 1); }`;
+  o = vec4(display(textureLod(image, uv, lod).rgb), 1); }`; // of derivatives there would be a seam
 const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb), alpha); }`;
 
+const TONES = ["srgb", "filmic", "agx", "aces"];
+const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 const FADE = 200; // milliseconds in which a picture at rest appears
 const SLOW = 500; // milliseconds of a whole picture from which on a coarse one comes first
 
@@ -180,34 +195,43 @@ class Drawing {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     return made;
   }
-  setSky(data, width, height, scale) {
-    if (this.skyImage) this.gl.deleteTexture(this.skyImage);
+  setSky(data, { width, height, scale, levels = 1 }) { // levels: pictures of half the size follow, as mip maps
+    const gl = this.gl;
+    if (this.skyImage) gl.deleteTexture(this.skyImage);
     this.skyImage = this.texture(data, width, height, false, true);
-    this.skyScale = scale;
+    for (let level = 1, first = 3 * width * height; level < levels; level++) {
+      const [w, h] = [width >> level, height >> level];
+      gl.texImage2D(gl.TEXTURE_2D, level, gl.RGB16F, w, h, 0, gl.RGB, gl.HALF_FLOAT, data.subarray(first, first += 3 * w * h));
+    }
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    [this.skyScale, this.skyHeight] = [scale, height];
   }
   addStill(data, width, height, encoded, scale) {
     this.dropStills(1);
     this.stills.push({ image: this.texture(data, width, height, encoded, false), encoded, scale, since: performance.now() });
   }
   dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
-  quad(program, image, gain, encoded) {
+  quad(program, image, gain, encoded, tone) {
     const gl = this.gl;
     gl.useProgram(program.made);
     gl.bindVertexArray(this.empty);
     gl.bindTexture(gl.TEXTURE_2D, image);
     gl.uniform1f(program.at("gain"), gain);
     gl.uniform1i(program.at("encoded"), encoded ? 1 : 0);
+    gl.uniform1i(program.at("tone"), tone);
   }
   draw(camera, state, center, now) { // true while a picture at rest appears
-    const gl = this.gl, { width, height } = this.canvas, gain = 2 ** state.stops;
+    const gl = this.gl, { width, height } = this.canvas, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0.1, 0.1, 0.1, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.disable(gl.DEPTH_TEST);
     if (state.background && this.skyImage) {
-      this.quad(this.sky, this.skyImage, gain * this.skyScale, false);
+      this.quad(this.sky, this.skyImage, gain * this.skyScale, false, tone);
       gl.uniformMatrix3fv(this.sky.at("ray"), false, camera.ray(width / height));
       gl.uniform1f(this.sky.at("turn"), state.turn);
+      gl.uniform1f(this.sky.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     if (this.count && this.colored) {
@@ -217,6 +241,7 @@ class Drawing {
       gl.uniformMatrix4fv(this.mesh.at("matrix"), false, camera.matrix(width / height, center));
       gl.uniform1f(this.mesh.at("gain"), gain * this.scale);
       gl.uniform1i(this.mesh.at("encoded"), this.encoded ? 1 : 0);
+      gl.uniform1i(this.mesh.at("tone"), tone);
       // Backs lie a little deeper: at silhouettes they are as deep as the fronts beside them, and would show as dots.
       gl.enable(gl.CULL_FACE);
       gl.enable(gl.POLYGON_OFFSET_FILL);
@@ -234,7 +259,7 @@ class Drawing {
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     for (const each of this.stills) {
       alpha = clamp((now - each.since) / FADE, 0, 1);
-      this.quad(this.still, each.image, gain * each.scale, each.encoded);
+      this.quad(this.still, each.image, gain * each.scale, each.encoded, tone);
       gl.uniform1f(this.still.at("alpha"), alpha);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
@@ -270,13 +295,13 @@ export function mount(root, ask) {
   const panel = element("div", frame, { className: "panel" });
   const line = element("div", frame, { className: "line" }), told = element("div", frame, { className: "told" });
   const help = element("pre", frame, { className: "help", textContent: HELP, hidden: true });
-  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, background: true, bounces: false, still: true, exact: false, materials: {} };
-  const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
+  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, tone: "srgb", background: true, bounces: false, still: true, exact: false, materials: {} };
+  const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, sky: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
   let scene = null, camera = null, first = null, drawing = null, closed = false;
   // Whether round trips are long: the kernel is far away, or the browser draws slowly. Then colors come as bytes, and
   // those that the eye can see first.
   let long = false, bytes = null, partial = false;
-  let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = "", framed = 0;
+  let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = {}, framed = 0;
   let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
   const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
 
@@ -300,7 +325,7 @@ export function mount(root, ask) {
   const message = (kind) => ({
     kind, viewer, seq, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
     target: camera.target, field_of_view: camera.angle, bounces: state.bounces, materials: state.materials,
-    stops: long ? state.stops : null,
+    stops: long ? state.stops : null, tone: state.tone,
   });
   // Anything that changes the picture: the newest state is asked for as soon as the last answer has come.
   const moved = () => {
@@ -354,26 +379,30 @@ export function mount(root, ask) {
     }
     if (dirty) look();
     else if (stats.shown === seq && partial) look("unseen");
-    else if (stats.shown === seq) { sky(); stillTimer = setTimeout(still, 250); }
+    else if (stats.shown === seq) { sky(); stillTimer = setTimeout(rested, 250); }
   };
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
     line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
       `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
   };
-  const sky = async () => {
+  // The light as it is seen: a small picture at once and a fine one at rest, unless the way is long.
+  const sky = async (rows = 1) => {
     const key = JSON.stringify([state.light, state.lamps]);
-    if (key === skyKey) return;
-    skyKey = key;
+    if (key === skyKey.light && rows <= skyKey.rows) return;
+    skyKey = { light: key, rows };
     try {
-      const { content, buffers } = await ask(message("sky"));
-      if (closed || content.kind === "error") return;
+      const { content, buffers } = await ask({ ...message("sky"), rows });
+      if (closed || content.kind === "error" || skyKey.light !== key) return;
       const data = new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
-      drawing.setSky(data, content.width, content.height, content.scale);
-      controls?.paint(data, content);
+      if (rows === 1) controls?.paint(data, content);
+      if (skyKey.rows !== rows) return; // the fine one has been asked for
+      drawing.setSky(data, content);
+      stats.sky = content.height;
       redraw();
-    } catch { skyKey = ""; }
+    } catch { skyKey = {}; }
   };
+  const rested = () => { if (!long) sky(SKY_ROWS); still(); };
   // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first picture
   // of a size does not count: its programs are compiled. Python gives up what it is at when the next look comes.
   const still = async () => {
@@ -414,6 +443,11 @@ export function mount(root, ask) {
     controls?.show();
     if (long) moved(); else redraw();
   };
+  const map = (tone) => {
+    state.tone = tone;
+    controls?.show();
+    if (long) moved(); else redraw();
+  };
   const drop = async (file) => {
     if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
@@ -444,7 +478,7 @@ export function mount(root, ask) {
       state.system ||= Object.keys(scene.systems)[0];
       state.bounces = scene.systems[state.system].bounces;
       drawing.setMesh(scene.position, scene.face, scene.backs);
-      controls = panelOf(panel, scene, state, { set, expose, moved });
+      controls = panelOf(panel, scene, state, { set, expose, map, moved });
       controls.show();
       resize();
       moved();
@@ -459,7 +493,7 @@ export function mount(root, ask) {
   canvas.addEventListener("webglcontextrestored", () => {
     drawing.build();
     if (scene) drawing.setMesh(scene.position, scene.face, scene.backs);
-    skyKey = "";
+    skyKey = {};
     moved();
   });
   const watch = new ResizeObserver(resize);
@@ -470,7 +504,7 @@ export function mount(root, ask) {
   return () => { closed = true; watch.disconnect(); hands(); clearTimeout(stillTimer); drawing.close(); };
 }
 
-function panelOf(panel, scene, state, { set, expose, moved }) {
+function panelOf(panel, scene, state, { set, expose, map, moved }) {
   panel.textContent = "";
   const row = (text) => { const made = element("label", panel); element("span", made, { textContent: text }); return made; };
   const choice = (text, names, pick) => {
@@ -485,6 +519,7 @@ function panelOf(panel, scene, state, { set, expose, moved }) {
   const light = choice("light", scene.lights, (i) => set({ light: i }));
   const exposure = element("input", row("exposure"), { type: "range", min: -6, max: 6, step: 0.1 });
   exposure.oninput = () => expose(Number(exposure.value));
+  const tone = choice("tone", TONES, (i) => map(TONES[i]));
   const box = (text, key, change) => {
     const made = element("input", row(text), { type: "checkbox" });
     made.onchange = () => change({ [key]: made.checked });
@@ -507,6 +542,7 @@ function panelOf(panel, scene, state, { set, expose, moved }) {
       light.value = state.light;
       if (system) system.value = names.indexOf(state.system);
       exposure.value = state.stops;
+      tone.value = TONES.indexOf(state.tone);
       for (const [key, each] of boxes) each.checked = state[key];
       for (const part of parts) part();
     },

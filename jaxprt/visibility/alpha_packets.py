@@ -8,7 +8,7 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, Integer
+from jaxtyping import Bool, Float32, Int, Int32, Integer, UInt8
 from numba import carray  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import types
 from numba.extending import intrinsic
@@ -86,6 +86,19 @@ class AlphaPackets:
         """Whether each ray is stopped: with the probability that its light is, by a hash of the ray."""
         share = self.passed(origin, direction, point, way)
         return _stopped(origin, direction, point, way, share)
+
+    def shares(
+        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
+    ) -> None:
+        """Traces the rays of some points of a picture to texels, as `packets.Packets.shares` does.
+
+        Of translucent surfaces, the share of light that passes counts.
+        """
+        passed, context, arguments = np.ones(packets.WIDTH, np.float32), np.empty(16, np.int64), np.empty(4, np.int64)
+        _empty_context(context, arguments, _PASSED)
+        context[_FIELD] = passed.ctypes.data
+        query = self._occluded, self._scene, arguments.ctypes.data, passed
+        packets.trace_shares(query, surface, points, texels, part.start, part.stop, share)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
         """The first triangle that stops each ray (-1 for none), its distance, and the barycentric coordinates.

@@ -10,7 +10,7 @@ from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.starts import start_points
+from jaxprt.visibility.starts import start_points, starts_and_buried
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
@@ -35,7 +35,7 @@ class DiffuseTracer:
     double: Bool[np.ndarray, " f"]
 
     def __init__(self, mesh: Mesh, occluder: Mesh, samples: LightSamples, pool: ThreadPoolExecutor):
-        self._samples, self._pool = samples, pool
+        self._samples, self._pool, self._given = samples, pool, (mesh, occluder)
         # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
@@ -49,9 +49,16 @@ class DiffuseTracer:
         self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
         self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
 
-    def at_vertices(self) -> Float32[np.ndarray, "v l c"]:
-        """Reflected radiance at the vertices of the surface, before subdivision."""
-        return self._light(start_points(self._mesh, self._rays), np.asarray(self._mesh.normal, np.float64))
+    def at_vertices(self, vertex: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "v l c"]:
+        """Reflected radiance at some vertices of the surface, before subdivision; 0 at others."""
+        result = np.zeros((len(self._mesh.position), *self._samples.weight.shape[1:]), np.float32)
+        start = start_points(self._mesh, self._rays)
+        result[vertex] = self._light(start[vertex], np.asarray(self._mesh.normal, np.float64)[vertex])
+        return result
+
+    def occluder(self, mesh: Mesh) -> Occluder:
+        """The triangles of a mesh for rays: those that cast shadows, if they are the same."""
+        return self._rays if mesh is self._given[0] and self._given[1] is mesh else Occluder(mesh)
 
     def at(
         self,
@@ -61,8 +68,8 @@ class DiffuseTracer:
         offset: Float32[np.ndarray, " n"],
         casting: Int[np.ndarray, "m 3"],
         vertex: Int[np.ndarray, " p"],
-    ) -> Float32[np.ndarray, "p l c"]:
-        """Reflected radiance at some vertices of the subdivided surface.
+    ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """Reflected radiance at some vertices of the subdivided surface, and whether they are inside of solids.
 
         Args:
             position: Positions of all vertices.
@@ -73,18 +80,19 @@ class DiffuseTracer:
             vertex: Indices of the vertices at which radiance is wanted.
 
         Returns:
-            Radiance for each light and color of the samples.
+            Radiance for each light and color of the samples, and a mask of vertices inside of other solids.
         """
         if not vertex.size:
-            return np.zeros((0, *self._samples.weight.shape[1:]), np.float32)
+            return np.zeros((0, *self._samples.weight.shape[1:]), np.float32), np.zeros(0, bool)
         used, index = np.unique(np.concatenate([around.ravel(), vertex]), return_inverse=True)
         mesh = _mesh(position[used], index[: around.size].reshape(-1, 3), normal[used])
         other = self._other
         place, face = (
             np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
         )
-        start = start_points(mesh, Occluder(_mesh(place, face)), offset=offset)
-        return self._light(start[index[around.size :]], normal[vertex])
+        start, buried = starts_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
+        own = index[around.size :]
+        return self._light(start[own], normal[vertex]), buried[own]
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Radiance that surfaces with the given normals reflect at the given ray origins."""

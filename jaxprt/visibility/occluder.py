@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float32, Integer
+from jaxtyping import Bool, Float32, Integer, UInt8
 
 from jaxprt.scene.mesh import Mesh
 
@@ -186,6 +186,20 @@ class Occluder:
         with self._building:
             partial = self._partial
         return partial.passed(origin, direction, point, way)
+
+    def shares(
+        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
+    ) -> None:
+        """Visible shares of texels at some points of a picture; `texel_rays.shares` calls it.
+
+        Raises:
+            RuntimeError: The Embree library that embreex ships has no packets of rays.
+        """
+        with self._building:
+            packed = self._packed if self.opacity is None else self._partial
+        if packed is None:
+            raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
+        packed.shares(surface, points, texels, part, share)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.

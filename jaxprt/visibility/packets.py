@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, no_type_check
 import llvmlite.ir
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Integer
+from jaxtyping import Bool, Float32, Integer, UInt8
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -29,6 +29,7 @@ COHERENT = 1 << 16
 EVERY_FEATURE = 0xFFFFFFFF
 _NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
+_ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # places of ray origins in a pixel, from its center
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
@@ -82,6 +83,21 @@ class Packets:
         found = np.empty(len(point), np.bool_)
         _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
         return found
+
+    def shares(
+        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
+    ) -> None:
+        """Traces the rays of some points of a picture to texels; `jaxprt.visibility.texel_rays` explains the arguments.
+
+        Args:
+            surface: Positions and normals of vertices, triangles, and the distance from each at which rays start.
+            points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
+            texels: Directions of the places in each texel, of its middle, number of rays, and first place.
+            part: The points to trace.
+            share: The result, in 255ths.
+        """
+        query = self._occluded, self._scene, self._arguments.ctypes.data, np.ones(WIDTH, np.float32)
+        trace_shares(query, surface, points, texels, part.start, part.stop, share)
 
 
 class Embree(NamedTuple):
@@ -233,7 +249,6 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
     memory = np.empty(13 * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
     ray = memory[first : first + 12 * 16].reshape(12, 16)
-    number = ray.view(np.uint32)
     valid = memory[first + 12 * 16 : first + 13 * 16].view(np.int32)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
@@ -243,12 +258,98 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
             for axis in range(3):
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
-            ray[3, lane] = 0.0  # near
-            ray[7, lane] = 0.0  # time
-            ray[8, lane] = 1e37  # far; minus infinity after a hit
-            number[9, lane] = 0xFFFFFFFF  # mask
-            number[10, lane] = lane
-            number[11, lane] = 0  # flags
+        _whole_ray(ray)
         call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
             found[packet + lane] = ray[8, lane] < 0
+
+
+@no_type_check
+@compiled
+def _start(surface, points, point, lane, origin, facing):
+    """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
+
+    The normal is zero in padding and for triangles without an area, which have no side to start from.
+    """
+    position, normal, face, offset = surface
+    triangle, barycentric, slope, _ = points
+    number = max(triangle[point], 0)
+    a, b, c = face[number]
+    first = position[a].astype(np.float64)
+    across = np.cross(position[b].astype(np.float64) - first, position[c].astype(np.float64) - first)
+    length = np.sqrt(across @ across)
+    side = across @ (normal[a] + normal[b] + normal[c]).astype(np.float64)
+    scale = 0.0 if length == 0 or triangle[point] < 0 else (-1 / length if side < 0 else 1 / length)
+    weight = np.empty(3)
+    for axis in range(3):
+        facing[axis, lane] = scale * across[axis]
+    for place in range(4):
+        for corner in range(3):
+            moved = barycentric[point, corner]
+            moved += _ORIGINS[place, 0] * slope[point, 0, corner] + _ORIGINS[place, 1] * slope[point, 1, corner]
+            weight[corner] = max(moved, 0.0)
+        weight /= max(weight.sum(), 1e-30)
+        for axis in range(3):
+            on_triangle = weight[0] * position[a, axis] + weight[1] * position[b, axis] + weight[2] * position[c, axis]
+            origin[place, axis, lane] = on_triangle + offset[number] * facing[axis, lane]
+
+
+@no_type_check
+@compiled
+def trace_shares(query, surface, points, texels, first, last, share):
+    """Visible shares of texels at points of a picture: see `Packets.shares`.
+
+    `query` holds the address of `rtcOccluded16`, the scene, the address of the arguments, and sixteen numbers. A filter
+    function may multiply the number of a ray by the share of light that a surface on it lets pass.
+    """
+    address, scene, arguments, passed = query
+    pattern = points[3]
+    direction, middle, count, shift = texels
+    strata = direction.shape[1]
+    memory = np.empty(13 * 16 + 16, np.float32)
+    begin = (-memory.ctypes.data // 4) % 16
+    ray = memory[begin : begin + 12 * 16].reshape(12, 16)
+    valid = memory[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
+    origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
+    above, visible = np.empty(16, np.bool_), np.empty(16)
+    for packet in range(first, last, 16):
+        lanes = min(16, last - packet)
+        for lane in range(lanes):
+            _start(surface, points, packet + lane, lane, origin, facing)
+        for texel in range(len(count)):
+            visible[:] = 0
+            for lane in range(16):
+                way = middle[texel]
+                cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
+                above[lane] = lane < lanes and cosine > 0
+            for turn in range(count[texel] if above.any() else 0):
+                for lane in range(16):
+                    here = min(lane, lanes - 1)
+                    base = pattern[packet + here]
+                    stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
+                    place = (base // 4 + base + texel + turn) % 4
+                    valid[lane] = -1 if above[lane] else 0
+                    for axis in range(3):
+                        ray[axis, lane] = origin[place, axis, here]
+                        ray[4 + axis, lane] = direction[texel, stratum, axis]
+                _whole_ray(ray)
+                passed[:] = 1.0
+                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                for lane in range(lanes):
+                    visible[lane] += passed[lane] if above[lane] and ray[8, lane] > 0 else 0.0
+            for lane in range(lanes):
+                share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / count[texel] + 0.5))
+
+
+@no_type_check
+@compiled
+def _whole_ray(ray):
+    """Fills in the fields of sixteen rays that are always the same."""
+    number = ray.view(np.uint32)
+    for lane in range(16):
+        ray[3, lane] = 0.0  # near
+        ray[7, lane] = 0.0  # time
+        ray[8, lane] = 1e37  # far; minus infinity after a hit
+        number[9, lane] = 0xFFFFFFFF  # mask
+        number[10, lane] = lane
+        number[11, lane] = 0  # flags

@@ -23,7 +23,7 @@ from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.starts import start_points
 
-ALGORITHM = 3  # version of the ray casting; raised by a release whose rays give other results
+ALGORITHM = 4  # version of the ray casting; raised by a release whose rays give other results
 ROUNDING = 3e-6  # relative to the norm: larger than the rounding error of single precision
 BLOCK = 64  # vertices in a block: a fraction of a second of work
 LEVELS = 16  # visibility is stored in sixteenths: 4 x 4 rays per texel

@@ -1,9 +1,10 @@
 """Refinement of meshes to the scale of their shadows.
 
 Edges are halved where the radiance at their midpoint differs from the mean of their endpoints. The radiance is that of
-a white diffuse surface. Rays are traced at the midpoint of each edge, and at points inside of triangles that are large
-enough to contain whole shadows. A triangle's share of the squared error of a picture is its area times its mean squared
-difference; triangles with the largest shares are divided first.
+a white diffuse surface. Rays are traced at the midpoint of each edge, at places that pictures of the scene show, and at
+points inside of triangles that are large enough to contain whole shadows. A triangle's part of the squared error is its
+share of the pictures times its mean squared difference; triangles with the largest parts are divided first. A small
+part of the error is that of the whole surface, for views that no camera of ours has.
 """
 
 import bisect
@@ -18,15 +19,21 @@ from threadpoolctl import threadpool_limits
 
 from jaxprt import require
 from jaxprt.scene import light_samples, subdivision
+from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.subdivision import Division, Edges
-from jaxprt.visibility import blocks
+from jaxprt.visibility import blocks, shown
 from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.diffuse import DiffuseTracer
 
+ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
+
 _DIRECTIONS = 1024  # per light: penumbrae have steps of a thousandth of its power
-_SIZE, _DEGREE = 16, 6  # texels along an edge and degree of harmonics, if no environments are given
+_SIZE, _DEGREE = 8, 6  # texels along an edge and degree of harmonics, if no environments are given
+_UNSEEN = 0.2  # share of the error that belongs to the whole surface, and not to the pictures
+_FINE = 1000  # triangles with edges shorter than this share of the scene's diagonal are not measured
+_MANY = 8  # places in pictures from which a triangle's share of them is counted, and not estimated by its area
 _FACES = 1 << 13  # triangles in a block whose errors are summed at once
 _HIDDEN = 4  # points inside of triangles per shadow that is just large enough to cause the whole error
 _FINEST = 0.01  # smaller errors do not increase the number of points inside of triangles
@@ -77,9 +84,8 @@ def refine(
     compare the endpoints of each edge instead.
     """
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
-    return subdivision.subdivide(
-        mesh, divisions(mesh, mesh if occluder is None else relative(occluder, mesh.origin), **options)
-    )
+    shadowing = mesh if occluder is None else relative(occluder, mesh.origin)
+    return subdivision.subdivide(mesh, divisions(mesh, shadowing, views=shown.cameras(mesh, (), ()), **options)[0])
 
 
 def divisions(
@@ -89,9 +95,20 @@ def divisions(
     error: float,
     vertices: int,
     environments: Sequence[Environment] | None,
+    views: Sequence[Camera],
     progress: bool,
-) -> list[Division]:
-    """Successive subdivisions that `refine` applies to a mesh. It has the arguments of `refine`, all required."""
+) -> tuple[list[Division], float]:
+    """Successive subdivisions that `refine` applies to a mesh, and the error that is left.
+
+    Args:
+        mesh: As in `refine`.
+        occluder: As in `refine`.
+        error: As in `refine`.
+        vertices: As in `refine`.
+        environments: As in `refine`.
+        views: Cameras whose pictures the error is of.
+        progress: As in `refine`.
+    """
     if not 0 <= error < np.inf:
         raise ValueError(f"error must be at least 0 and finite, got {error}")
     if vertices < 1:
@@ -108,14 +125,15 @@ def divisions(
         ThreadPoolExecutor(blocks.cores()) as pool,
         tqdm.tqdm(desc="refine", unit="vertex", unit_scale=True, disable=not progress) as bar,
     ):
-        surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points)
+        tracer = DiffuseTracer(mesh, occluder, samples, pool)
+        surface = _Surface(mesh, tracer, points, shown.places(mesh, tracer.occluder(mesh), views))
         while True:
             count, squares = len(surface.position), surface.squares()
             left = float(squares.sum(0).max()) ** 0.5
             bar.update(count - bar.n)
             bar.set_postfix_str(f"{100 * left:.2g} % error")
             if left <= error:
-                return result
+                return result, left
             edges = Edges(surface.position, surface.face)
             marked = _marked(surface, edges, squares, error, vertices - count)
             if not marked.any():
@@ -128,7 +146,7 @@ def divisions(
             f"asked for; at most {vertices} were allowed",
             stacklevel=3,
         )
-    return result
+    return result, left
 
 
 class _Surface:
@@ -143,46 +161,81 @@ class _Surface:
         offset: Distance of ray origins from each triangle.
     """
 
-    def __init__(self, mesh: Mesh, tracer: DiffuseTracer, points: int):
+    def __init__(
+        self, mesh: Mesh, tracer: DiffuseTracer, points: int, seen: tuple[subdivision.Points, Float[np.ndarray, " p"]]
+    ):
         self.position, self.normal = np.asarray(mesh.position), np.asarray(mesh.normal, np.float64)
         self.face = np.asarray(mesh.face, np.int64)
         self.offset = tracer.offset
         self._tracer, self._casts = tracer, tracer.casts
-        self.light = tracer.at_vertices()
+        corner = self.position[self.face].astype(np.float64)
+        longest = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2).max(1)
+        self._coarse = longest * _FINE > np.linalg.norm(np.ptp(corner.reshape(-1, 3), axis=0))
+        self.light = tracer.at_vertices(np.unique(self.face[self._coarse]))
         self._key = np.zeros(0, np.int64)  # keys of the edges whose midpoints are known, in ascending order
-        self._middle = self.light[:0]
+        self._middle, self._buried = self.light[:0], np.zeros(0, bool)
         area = self._area()
-        share = points * area / max(area.sum(), np.finfo(np.float64).tiny)
+        area = area / max(area.sum(), np.finfo(np.float64).tiny)
         # No points on sheets: there only shared vertices tell the two sides apart.
-        self._points = subdivision.scatter(np.where(tracer.double, 0, share).astype(np.int64))
-        self._at_points = self._traced_points()
+        even = subdivision.scatter(np.where(tracer.double | ~self._coarse, 0, points * area).astype(np.int64))
+        own = (self._coarse & ~tracer.double)[seen[0].triangle]
+        of_pictures = np.bincount(seen[0].triangle, seen[1], len(area))
+        self._shown = seen[1][own].sum() > 0
+        self.share = _UNSEEN * area + (1 - _UNSEEN) * of_pictures if self._shown else area
+        pairs = zip(even, seen[0], strict=True)
+        self._points = subdivision.Points(*(np.concatenate([one, other[own]]) for one, other in pairs))
+        self._picture = np.concatenate([np.zeros(len(even.triangle)), seen[1][own]])
+        self._at_points, self._inside = self._traced_points()
         self.error = np.zeros((len(self.face), self.light.shape[1]))
-        self._measure(np.arange(len(self.face)))
+        self._measure(np.flatnonzero(self._coarse))
 
     def scale(self) -> Float[np.ndarray, " l"]:
-        """Integral of the squared radiance over the surface."""
-        return self._area() @ self._square()[self.face].mean(1)
+        """Mean of the squared radiance."""
+        share = self.share[self._coarse]
+        return share @ self._square()[self.face[self._coarse]].mean(1) / max(share.sum(), np.finfo(np.float64).tiny)
 
     def squares(self) -> Float[np.ndarray, "f l"]:
-        """Contribution of each triangle to the squared relative error of the surface."""
+        """Contribution of each triangle to the squared relative error of pictures and of the surface."""
         scale = self.scale()
-        return self._area()[:, None] * self.error / np.where(scale > 0, scale, 1)
+        return self.share[:, None] * self.error / np.where(scale > 0, scale, 1)
 
     def differences(self, face: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 l c"]:
-        """Radiance at the midpoints of edges, minus the mean of their endpoints."""
+        """Radiance at the midpoints of edges, minus the mean of their endpoints; 0 inside of solids."""
         ends = _ends(face)
-        return self._middle[np.searchsorted(self._key, _key(ends))] - self.light[ends].mean(2)
+        middle = np.searchsorted(self._key, _key(ends))
+        apart = self._middle[middle] - self.light[ends].mean(2)
+        apart[self._buried[middle]] = 0
+        return apart
 
     def divide(self, division: Division) -> None:
         """Divides triangles and traces rays on the new ones."""
-        self.light = np.concatenate([self.light, self._middle[np.searchsorted(self._key, _key(division.parent))]])
+        middle, key = np.searchsorted(self._key, _key(division.parent)), _key(division.parent)
+        known = np.append(self._key, -1)[middle] == key  # Others are of triangles that are not measured.
+        added = np.zeros((len(key), *self.light.shape[1:]), self.light.dtype)
+        added[known] = self._middle[middle[known]]
+        self.light = np.concatenate([self.light, added])
         self.normal = np.concatenate([self.normal, subdivision.middle_normal(self.normal, division.parent)])
         self.position = np.concatenate([self.position, subdivision.middle(self.position, division.parent)])
+        before = self._area()
         self._points = subdivision.relocate(self._points, self.face, division)
         self.face = division.face
+        self._divide_shares(division.origin, before)
+        self._coarse = self._coarse[division.origin]
         self.error, self._casts = self.error[division.origin], self._casts[division.origin]
         self.offset = self.offset[division.origin]
-        self._measure(np.flatnonzero((np.bincount(division.origin) > 1)[division.origin]))
+        self._measure(np.flatnonzero((np.bincount(division.origin) > 1)[division.origin] & self._coarse))
+
+    def _divide_shares(self, origin: Int[np.ndarray, " f"], before: Float[np.ndarray, " _"]) -> None:
+        """Gives new triangles their shares of pictures: by the places in them, or where these are few, by area."""
+        of_area = self._area() / np.maximum(before, np.finfo(np.float64).tiny)[origin]
+        share = self.share[origin] * of_area
+        if self._shown:
+            inside = self._points.triangle[self._picture > 0]
+            many = np.bincount(origin[inside], minlength=len(before)) >= _MANY * np.bincount(origin)
+            total = self._area() / max(self._area().sum(), np.finfo(np.float64).tiny)
+            counted = np.bincount(self._points.triangle, self._picture, len(origin))
+            share = np.where(many[origin], _UNSEEN * total + (1 - _UNSEEN) * counted, share)
+        self.share = share
 
     def _square(self) -> Float[np.ndarray, " v l"]:
         return np.sum(np.square(self.light, dtype=np.float64), -1)
@@ -206,6 +259,7 @@ class _Surface:
         here = again[self._points.triangle]
         triangle, weight = self._points.triangle[here], self._points.weight[here]
         apart = self._at_points[here] - np.einsum("pk,pklc->plc", weight, self.light[self.face[triangle]])
+        apart[self._inside[here]] = 0
         total = 3 * self.error
         np.add.at(total, triangle, np.sum(apart**2, -1))
         error = (total / (3 + np.bincount(triangle, minlength=len(total)))[:, None])[changed]
@@ -225,15 +279,16 @@ class _Surface:
         casting = np.concatenate([self.face[rest], smaller[np.repeat(self._casts[changed], 4)]])
         new = np.flatnonzero(~np.isin(edge, self._key))
         offset = np.repeat(self.offset[changed], 4)
-        light = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
+        light, buried = self._tracer.at(position, normal, smaller, offset, casting, len(self.position) + new)
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
+        buried = np.concatenate([self._buried, buried])
         # Drop the edges that have been cut.
         keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
         order = keep[np.argsort(key[keep])]
-        self._key, self._middle = key[order], light[order]
+        self._key, self._middle, self._buried = key[order], light[order], buried[order]
 
-    def _traced_points(self) -> Float32[np.ndarray, "p l c"]:
-        """Radiance at the points inside of triangles."""
+    def _traced_points(self) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """Radiance at the points inside of triangles, and whether they are inside of solids."""
         triangle, weight = self._points
         count, corner = len(self.position), self.face[triangle]
         place, normal = (

@@ -1,9 +1,10 @@
 """Origins of the rays of vertices: off the surface by what rounding needs, and on the open side of what touches it."""
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility.buried import out_of_solids
 from jaxprt.visibility.occluder import Occluder, check, offsets
 
 # Largest depth of a vertex inside a simplified occluder, as a share of the scene's diagonal, and of the longest edge of
@@ -12,6 +13,7 @@ _SINK, _SINK_EDGE = 0.02, 1.0
 _BACK = 1.25  # how far rays go back to the vertex, in offsets
 _STEEPEST = 0.25  # smallest cosine between the direction off the surface and the normals of faces around a vertex
 _TURNS = 16  # steps that turn this direction off faces which it grazes
+_INWARD, _FLAT = 4.0, 0.999  # step to the inside of faces, in offsets, and smallest cosine between faces of one plane
 
 
 def start_points(
@@ -23,7 +25,7 @@ def start_points(
     never shadows its own front, however far the shading normal leans. The distance from these faces is what rounding
     needs there. If a vertex lies inside a simplified occluder, its rays start where they leave the occluder. If a
     vertex touches another surface, its rays start on the open side of that surface, so that light does not leak in
-    from below.
+    from below. If a vertex lies inside of another solid, its rays start where its triangles come out of it.
 
     Args:
         mesh: The mesh.
@@ -37,20 +39,46 @@ def start_points(
         ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
             finite.
     """
+    return starts_and_buried(mesh, occluder, offset=offset, apart=apart)[0]
+
+
+def starts_and_buried(
+    mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None, apart: bool = False
+) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
+    """The result of `start_points`, and whether each vertex lies inside of another solid."""
     check(mesh, "mesh")
     position, face = np.asarray(mesh.position, np.float32), np.asarray(mesh.face)
     out, steepness = _outward(mesh, apart)
     distance = offsets(position, np.arange(len(position))[:, None])  # of vertices without faces
     np.maximum.at(distance, face.ravel(), np.repeat(offsets(position, face) if offset is None else offset, 3))
     distance = (distance / np.maximum(steepness, _STEEPEST))[:, None].astype(np.float32)
-    start = position + distance * out
+    start = position + distance * (out + _inward(position, face, out))
     foreign = ~np.isin(_rows(position), _rows(occluder.position[np.unique(occluder.face)]))
     if foreign.any():
         start[foreign] = _surface(occluder, position[foreign], out[foreign], distance[foreign])
     exact = ~foreign
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    return start
+    return out_of_solids(mesh, occluder, start, out, distance)
+
+
+def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:
+    """Steps along the surface, in offsets, from vertices at the border of flat faces to the inside of these faces.
+
+    Where such a vertex lies in a wall that stands on its face, rays start in front of the wall, and not in it.
+    """
+    position = position.astype(np.float64)
+    toward = position[face].mean(1)[:, None] - position[face]
+    toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-30)
+    count = np.maximum(np.bincount(face.ravel(), minlength=len(position)), 1)[:, None]
+    mean = _added(face.ravel(), toward.reshape(-1, 3), len(position)) / count
+    # Faces that are not in one plane have no inside that is above all of them.
+    flat = np.ones(len(position))
+    np.minimum.at(
+        flat, face.ravel(), np.abs(np.sum(np.repeat(_face_normal(position, face), 3, 0) * out[face.ravel()], 1))
+    )
+    mean -= np.sum(mean * out, 1, keepdims=True) * out
+    return (_INWARD * np.where(flat[:, None] > _FLAT, mean, 0)).astype(np.float32)
 
 
 def _rows(position: np.ndarray) -> np.ndarray:

@@ -161,7 +161,8 @@ def test_pictures_go_through_programs_and_have_gradients(close):
     ready = relit(Harmonics(degree=2))
 
     def picture(radiance, eye):
-        return ready.picture(Environment(radiance), dataclasses.replace(CAMERA, eye=eye))
+        camera = dataclasses.replace(CAMERA, eye=eye)
+        return ready.picture(Environment(radiance), camera, shadows="vertices")
 
     radiance = light().radiance
     whole = picture(radiance, CAMERA.eye)
@@ -173,7 +174,10 @@ def test_pictures_go_through_programs_and_have_gradients(close):
     close(turned[0], whole, tolerance=1e-4)
     bright = jax.jit(jax.grad(lambda eye: jnp.sum(picture(radiance, eye))))(CAMERA.eye)
     assert np.isfinite(bright).all()
-    close(jax.jit(lambda view, light: view.picture(light))(ready.picture_view(CAMERA), light()), whole, tolerance=1e-4)
+    view = ready.picture_view(CAMERA, shadows=light())
+    traced = jax.jit(lambda view, light: view.picture(light))(view, light())
+    close(traced, view.picture(light()), tolerance=1e-4)
+    close(traced, ready.picture(light(), CAMERA), tolerance=1e-4)
 
 
 def test_scenes_laid_over_devices_give_the_same_pictures(close):
@@ -392,7 +396,7 @@ def test_the_number_of_programs_does_not_depend_on_the_number_of_parts():
             made(scene).picture(light(), CAMERA)
         counts.append(len(events))
     assert counts[1] <= counts[0] + 2
-    assert counts[1] <= 55  # with some small ones of the test's own cubemaps
+    assert counts[1] <= 62  # with some small ones of the test's own cubemaps
 
 
 @pytest.mark.usefixtures("unchecked")

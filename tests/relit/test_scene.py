@@ -16,13 +16,13 @@ import pytest
 import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
-from jaxprt.image import raster
+from jaxprt.image import raster, sky
 from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.camera import orbit
-from jaxprt.scene.environment import background
+from jaxprt.scene.environment import background, environment_from_image
 from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import cubemap
@@ -377,6 +377,31 @@ def test_pictures_show_the_radiance_before_the_light():
     assert picture.shape == (16, 24, 3)
     np.testing.assert_allclose(np.asarray(picture)[~seen], sky[~seen], rtol=1e-6)
     assert 0.2 < seen.mean() < 0.9
+
+
+def test_pictures_show_the_pixels_of_the_lights_file_behind_the_same_surfaces():
+    pixels = np.random.default_rng(5).uniform(0.1, 1, (64, 128, 3)).astype(np.float32)
+    from_file = environment_from_image(pixels, size=light().radiance.shape[-2])
+    texels, ready = Environment(from_file.radiance), relit("harmonic")
+    one, other = (np.asarray(ready.picture(each, CAMERA)) for each in (from_file, texels))
+    cover = np.asarray(ready.coverage(CAMERA))
+    np.testing.assert_allclose(one[cover == 1], other[cover == 1], rtol=1e-6)
+    np.testing.assert_allclose(one[cover == 0], np.asarray(sky(from_file, CAMERA))[cover == 0], rtol=1e-6)
+    assert np.abs(one - other)[cover == 0].max() > 0.1
+    inside = jax.jit(lambda light: ready.picture(light, CAMERA))(from_file)
+    np.testing.assert_allclose(inside, other, rtol=1e-4, atol=1e-5)
+
+
+def test_exposure_is_of_the_surfaces_whatever_is_behind_them():
+    ready = relit("harmonic")
+    picture, cover = ready.picture(light(), CAMERA), ready.coverage(CAMERA)
+    window = jnp.where(cover[..., None] == 1, picture, 1e4)
+    assert float(ready.exposure(window, CAMERA)) == pytest.approx(float(ready.exposure(picture, CAMERA)), rel=1e-6)
+    shown = np.asarray(picture @ jnp.asarray([0.2126, 0.7152, 0.0722]))[np.asarray(cover) == 1]
+    bright = np.percentile(shown[shown > 0], 99)
+    assert float(ready.exposure(picture, CAMERA)) == pytest.approx(np.log2(0.9 / bright), abs=1e-4)
+    with pytest.raises(ValueError, match=r"picture must have the camera's 16 x 24 pixels .* got 24 x 16"):
+        ready.exposure(jnp.ones((24, 16, 3)), CAMERA)
 
 
 def test_the_camera_is_the_scenes_first_or_one_that_sees_all():

@@ -85,7 +85,7 @@ def test_the_parameters_of_a_part_are_those_at_its_vertices(close):
         (
             lambda: Scene(scene()["ball"]),
             TypeError,
-            "a scene takes lists of parts, cameras, environments and point_lights, got one Part",
+            "a scene takes lists of parts, cameras, environments, point_lights and suns, got one Part",
         ),
         (lambda: Scene([BALL]), TypeError, "each of the scene's parts must be of class Part"),
         (lambda: Scene(scene().parts, [BALL]), TypeError, "each of the scene's cameras must be of class Camera"),

@@ -13,6 +13,7 @@ from PIL import Image
 
 import jaxprt as prt
 from jaxprt import files, image
+from jaxprt.image import tone_curves
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import standard
@@ -462,3 +463,27 @@ def test_the_page_works_behind_a_proxy_with_a_path(browser, session):
     made.close()
     proxy.shutdown()
     proxy.server_close()
+
+
+def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
+    """The canvas without a picture at rest and a background shows vertex colors by each curve."""
+    hand.page.evaluate(f"() => Object.assign(({CANVAS}).state, {{ still: false, background: false }})")
+    place = "document.querySelector('#viewer').shadowRoot.querySelectorAll('select')"
+    shown = {}
+    for number, tone in enumerate(tone_curves.TONES):
+        hand.page.evaluate(
+            f"() => {{ const select = [...{place}].find((each) => each.options[1]?.text === 'filmic');"
+            f" select.value = {number}; select.onchange(); }}"
+        )
+        hand.page.wait_for_timeout(300)
+        assert hand.state()["tone"] == tone
+        shown[tone] = hand.pixels()
+    linear = np.asarray(image.decode_srgb(shown["srgb"].reshape(-1, 3)))
+    inside = (linear.max(-1) < 0.97) & (linear.min(-1) > 0.03)  # neither clamped nor coarse in bytes
+    assert inside.mean() > 0.05
+    for tone in tone_curves.TONES[1:]:
+        expected = np.asarray(image.encode_srgb(tone_curves.toned(linear[inside], tone, np)))
+        found = shown[tone].reshape(-1, 3)[inside]
+        # Bytes of the first picture, and their slope.
+        assert np.median(np.abs(found - expected)) < 0.006
+        assert np.percentile(np.abs(found - expected), 99) < 0.03

@@ -15,7 +15,7 @@ import jaxprt as prt
 from jaxprt import files, image, require
 from jaxprt.relit import canvas, pictures
 from jaxprt.scene import Camera, Environment
-from jaxprt.scene.environment import rotate
+from jaxprt.scene.environment import environment_from_image, rotate
 from jaxprt.sphere import cubemap
 from jaxprt.systems import reference
 from jaxprt.view import Session, messages, stages
@@ -238,6 +238,27 @@ def test_a_small_lamp_has_its_flux_in_its_direction(session, lights, look):
     middle = (area[..., 0] * added[..., 0])[..., None] * np.asarray(cubemap.direction(size=8))
     toward = middle.sum((0, 1, 2)) / np.linalg.norm(middle.sum((0, 1, 2)))
     assert toward @ np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2]) > np.cos(0.12)
+
+
+def test_the_sky_of_a_file_comes_in_levels_and_lamps_are_disks_on_it(systems, look):
+    pixels = np.full((256, 512, 3), 0.25, np.float32)
+    pixels[100:104, 300:304] = 9
+    light = environment_from_image(pixels, size=8)
+    lamp = {"direction": [1.0, 0.0, 0.0], "angle": 0.05, "radiance": [2.0, 3.0, 4.0]}
+    asked = look | {"kind": "sky", "lamps": [lamp], "rows": 1024}
+    reply = Session(systems, environments={"file": light}).answer(asked)
+    size = {name: reply.content[name] for name in ("width", "height", "levels")}
+    assert size == {"width": 512, "height": 256, "levels": 2}
+    level = halves(reply).reshape(-1)
+    fine, coarse = level[: 3 * 256 * 512].reshape(256, 512, 3), level[3 * 256 * 512 :].reshape(128, 256, 3)
+    near(fine[102, 302], [9, 9, 9])
+    near(fine[30, 30], [0.25] * 3)
+    near(fine[127, 127], [2.25, 3.25, 4.25])
+    near(coarse[63, 63], [2.25, 3.25, 4.25])
+    # The disk has the solid angle 2 pi (1 - cos .05) and a smooth rim.
+    covered = np.sum(fine[:, 64:192, 0] - 0.25) / 2 * (np.pi / 256) ** 2
+    assert covered == pytest.approx(2 * np.pi * (1 - np.cos(0.05)), rel=0.02)
+    assert Session(systems, environments={"file": light}).answer(look | {"kind": "sky"}).content["height"] == 128
 
 
 def test_the_picture_of_the_sky_has_up_on_top_and_z_in_the_middle(systems, look):

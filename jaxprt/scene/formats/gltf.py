@@ -1,4 +1,4 @@
-"""Scenes from glTF files: parts with their materials, and cameras."""
+"""Scenes from glTF files: parts with their materials, cameras, and lights."""
 
 import math
 import pathlib
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxprt.scene.camera import Camera
-from jaxprt.scene.formats import gltf_geometry, gltf_nodes
+from jaxprt.scene.formats import gltf_animation, gltf_geometry, gltf_lights, gltf_nodes
 from jaxprt.scene.formats.file_parts import split_parts
 from jaxprt.scene.formats.gltf_extensions import HONORED, check_required, unread
 from jaxprt.scene.formats.gltf_file import Document, damage_named
@@ -22,29 +22,39 @@ _HEIGHT = 512  # height of cameras' pictures in pixels
 _WIDEST = 64  # a larger aspect ratio is taken for damage
 
 
-def read(path: pathlib.Path, *, outside: bool = False) -> Scene:
+def read(
+    path: pathlib.Path,
+    *,
+    outside: bool = False,
+    time: float | None = None,
+    animation: str | int | None = None,
+    lights: float = 1.0,
+) -> Scene:
     """Reads the default scene of a glTF file, as `load_scene` documents."""
     with damage_named(path):
         document = Document(path, outside=outside)
         check_required(document, geometry=False)
+        ignored = set() if time is None else gltf_animation.pose(document, time, animation)
         nodes = gltf_nodes.nodes(document)
         contents = gltf_geometry.read(document, scene=nodes)
         reader = MaterialReader(document)
         materials = [reader.material(index) for index in contents.material]
         names = [_name(document, index) for index in contents.material]
         parts = split_parts(contents.geometry, names, materials, path)
-        ignored = contents.ignored | reader.ignored | unread(document)
-        if document.items("animations"):
-            ignored |= {"animations"}
+        ignored |= contents.ignored | reader.ignored | unread(document)
         for index, material in zip(contents.material, materials, strict=True):
             if any((index, texture.set) in contents.lacking for texture in material.textures):
                 ignored |= {"textures of primitives without texture coordinates"}
         used = contents.geometry.position
         cameras, skipped = _cameras(document, nodes, (used.min(0) + used.max(0)) / 2)
-    ignored = (ignored | skipped) - HONORED
+        point_lights, suns, unread_lights = gltf_lights.lights(document, nodes, [part.name for part in parts], lights)
+    ignored = (ignored | skipped | unread_lights) - HONORED
     if ignored:
         warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
-    return Scene(parts, cameras)
+    if suns:
+        advice = "jaxprt.scene.with_suns(light, scene.suns) adds them to an environment"
+        warnings.warn(f"{path}: its directional lights ({len(suns)}) are in scene.suns: {advice}", stacklevel=3)
+    return Scene(parts, cameras, point_lights=point_lights, suns=suns)
 
 
 def _name(document: Document, index: int | None) -> str:

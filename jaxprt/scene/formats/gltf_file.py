@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt.files import inputs
+from jaxprt.scene.formats import gltf_meshopt
 from jaxprt.scene.formats.gltf_header import Header, excerpt
 
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
-MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")  # of a URI that is not relative
 
 
@@ -57,6 +57,26 @@ class Elements(NamedTuple):
         return np.maximum(value / self.most, -1) if self.most else value
 
 
+class Form(NamedTuple):
+    """The header of an accessor.
+
+    Attributes:
+        item: The JSON object.
+        name: Name for messages.
+        dtype: Type of the numbers.
+        rows: Number of elements.
+        width: Numbers of an element.
+        most: Largest value of normalized integers, which stands for 1; 0 for other numbers.
+    """
+
+    item: dict[str, Any]
+    name: str
+    dtype: np.dtype
+    rows: int
+    width: int
+    most: int
+
+
 class Document(Header):
     """A glTF file. Its objects are looked up by index; errors name the file and the object."""
 
@@ -83,13 +103,7 @@ class Document(Header):
         index = self.index("bufferViews", value, owner)
         if index not in self._view:
             item, name = self.items("bufferViews")[index], f"buffer view {index}"
-            content = self._content(item, name)
-            start = self.integer(item, "byteOffset", name, 0)
-            end = start + self.integer(item, "byteLength", name)
-            if end > len(content):
-                got = f"{len(content)} bytes in buffer {item['buffer']}"
-                raise self.error(f"must have buffers of at least {end} bytes for {name}", got)
-            self._view[index] = memoryview(content)[start:end], self.integer(item, "byteStride", name, 0)
+            self._view[index] = self._part(item, name), self.integer(item, "byteStride", name, 0)
         return self._view[index]
 
     def accessor(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Elements:
@@ -105,16 +119,7 @@ class Document(Header):
             ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type; or it
                 has no buffer view and more elements than the file and its buffers have bytes.
         """
-        index = self.index("accessors", value, owner)
-        item, name = self.items("accessors")[index], f"accessor {index} ({owner})"
-        kind, form = self.integer(item, "componentType", name), self.string(item, "type", name)
-        count, width = self.integer(item, "count", name), _WIDTH.get(form, 0)
-        if width not in widths or kind not in _COMPONENT or (whole and kind == 5126):
-            must = f"must have {' or '.join(map(str, widths))} {'whole ' if whole else ''}numbers per element"
-            raise self.error(f"{must} in {name}", f"type {excerpt(form)} of component type {kind}")
-        if count < 1:
-            raise self.error(f"must have 1 or more elements in {name}", str(count))
-        dtype = np.dtype(_COMPONENT[kind])
+        item, name, dtype, count, width, most = self.form(value, owner, *widths, whole=whole)
         if "bufferView" in item:
             array = self._strided(item, name, dtype, (count, width))
         else:
@@ -127,8 +132,22 @@ class Document(Header):
         place, replacement = np.zeros(0, np.int64), array[:0]
         if "sparse" in item:
             place, replacement = self._sparse(self.object(item, "sparse", name), name, array)
+        return Elements(array, place, replacement, most)
+
+    def form(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Form:
+        """The header of an accessor; arguments and errors are those of `accessor`. No data are read."""
+        index = self.index("accessors", value, owner)
+        item, name = self.items("accessors")[index], f"accessor {index} ({owner})"
+        kind, form = self.integer(item, "componentType", name), self.string(item, "type", name)
+        count, width = self.integer(item, "count", name), _WIDTH.get(form, 0)
+        if width not in widths or kind not in _COMPONENT or (whole and kind == 5126):
+            must = f"must have {' or '.join(map(str, widths))} {'whole ' if whole else ''}numbers per element"
+            raise self.error(f"{must} in {name}", f"type {excerpt(form)} of component type {kind}")
+        if count < 1:
+            raise self.error(f"must have 1 or more elements in {name}", str(count))
+        dtype = np.dtype(_COMPONENT[kind])
         normalized = self.boolean(item, "normalized", name) and dtype.kind in "iu"
-        return Elements(array, place, replacement, int(np.iinfo(dtype).max) if normalized else 0)
+        return Form(item, name, dtype, count, width, int(np.iinfo(dtype).max) if normalized else 0)
 
     def image(self, value: Any, owner: str) -> bytes:
         """The bytes of an image, embedded or in a separate file."""
@@ -170,16 +189,27 @@ class Document(Header):
             place += 8 + extent
         return content[20 : 20 + size], binary
 
-    def _content(self, view: dict[str, Any], name: str) -> bytes:
-        """The bytes of the buffer of a buffer view. Compressed views have a fallback, which may be empty."""
+    def _part(self, view: dict[str, Any], name: str) -> memoryview:
+        """The bytes of a buffer view. Compressed views are decoded where they have no uncompressed fallback."""
         index = self.index("buffers", view.get("buffer"), name)
-        item = self.items("buffers")[index]
-        compressed = [key for key in MESHOPT if key in self.object(view, "extensions", name)]
-        compressed += [key for key in MESHOPT if key in self.object(item, "extensions", f"buffer {index}")]
-        if compressed and "uri" not in item and (index or self._chunk is None):
-            got = f"{compressed[0]} in {name}, whose fallback, buffer {index}, has no data"
-            raise self.error("must have uncompressed geometry", got)
-        return self._bytes(index)
+        extension = gltf_meshopt.extension(self, view, name)
+        if extension is None:
+            return self._cut(view, name)
+        here = "uri" in self.items("buffers")[index] or (index == 0 and self._chunk is not None)
+        if here and not gltf_meshopt.is_fallback(self, self.items("buffers")[index], f"buffer {index}"):
+            return self._cut(view, name)
+        content = self._cut(extension, f"the compressed data of {name}")
+        return memoryview(gltf_meshopt.decoded(self, view, extension, content, name))
+
+    def _cut(self, item: dict[str, Any], name: str) -> memoryview:
+        """The bytes of a buffer that an object names."""
+        content = self._bytes(self.index("buffers", item.get("buffer"), name))
+        start = self.integer(item, "byteOffset", name, 0)
+        end = start + self.integer(item, "byteLength", name)
+        if end > len(content):
+            got = f"{len(content)} bytes in buffer {item['buffer']}"
+            raise self.error(f"must have buffers of at least {end} bytes for {name}", got)
+        return memoryview(content)[start:end]
 
     def _bytes(self, index: int) -> bytes:
         """The bytes of a buffer."""

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt import require
-from jaxprt.scene.formats import gltf_skin
+from jaxprt.scene.formats import gltf_morph, gltf_skin
 from jaxprt.scene.formats.geometry import Geometry, instances, joined
-from jaxprt.scene.formats.gltf_extensions import DRACO, check_required
+from jaxprt.scene.formats.gltf_draco import DracoReader
+from jaxprt.scene.formats.gltf_extensions import check_required
 from jaxprt.scene.formats.gltf_file import Document, Elements
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
@@ -34,6 +35,7 @@ class Primitive(NamedTuple):
         corner: Vertices of the corners; None if they are the vertices in order.
         attribute: Attributes of the vertices by their names in the file.
         joints: Number of sets of joints; 0 where no skin is used.
+        targets: Morph targets, as they stand in the file.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Primitive(NamedTuple):
     corner: Elements | None
     attribute: dict[str, Elements]
     joints: int
+    targets: list
 
     @property
     def flat(self) -> bool:
@@ -82,7 +85,7 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
 
     Vertices that no triangle of their primitive uses are removed. The others keep the order of the file. Without
     normals, each triangle has vertices and a flat normal of its own (section 3.7.2.1). Meshes with a skin are in the
-    pose of the file's joints.
+    pose of the file's joints. Morph targets have the weights of the node, or else of the mesh.
 
     Args:
         document: The file.
@@ -100,7 +103,8 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     ignored: set[str] = set()
     mesh_of = [document.index("meshes", node.item["mesh"], f"node {node.number}") for node in drawn]
     skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
-    primitives = {mesh: _primitives(document, mesh, mesh in skinned, ignored) for mesh in dict.fromkeys(mesh_of)}
+    draco = DracoReader(document)
+    primitives = {mesh: _primitives(document, mesh, mesh in skinned, draco, ignored) for mesh in dict.fromkeys(mesh_of)}
     # Meshes without triangles have no instances: these would take memory that `_check_memory` does not count.
     drawn = [node for node, mesh in zip(drawn, mesh_of, strict=True) if primitives[mesh]]
     mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
@@ -128,7 +132,7 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     return Contents(geometry, () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
 
 
-def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str]) -> list[Primitive]:
+def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader, ignored: set[str]) -> list[Primitive]:
     """The primitives of a mesh that consist of triangles. Adds the names of what is not read to `ignored`."""
     owner = f"mesh {mesh}"
     primitives = []
@@ -142,8 +146,6 @@ def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str])
         if mode < _TRIANGLES:
             ignored.add("points and lines")
             continue
-        if "targets" in item:
-            ignored.add("morph targets")
         material = item.get("material")
         if material is not None:
             material = document.index("materials", material, name)
@@ -152,22 +154,26 @@ def _primitives(document: Document, mesh: int, skinned: bool, ignored: set[str])
             key for key in attribute if key.startswith(("TEXCOORD_", "COLOR_")) and key[-2:] not in ("_0", "_1")
         }
         ignored |= {"COLOR_1"} & set(attribute)
-        _check_uncompressed(document, item, name)
-        elements = _elements(document, attribute, skinned, name)
-        index = None
-        if "indices" in item:
+        decoded = draco.primitive(item, name) or {}
+        elements = _elements(document, attribute, skinned, decoded, name)
+        index = decoded.get("indices")
+        mode = mode if index is None else _TRIANGLES
+        if "indices" in item and index is None:
             index = document.accessor(item["indices"], f"indices of {name}", 1, whole=True)
         corners = len((index or elements["POSITION"]).value)
         if corners < 3 or (mode == _TRIANGLES and corners % 3):
             must = "a multiple of three" if mode == _TRIANGLES else "three or more"
             raise document.error(f"must have {must} corners of triangles in {name}", str(corners))
         sets = sum(key.startswith("JOINTS_") for key in elements)
-        primitives.append(Primitive(name, material, mode, index, elements, sets))
+        targets = document.array(item, "targets", name)
+        primitives.append(Primitive(name, material, mode, index, elements, sets, targets))
     return primitives
 
 
-def _elements(document: Document, attribute: dict[str, Any], skinned: bool, name: str) -> dict[str, Elements]:
-    """The attributes of a primitive that are read."""
+def _elements(
+    document: Document, attribute: dict[str, Any], skinned: bool, decoded: dict[str, Elements], name: str
+) -> dict[str, Elements]:
+    """The attributes of a primitive that are read; some may be decoded already."""
     if "POSITION" not in attribute:
         raise document.error("must be an undamaged glTF file", f"one that lacks 'POSITION' in {name}")
     widths = dict(_ATTRIBUTES)
@@ -179,21 +185,13 @@ def _elements(document: Document, attribute: dict[str, Any], skinned: bool, name
     for key, width in widths.items():
         if key in attribute:
             whole = key.startswith("JOINTS_")
-            elements[key] = document.accessor(attribute[key], f"{key} of {name}", *width, whole=whole)
+            owner = f"{key} of {name}"
+            document.form(attribute[key], owner, *width, whole=whole)
+            elements[key] = decoded.get(key) or document.accessor(attribute[key], owner, *width, whole=whole)
             got, count = len(elements[key].value), len(elements["POSITION"].value)
             if got != count:
                 raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(got))
     return elements
-
-
-def _check_uncompressed(document: Document, item: dict[str, Any], name: str) -> None:
-    """Refuses a primitive whose geometry is only in a compressed form. Its accessors are then without data."""
-    if DRACO not in document.object(item, "extensions", name):
-        return
-    for value in [*item["attributes"].values(), *([item["indices"]] if "indices" in item else [])]:
-        if "bufferView" not in document.item("accessors", value, name):
-            got = f"{DRACO} in {name}, and accessor {value} has no uncompressed data"
-            raise document.error("must have uncompressed geometry", got)
 
 
 def _check_memory(
@@ -225,21 +223,28 @@ def _placements(
     mesh_of: Sequence[int],
     primitives: dict[int, list[Primitive]],
 ) -> Iterator[tuple[Node, Primitive, Geometry]]:
-    """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once."""
+    """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once.
+
+    Meshes are equal if their morph targets have the same weights.
+    """
     matrices = [instance_matrices(document, node) for node in drawn]
-    together: dict[int, list[np.ndarray]] = {}
-    for mesh, matrix in zip(mesh_of, matrices, strict=True):
-        together.setdefault(mesh, []).append(matrix)
+    most = {mesh: max(len(primitive.targets) for primitive in listed) for mesh, listed in primitives.items() if listed}
+    shapes = [
+        (mesh, gltf_morph.weights(document, node, mesh, most[mesh])) for node, mesh in zip(drawn, mesh_of, strict=True)
+    ]
+    together: dict[tuple, list[np.ndarray]] = {}
+    for shape, matrix in zip(shapes, matrices, strict=True):
+        together.setdefault(shape, []).append(matrix)
     bound, placed = {}, {}
-    for mesh, transforms in together.items():
-        pairs = [_geometry(document, primitive) for primitive in primitives[mesh]]
-        bound[mesh] = pairs
-        placed[mesh] = [iter(instances(geometry, np.concatenate(transforms))) for geometry, _ in pairs]
+    for shape, transforms in together.items():
+        pairs = [_geometry(document, primitive, shape[1]) for primitive in primitives[shape[0]]]
+        bound[shape] = pairs
+        placed[shape] = [iter(instances(geometry, np.concatenate(transforms))) for geometry, _ in pairs]
     skins = _joint_matrices(document, scene, drawn, mesh_of, primitives)
-    for node, mesh, matrix in zip(drawn, mesh_of, matrices, strict=True):
-        skin = skins.get(node.number)
+    for node, shape, matrix in zip(drawn, shapes, matrices, strict=True):
+        skin, listed = skins.get(node.number), primitives[shape[0]]
         for _ in matrix:
-            for primitive, (geometry, binding), rest in zip(primitives[mesh], bound[mesh], placed[mesh], strict=True):
+            for primitive, (geometry, binding), rest in zip(listed, bound[shape], placed[shape], strict=True):
                 here = next(rest)
                 if skin is not None and binding is not None:
                     here = gltf_skin.pose(document, geometry, binding, skin, primitive.name)
@@ -268,18 +273,36 @@ def _joint_matrices(
     return {node: matrices[number] for node, number in skin.items()}
 
 
-def _geometry(document: Document, primitive: Primitive) -> tuple[Geometry, gltf_skin.Binding | None]:
-    """The triangles of a primitive (section 3.7.2), and the joints of its vertices."""
+def _geometry(
+    document: Document, primitive: Primitive, weight: tuple[float, ...]
+) -> tuple[Geometry, gltf_skin.Binding | None]:
+    """The triangles of a primitive (section 3.7.2), and the joints of its vertices.
+
+    Args:
+        document: The file.
+        primitive: The primitive.
+        weight: Weights of its morph targets.
+    """
     face = _faces(document, primitive)
     if primitive.flat:
         used, face = face.ravel(), np.arange(face.size).reshape(-1, 3)
     else:
         used, face = _used(face, len(primitive.attribute["POSITION"].value))
 
-    def values(key: str) -> np.ndarray | None:
-        return primitive.attribute[key].numbers(used) if key in primitive.attribute else None
+    count = len(primitive.attribute["POSITION"].value)
 
-    position = primitive.attribute["POSITION"].numbers(used)
+    def values(key: str) -> np.ndarray | None:
+        if key not in primitive.attribute:
+            return None
+        value, targets = primitive.attribute[key].numbers(used), primitive.targets
+        change = gltf_morph.change(document, targets, weight, key=key, used=used, count=count, name=primitive.name)
+        if isinstance(change, np.ndarray):
+            width = min(value.shape[1], change.shape[1])
+            value[:, :width] += change[:, :width]
+        return value
+
+    position = values("POSITION")
+    assert position is not None
     normal = _face_normals(position) if primitive.flat else values("NORMAL")
     tangent = None if primitive.flat else values("TANGENT")  # section 3.7.2.1: ignored without normals
     color = values("COLOR_0")

@@ -3,12 +3,15 @@
 import json
 import math
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from jaxprt import require
 from jaxprt.files import inputs
 
+_SLACK = 64  # bytes of compressed data besides which a header can be short
 _SHOWN = 80  # characters of a wrong value in messages
 _LARGEST = 2**53  # JSON numbers are exact up to here
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
@@ -36,6 +39,7 @@ class Header:
         """
         self.path = path
         self._items: dict[str, list[dict[str, Any]]] = {}
+        self._decoded = 0  # bytes
         try:
             header = json.loads(text, object_pairs_hook=inputs.unique_names)  # section 2.6
         except (ValueError, RecursionError) as error:
@@ -67,6 +71,16 @@ class Header:
                     raise self.error(f"{must}, all of them objects", f"{excerpt(item)} at {number}")
             self._items[kind] = items
         return self._items[kind]
+
+    def change(self, kind: str, fields: Mapping[int, Mapping[str, Any]]) -> None:
+        """Replaces fields of some objects of a kind, which the header itself keeps.
+
+        Args:
+            kind: The kind, such as "nodes".
+            fields: New fields by the index of the object.
+        """
+        items = self.items(kind)
+        self._items[kind] = [{**item, **fields.get(number, {})} for number, item in enumerate(items)]
 
     def index(self, kind: str, value: Any, owner: str) -> int:
         """The index of an object of a kind.
@@ -139,6 +153,20 @@ class Header:
             must = f"{math.prod(shape)} finite numbers" if shape else "a finite number"
             raise self.error(f"must have {must} for {what}", excerpt(value))
         return np.array(value, np.float64)
+
+    def decoding(self, size: int, length: int, name: str, *, most: int) -> None:
+        """Refuses compressed data that would become larger than they can, or than memory. Counts what is decoded.
+
+        Args:
+            size: Bytes that the header states for the decoded data.
+            length: Bytes of the compressed data.
+            name: The compressed data, for messages.
+            most: Decoded bytes that one compressed byte can hold at most.
+        """
+        if size > most * (length + _SLACK):
+            raise self.error(f"must have at most {most} decoded bytes for each byte of {name}", f"{size} for {length}")
+        self._decoded += size
+        require.memory(f"the decoded data of {self.path}", self._decoded, "load a smaller scene")
 
     def _field(self, item: dict[str, Any], key: str, owner: str, kind: type, name: str, default: Any) -> Any:
         value = self._present(item, key, owner) if default is None else item.get(key, default)

@@ -17,6 +17,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
+_SOURCES = ("KHR_texture_basisu", "EXT_texture_webp")
 _SHOWN = 80  # characters of a URI in warnings
 
 
@@ -47,15 +48,19 @@ class MaterialReader:
         owner = f"material {index}"
         item = self._document.item("materials", index, owner)
         extensions = self._document.object(item, "extensions", owner)
-        ior, specular, brushed, emissive = (
+        ior, specular, brushed, emissive, coat, passing = (
             self._document.object(extensions, f"KHR_materials_{name}", owner)
-            for name in ("ior", "specular", "anisotropy", "emissive_strength")
+            for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "transmission")
         )
         pbr = self._document.object(item, "pbrMetallicRoughness", owner)
         glow = self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner)
         glow = glow * self._number(emissive, "emissiveStrength", 1.0, owner)
         normal = self._document.object(item, "normalTexture", owner)
         self._note(item, owner)
+        if "clearcoatNormalTexture" in coat:
+            self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
+        if passing.get("transmissionFactor", 0) != 0:
+            self.ignored.add("what is seen through transmitting surfaces (their reflection is read)")
         field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
@@ -69,6 +74,9 @@ class MaterialReader:
             "anisotropy": self._number(brushed, "anisotropyStrength", 0.0, owner),
             "rotation": self._number(brushed, "anisotropyRotation", 0.0, owner),
             "normal_scale": self._number(normal, "scale", 1.0, owner),
+            "clearcoat": self._number(coat, "clearcoatFactor", 0.0, owner),
+            "clearcoat_roughness": self._number(coat, "clearcoatRoughnessFactor", 0.0, owner),
+            "transmission": self._number(passing, "transmissionFactor", 0.0, owner),
         }
         colors = (0, 1, 2)
         field |= {
@@ -80,6 +88,9 @@ class MaterialReader:
             "specular_color_texture": self._texture(specular, "specularColorTexture", colors, owner, decoded=True),
             "anisotropy_texture": self._texture(brushed, "anisotropyTexture", colors, owner),
             "normal_texture": self._texture(item, "normalTexture", colors, owner),
+            "clearcoat_texture": self._texture(coat, "clearcoatTexture", (0,), owner),
+            "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
+            "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
         }
         field |= self._cover(item, pbr, owner)
         try:
@@ -127,8 +138,9 @@ class MaterialReader:
         texture, name = document.items("textures")[index], f"texture {index}"
         moved = document.object(document.object(info, "extensions", owner), "KHR_texture_transform", owner)
         number = document.integer({**info, **moved}, "texCoord", owner, 0)
-        if "source" not in texture or number > 1:
-            self.ignored.add("textures without PNG or JPEG" if "source" not in texture else "third texture coordinates")
+        source = self._source(texture, name)
+        if source is None or number > 1:
+            self.ignored.add("textures without an image" if source is None else "third texture coordinates")
             return None
         sampler = {}
         if "sampler" in texture:
@@ -136,8 +148,16 @@ class MaterialReader:
         if sampler.get("magFilter") == _NEAREST:
             self.ignored.add("nearest filters (textures are interpolated)")
         across, up = (_WRAP.get(document.integer(sampler, side, name, 0), "repeat") for side in ("wrapS", "wrapT"))
-        image = self._pixels(texture["source"], channels, name, decoded)
+        image = self._pixels(source, channels, name, decoded)
         return None if image is None else Texture(image, self._transform(moved, owner), number, (across, up))
+
+    def _source(self, texture: dict[str, Any], name: str) -> Any:
+        """The image of a texture: PNG or JPEG, or else that of an extension; None if there is none."""
+        if "source" in texture:
+            return texture["source"]
+        extensions = self._document.object(texture, "extensions", name)
+        used = (self._document.object(extensions, key, name).get("source") for key in _SOURCES if key in extensions)
+        return next((source for source in used if source is not None), None)
 
     def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array | None:
         """Channels of an image; None, with a record of the reason, if it cannot be decoded."""

@@ -16,21 +16,47 @@ def _path(value: Any) -> None:
         require.path("path", value)
 
 
-@require.arguments(path=_path)
-def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = False) -> Scene:
+def _time(value: Any) -> float | None:
+    if value is None:
+        return None
+    require.number("time", value, 0.0)
+    return float(value)
+
+
+def _animation(value: Any) -> None:
+    if value is not None and not isinstance(value, str):
+        require.count("animation", value)
+
+
+def _scale(value: Any) -> float:
+    require.number("lights", value, 0.0)
+    return float(value)
+
+
+@require.arguments(path=_path, time=_time, animation=_animation, lights=_scale)
+def load_scene(
+    path: str | pathlib.Path | Mapping[str, Any],
+    *,
+    outside: bool = False,
+    time: float | None = None,
+    animation: str | int | None = None,
+    lights: float = 1.0,
+) -> Scene:
     """Loads a scene with its materials from a glTF, GLB, PLY, OBJ, STL or OFF file, or a dictionary of Mitsuba 3.
 
     Geometry is read like `load_mesh` reads it. Each material in use becomes one part, named after the material; equal
     names are numbered. Textures that materials share are stored only once.
 
     Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
-    texture coordinates, and perspective cameras, whose pictures are 512 pixels high. It supports the extensions
-    KHR_materials_ior, _specular, _anisotropy and _emissive_strength, KHR_texture_transform, KHR_mesh_quantization and
-    EXT_mesh_gpu_instancing. Meshes with a skin are in the pose that the file's joints have. Triangles without normals
-    are flat. Compressed geometry is read from its uncompressed fallback. A file that requires another extension is
-    refused. A single warning names all other features of the file (transmission, animations, lights,
-    orthographic cameras, images that cannot be read, and so on). Primitives without material get the default material
-    of the specification, a white rough metal.
+    texture coordinates, alpha, double-sided materials, skins, morph targets, and perspective cameras, whose pictures
+    are 512 pixels high. It supports the extensions KHR_materials_ior, _specular, _anisotropy, _emissive_strength,
+    _clearcoat and _transmission (its reflection only), KHR_texture_transform, KHR_mesh_quantization and
+    EXT_mesh_gpu_instancing. Point lights and spots of KHR_lights_punctual become point lights of the scene. Its
+    directional lights become suns, which `jaxprt.scene.with_suns` adds to an environment. Triangles without normals are
+    flat. Compressed geometry and textures (Draco, meshoptimizer, KTX 2) are decoded by the packages of `jaxprt[web]`
+    where they have no uncompressed fallback. A file that requires another extension is refused, unless it is one of
+    materials. A single warning names all other features of the file (sheen, orthographic cameras, images that cannot be
+    read, and so on). Primitives without material get the default material of the specification, a white rough metal.
 
     Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
     metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `mtl.read` explains how Phong materials and those of
@@ -54,12 +80,20 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     Args:
         path: The file, or the dictionary.
         outside: Whether the file may refer to files outside of its folder. Use it only for scenes that you trust.
+        time: Time in seconds from the start of an animation of a glTF file: nodes, cameras, joints and weights of morph
+            targets are where the animation has them then. Times beyond its end show the end. With None they are where
+            the file's nodes have them, which is what other viewers show before they play an animation.
+        animation: Name or index of the animation; None for the first one.
+        lights: Factor on the lights of a glTF file (KHR_lights_punctual). One candela is taken as an intensity of 1 and
+            one lux as an irradiance of 1, as three.js takes them. Blender writes watts times 683 lm/W, so `1 / 683`
+            gives its watts back. With 0 they are left out.
 
     Returns:
         The scene.
 
     Raises:
         FileNotFoundError: The file, or a buffer or an image of a glTF file, does not exist.
+        ImportError: The file is compressed, and a package of `jaxprt[web]` is missing.
         ValueError: The file is of an unknown kind, damaged, or has no triangles; it refers to a file outside of its
             folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF of a dictionary
             is not supported.
@@ -67,11 +101,17 @@ def load_scene(path: str | pathlib.Path | Mapping[str, Any], *, outside: bool = 
     """
     if not isinstance(outside, bool):
         raise TypeError(f"outside must be True or False, got {require.shown(outside)}")
+    if animation is not None and time is None:
+        raise ValueError(f"time must be a number of seconds where an animation is given, got None for {animation!r}")
     if isinstance(path, Mapping):
+        if time is not None:
+            raise ValueError(f"the scene must be a glTF file where a time is given, got a dictionary and {time:g} s")
         return mitsuba_dict.read(path)
     path = pathlib.Path(path)
     if path.suffix.lower() in (".glb", ".gltf"):
-        return gltf.read(path, outside=outside)
+        return gltf.read(path, outside=outside, time=time, animation=animation, lights=lights)
+    if time is not None:
+        raise ValueError(f"{path} must be a glTF file where a time is given, got {path.suffix.lower()!r}")
     mesh_file.check(path)
     content = mesh_file.content(path, groups=False)
     plain = mesh_colors.matte(geometry=content.geometry)

@@ -6,6 +6,9 @@ w_k are the weights of the channels of a `Blend`, r is the roughness or another 
 of r. Light that a vertex sends to other surfaces thus has the same roughness as light that it sends to the eye.
 """
 
+import itertools
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -19,20 +22,20 @@ class Sent(eqx.Module):
     """Weights of path functions for the channels of a BRDF.
 
     Attributes:
-        knot: Increasing values of the parameter; empty for a BRDF without a parameter.
-        factor: Weight of each function p for each channel k at each knot; one row without knots.
+        knot: Increasing values of each parameter; empty for a BRDF without a parameter.
+        factor: Weight of each function p for each channel k at each knot, with one axis for each parameter; one row
+            without knots.
     """
 
     knot: tuple[Float[Array, " _"], ...]
-    factor: Float[Array, "n k p"]
+    factor: Float[Array, "*n k p"]
 
     def __check_init__(self):
         """Refuses factors for another number of knots."""
-        knots = len(self.knot[0]) if self.knot else 1
-        if len(self.knot) > 1 or len(self.factor) != knots:
+        knots = [len(each) for each in self.knot] or [1]
+        if list(self.factor.shape[:-2]) != knots:
             raise ValueError(
-                f"the factors must have one row for each knot of at most one parameter, got {len(self.factor)} rows "
-                f"for {len(self.knot)} parameters"
+                f"the factors must have {knots} rows, one for each knot, got {list(self.factor.shape[:-2])}"
             )
 
     def weights(self, blend: Blend) -> Float[Array, "v p c"]:
@@ -44,7 +47,11 @@ class Sent(eqx.Module):
 def _weights(sent: Sent, blend: Blend) -> Array:
     if not sent.knot:
         return jnp.einsum("kp,vkc->vpc", sent.factor[0], blend.weight, precision="highest")
-    (knot,), (parameter,) = sent.knot, blend.parameter
-    low, upper = grid.neighbors(grid.place(knot, parameter), size=len(knot))
-    each = [sent.factor[low + step] * part[:, None, None] for step, part in ((0, 1 - upper), (1, upper))]
-    return jnp.einsum("vkp,vkc->vpc", each[0] + each[1], blend.weight, precision="highest")
+    pairs = zip(sent.knot, blend.parameter, strict=True)
+    axis = [grid.neighbors(grid.place(knot, parameter), size=len(knot)) for knot, parameter in pairs]
+    between = [((low, 1 - upper), (low + 1, upper)) for low, upper in axis]
+    total: Array | float = 0.0
+    for corner in itertools.product(*between):
+        share = math.prod(part for _, part in corner)
+        total = total + sent.factor[tuple(place for place, _ in corner)] * share[:, None, None]
+    return jnp.einsum("vkp,vkc->vpc", total, blend.weight, precision="highest")

@@ -135,22 +135,28 @@ def _relative(lamp: Mesh | PointLight, origin: origins.Origin) -> Mesh | PointLi
 
 
 class _Samples(NamedTuple):
-    """Sample points on all lamps, the area of each times the normal there, and the number of points of each piece."""
+    """Sample points on all lamps, the area of each times the normal there, and the number of points of each piece.
+
+    The spots among the lamps stand with the index of their one sample.
+    """
 
     place: np.ndarray
     area: np.ndarray
     piece: np.ndarray
+    spot: Sequence[tuple[int, PointLight]]
 
     @classmethod
     def of(cls, lamps: Sequence[Mesh | PointLight], count: int, pieces: int) -> "_Samples":
-        points, sizes = [], []
+        points, sizes, spots = [], [], []
         for each in lamps:
+            if isinstance(each, PointLight) and each.axis is not None:
+                spots.append((sum(sizes), each))
             place, area = sampled(each, count=count) if isinstance(each, Mesh) else _alone(each)
             order = _halved(place, pieces if isinstance(each, Mesh) else 1)
             points.append((place[np.concatenate(order)], area[np.concatenate(order)]))
             sizes += [len(own) for own in order]
         place, area = (np.concatenate(each).astype(np.float32) for each in zip(*points, strict=True))
-        return cls(place, area, np.asarray(sizes))
+        return cls(place, area, np.asarray(sizes), spots)
 
 
 def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
@@ -215,7 +221,11 @@ class _Job(visibility.rays.VisibilityJob):
     @property
     def near(self) -> Mapping[str, list[float]]:
         """Sketches of the positions and areas of the lamps' samples, compared up to rounding."""
-        return {**super().near, "lamps": sketch(np.concatenate(self.coarse[:2]))}
+        spots = [
+            [number, *np.asarray(spot.axis), *spot.cone] for number, spot in self.coarse.spot if spot.axis is not None
+        ]
+        cones = {"spots": sketch(np.array(spots))} if spots else {}
+        return {**super().near, "lamps": sketch(np.concatenate(self.coarse[:2])), **cones}
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -247,6 +257,8 @@ class _Job(visibility.rays.VisibilityJob):
         size = np.linalg.norm(samples.area, axis=1)
         facing = np.where(size > 0, np.maximum(-np.einsum("vsc,sc->vs", unit, samples.area), 0), 1)
         solid = facing / (square + size / np.float32(np.pi))
+        for sample, spot in samples.spot:
+            solid[:, sample] *= spot.share(-unit[:, sample])
         height = np.einsum("vsc,vc->vs", unit, normal)
         point, sample = np.nonzero((solid > 0) & (height > 0))
         triangle, distance, _ = self.rays.hit(start[point], way[point, sample])

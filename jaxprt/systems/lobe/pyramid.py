@@ -5,7 +5,7 @@ visibility of a lobe is read from a few texels at the scale of its width. Pyrami
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -23,15 +23,18 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
-from jaxprt.systems import harmonic
+from jaxprt.systems.lobe import diffuse
 from jaxprt.visibility import StoredVisibility
 from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 2}
+_BITS = 2  # largest number of scales that are read from the bits
+# Fewest texels along an edge of such a scale. Bits have no border, so that slopes jump at the edges of the cube.
+_FINE = 16
+_TAPS = 3  # texels along an axis from which visibility is interpolated
+_BYTE = 255
 _R2 = 0.7548776662466927, 0.5698402909980532  # steps of a sequence that fills squares evenly
-ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 1}
-DEGREE = 6  # of the harmonics by which the diffuse part is lit
-_BITS = 2  # number of finest scales, which are read from the bits
 _BLOCK = 1024
 
 
@@ -41,14 +44,15 @@ class LobeTransport(eqx.Module):
     Attributes:
         pyramid: For each vertex, first the bits of all texels, with 2 x 2 neighbors in each half of a byte; then the
             means at a quarter of the resolution and below, as bytes, each face with a border of its neighbors' texels.
-        vector: Transfer vectors: SH coefficients of visibility x cosine / pi.
+            Scales with fewer than 16 texels along an edge are always bytes.
+        vector: Transfer vectors for diffuse light, as bytes; see `jaxprt.systems.lobe.diffuse`.
         position: Vertex positions in world units.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         size: Edge of the cubemap faces in texels.
     """
 
     pyramid: UInt8[Array, "v n"]
-    vector: Float[Array, "lm v"]
+    vector: UInt8[Array, "h v"]
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     size: int = eqx.field(static=True)
@@ -74,8 +78,9 @@ class LobeTransport(eqx.Module):
     ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
         """Mean visibility over each lobe of each vertex, horizon included, and its derivatives.
 
-        Lookup is bilinear at the two scales next to the lobe's width, and linear in the spread between them. At points,
-        visibility at the three corners of the triangle is interpolated, for the lobes of the point itself.
+        Lookup is by quadratic B-splines at the two scales next to the lobe's width, and linear in the spread between
+        them, so that the derivatives are continuous. At points, visibility at the three corners of the triangle is
+        interpolated, for the lobes of the point itself.
 
         Args:
             face: Cubemap face of each lobe's direction, from `jaxprt.sphere.cubemap.project`.
@@ -101,20 +106,30 @@ class LobeTransport(eqx.Module):
 
 @partial(isolated, static=("size",))
 def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
-    """Addresses of the bytes of the eight texels that each lobe reads and, for scales stored as bits, the bit."""
+    """Addresses of the bytes that each lobe reads: 3 x 3 texels at two scales, by rows.
+
+    For scales stored as bits, the bit is the sum of one number for each of the three rows and one for each of the three
+    columns, which follow for each scale.
+    """
     scale = scales(size)
     number, _ = between(scale, spread)
     address, bit = [], []
     for step in (0, 1):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
-        row, column, weights = corners(edge, s, t)
-        in_bits, twice = number + step < _BITS, jnp.where(number + step == 0, 1, 2)
-        for (down, right), _ in weights:
-            first, second = (jnp.clip(x - 1, 0, edge - 1) * twice for x in (row + down, column + right))
-            byte, place = _bit(face, first, second, size)
-            plain = start + (face * (edge + 2) + row + down) * (edge + 2) + column + right
-            address.append(jnp.where(in_bits, byte, plain))
-            bit.append(place)
+        in_bits, fine = number + step < scale.bits, jnp.where(number + step == 0, 0, 1)
+        place = []
+        for center in (_nearest(edge, t), _nearest(edge, s)):
+            rim = [center + offset for offset in (-1, 0, 1)]  # counted from the border
+            place.append((rim, [jnp.clip(x - 1, 0, edge - 1) << fine for x in rim]))
+        (row, first), (column, second) = place
+        width = size // 4  # bytes of two rows of texels
+        down = [
+            jnp.where(in_bits, (face * (size // 2) + (x >> 1)) * width, start + (face * (edge + 2) + y) * (edge + 2))
+            for x, y in zip(first, row, strict=True)
+        ]
+        right = [jnp.where(in_bits, x >> 2, y) for x, y in zip(second, column, strict=True)]
+        address += [x + y for x in down for y in right]
+        bit += [(x & 1) << 1 for x in first] + [((x & 2) << 1) + (x & 1) for x in second]
     return tuple(address), tuple(bit)
 
 
@@ -138,44 +153,104 @@ def _bytes_of(
 
 @isolated
 def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
-    return tuple(read.T.reshape(8, -1, len(read)))
+    return tuple(read.T.reshape(2 * _TAPS**2, -1, len(read)))
 
 
 @partial(isolated, static=("size",))
 def _decoded(
     read: tuple, corner_weight: Array | None, bit: tuple, s: Array, t: Array, spread: Array, *, size: int
 ) -> tuple[Array, Array, Array]:
-    """Visibility and its derivatives with respect to s and t, from the eight bytes of each corner."""
+    """Visibility and its derivatives with respect to s and t, from the 18 bytes of each corner."""
     scale = scales(size)
     number, upper = between(scale, spread)
     result = [jnp.zeros_like(spread)] * 3
-    count = 0
     for step, part in ((0, 1 - upper), (1, upper)):
-        _, _, weights = corners(jnp.asarray(scale.edge)[number + step], s, t)
-        for _, each in weights:
-            own = [_seen(corner[count], bit[count], number + step).astype(spread.dtype) for corner in read]
-            seen = own[0] if corner_weight is None else sum(x * w for x, w in zip(own, corner_weight, strict=True))
-            result = [total + seen * (weight * part) for total, weight in zip(result, each, strict=True)]
-            count += 1
+        own, first = [corner[step * _TAPS**2 :][: _TAPS**2] for corner in read], bit[2 * step * _TAPS :]
+        edge = jnp.asarray(scale.edge)[number + step]
+
+        def seen(i, j, own=own, bit=first, number=number + step):
+            place = bit[i] + bit[_TAPS + j]
+            value = [
+                _seen(corner[_TAPS * i + j], place, number, bits=scale.bits).astype(spread.dtype) for corner in own
+            ]
+            return value[0] if corner_weight is None else sum(x * w for x, w in zip(value, corner_weight, strict=True))
+
+        sums = _smooth(seen, edge, s, t, rim=number + step >= scale.bits)
+        result = [total + value * part for total, value in zip(result, sums, strict=True)]
     return result[0], result[1], result[2]
 
 
-def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array) -> Array:
-    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond."""
+def _smooth(seen: Callable[[int, int], Array], edge: Array, s: Array, t: Array, *, rim: Array) -> list[Array]:
+    """Quadratic B-spline over 3 x 3 texels, and its derivatives with respect to s and t.
+
+    A border texel holds the texel of the neighboring face in the same row. Lines of constant t have a kink of slope t
+    at that edge, so that slopes across the edge would differ between the faces. The texel that continues the face
+    lies t / edge farther inside; its difference along the edge is taken off the slopes, which makes them continuous.
+
+    Args:
+        seen: Values of the texels, by row and column.
+        edge: Number of texels along the edge of a face.
+        s: Column coordinate.
+        t: Row coordinate.
+        rim: Whether faces have borders.
+    """
+    half = edge.astype(s.dtype) / 2
+    (down, by_down, outside_down), (right, by_right, outside_right) = (_spline(edge, x, rim) for x in (t, s))
+    total, by_s, by_t = [jnp.zeros_like(s)] * 3
+    for j in range(_TAPS):
+        column = [seen(i, j) for i in range(_TAPS)]
+        mean = sum(x * w for x, w in zip(column, down, strict=True))
+        parts = [x * w for x, w in zip(column, by_down, strict=True)]
+        slope = parts[0] + parts[1] + parts[2]
+        outside = parts[0] * outside_down[0] + parts[2] * outside_down[1]
+        across = mean if j == 1 else mean - slope * (outside_right[j // 2] * t / 2)
+        total = total + mean * right[j]
+        by_s = by_s + across * by_right[j]
+        by_t = by_t + slope * right[j] - outside * (by_right[j] * s / 2)
+    return [total, by_s * half, by_t * half]
+
+
+def _spline(edge: Array, x: Array, rim: Array) -> tuple[list[Array], list[Array], list[Array]]:
+    """Weights of three texels around a coordinate, their derivatives in texels, and which outer ones are border."""
+    center = _nearest(edge, x)
+    off = (x + 1) * (edge.astype(x.dtype) / 2) + 0.5 - center
+    weight = [(0.5 - off) ** 2 / 2, 0.75 - off**2, (0.5 + off) ** 2 / 2]
+    outside = [(rim & (center == end)).astype(x.dtype) for end in (1, edge)]
+    return weight, [off - 0.5, -2 * off, off + 0.5], outside
+
+
+def _nearest(edge: Array, x: Array) -> Int[Array, "..."]:
+    """Index of the texel in which a coordinate lies, the border counted."""
+    place = jax.lax.stop_gradient((x + 1) * (edge.astype(x.dtype) / 2))
+    return jnp.clip(place.astype(jnp.int32), 0, edge - 1) + 1
+
+
+def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array, *, bits: int) -> Array:
+    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond.
+
+    `bits` is the number of scales that are read from bits.
+    """
     value = byte.astype(jnp.int32)
-    four = value >> (bit & 4)
-    four = (four & 1) + (four >> 1 & 1) + (four >> 2 & 1) + (four >> 3 & 1)
-    coarse = jnp.where(number < _BITS, four / 4, value / 255)
-    return jnp.where(number == 0, value >> bit & 1, coarse)
+    if not bits:
+        return value.astype(jnp.float32) / _BYTE
+    four = value >> bit & jnp.where(number == 0, 1, 15)
+    pair = (four & 5) + (four >> 1 & 5)
+    four = (pair & 3) + (pair >> 2)
+    factor = jnp.where(number == 0, 1.0, jnp.where(number < bits, 1 / 4, 1 / _BYTE)).astype(jnp.float32)
+    return jnp.where(number < bits, four, value) * factor
 
 
 class Scales(NamedTuple):
-    """Scales of a pyramid: face edge, spread (mean of 1 - cos) and offset of each scale, and the total length."""
+    """Scales of a pyramid: face edge, spread (mean of 1 - cos) and offset of each scale, and the total length.
+
+    `bits` is the number of finest scales that are read from single bits.
+    """
 
     edge: np.ndarray
     spread: np.ndarray
     start: np.ndarray
     total: int
+    bits: int = 0
 
 
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
@@ -210,11 +285,12 @@ def scales(size: int) -> Scales:
     if size < 8 or size & (size - 1):
         raise ValueError(f"size must be a power of two, at least 8, got {size}")
     edge = np.array([size >> k for k in range(size.bit_length())], np.int32)
-    # A texel's box and the bilinear tent together have a variance of a quarter of its solid angle along each axis.
-    spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 4
-    count = 6 * (edge[_BITS:] + 2) ** 2
-    start = np.concatenate([[0] * _BITS, 6 * size * size // 8 + np.cumsum(count) - count])
-    return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()))
+    # A texel's box and the spline together have a variance of a third of its solid angle along each axis.
+    spread = 4 * np.pi / (6 * edge.astype(np.float64) ** 2) / 3
+    bits = int(np.sum(edge[:_BITS] >= _FINE))
+    count = 6 * (edge[bits:] + 2) ** 2
+    start = np.concatenate([[0] * bits, 6 * size * size // 8 + np.cumsum(count) - count])
+    return Scales(edge, spread, start.astype(np.int32), 6 * size * size // 8 + int(count.sum()), bits)
 
 
 @require.arguments(**PRECOMPUTE)
@@ -276,7 +352,7 @@ def compress(direct: StoredVisibility) -> LobeTransport:
         part = np.arange(first, min(first + _BLOCK, len(frame)))
         seen = jax.device_put(direct.seen(part))
         pyramids.append(np.asarray(pyramid(seen)))
-        vectors.append(np.asarray(harmonic.transfer.transfer_diffuse(seen, direct.frame[part], degree=DEGREE)))
+        vectors.append(np.asarray(diffuse.vectors(seen, direct.frame[part])))
     made, vector = jax.device_put(np.concatenate(pyramids)), jax.device_put(np.concatenate(vectors, 1))
     return LobeTransport(made, vector, direct.position, direct.frame, direct.size)
 
@@ -339,7 +415,7 @@ def pyramid(seen: UInt8[Array, "b d"]) -> UInt8[Array, "b n"]:
     parts = [bits.reshape(count, -1)]
     area = cubemap.solid_angle(size=size)
     value = seen.reshape(count, 6, size, size).astype(area.dtype) * (area / visibility.LEVELS)
-    for edge in scale.edge.tolist()[_BITS:]:
+    for edge in scale.edge.tolist()[scale.bits :]:
         fold = size // edge
         mean, whole = (jnp.sum(x.reshape(-1, 6, edge, fold, edge, fold), (3, 5)) for x in (value, area[None]))
         faces = jnp.moveaxis(cubemap.pad(jnp.moveaxis(mean / whole, 0, -1)), -1, 0)
@@ -364,18 +440,18 @@ class _Job(visibility.rays.VisibilityJob):
 
     @property
     def header(self) -> Mapping[str, Any]:
-        return self.made_by("lobe", ALGORITHM, degree=DEGREE)
+        return self.made_by("lobe", ALGORITHM)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
         return {
             "pyramid": Layout((visibility.rays.BLOCK, scales(self.size).total), 0, "uint8"),
-            "vector": Layout(((DEGREE + 1) ** 2, visibility.rays.BLOCK), 1, "float32"),
+            "vector": Layout((diffuse.count(self.size), visibility.rays.BLOCK), 1, "uint8"),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
-        vector = harmonic.transfer.transfer_diffuse(seen, self.frame[self.part(block)], degree=DEGREE)
+        vector = diffuse.vectors(seen, self.frame[self.part(block)])
         pyramids = np.array(pyramid(seen))
         if self.rays.blends:
             bits = 6 * self.size**2 // 8

@@ -23,16 +23,17 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require
 from jaxprt.compile import isolated, jit, kept, total
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.sphere import cubemap, directions, harmonics
+from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import protocol
-from jaxprt.systems.lobe.pyramid import DEGREE, LobeTransport, Scales, between, corners
+from jaxprt.systems.lobe import diffuse
+from jaxprt.systems.lobe.pyramid import LobeTransport, Scales, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes
 
 _FIRST = 0.8  # width of the finest blur, in texels of the environment
@@ -53,13 +54,15 @@ class LobeLight(eqx.Module):
     Attributes:
         pyramid: Texels of all widths, one after another, in units of radiance; each face has a border of its neighbors'
             texels.
-        coefficient: SH coefficients of the unblurred light, for the diffuse part.
+        coefficient: Coefficients of the unblurred light, for the diffuse part; see `jaxprt.systems.lobe.diffuse`.
         size: Edge of the environment's cubemap faces in texels.
+        irradiance: Irradiance / pi of the vertices; None before `LobeSystem.shade`.
     """
 
     pyramid: Float[Array, "c t"]
-    coefficient: Float[Array, "lm c"]
+    coefficient: Float[Array, "h c"]
     size: int = eqx.field(static=True)
+    irradiance: Float[Array, "c v"] | None = None
 
 
 class LobeView(eqx.Module):
@@ -70,7 +73,7 @@ class LobeView(eqx.Module):
         visible: Weights of these texels: interpolation weight times visibility.
         weight: Weight of each lobe, gray or per color.
         diffuse: Albedo of the diffuse part, gray or per color.
-        vector: Transfer vectors of the vertices, for the diffuse part.
+        vector: Transfer vectors of the vertices, for the diffuse part; no rows if the light holds the irradiance.
         points: Points that the view belongs to; None for the vertices.
         size: Edge of the environment's cubemap faces in texels.
     """
@@ -79,7 +82,7 @@ class LobeView(eqx.Module):
     visible: tuple[Float[Array, "l v"], ...]
     weight: Float[Array, "c l v"]
     diffuse: Float[Array, "c v"]
-    vector: Float[Array, "lm _"]
+    vector: UInt8[Array, "h _"] | Float[Array, "h _"]
     points: Points | None
     size: int = eqx.field(static=True)
 
@@ -104,8 +107,8 @@ def radiance(
         eye: Position of the viewer in world units.
 
     Returns:
-        Linear radiance per vertex, in units of the light's radiance. Ringing of harmonics can make the diffuse
-        part slightly negative. Differentiable in the light, the eye and the table.
+        Linear radiance per vertex, in units of the light's radiance. Next to bright texels, hat functions can make the
+        diffuse part slightly negative. Differentiable in the light, the eye and the table.
 
     Raises:
         TypeError: The BRDF is not a `LobeBrdf`, or the light is not an `Environment`.
@@ -131,7 +134,8 @@ def prefilter(light: Environment) -> LobeLight:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
         )
-    return _prefilter(light, _blurs(light.radiance))
+    pyramid = _prefilter(light, _blurs(light.radiance))
+    return LobeLight(pyramid, diffuse.coefficients(light.radiance), light.radiance.shape[1])
 
 
 @require.arguments(brdf=_brdf)
@@ -244,7 +248,9 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
             f"got {light.size}"
         )
     protocol.check_colors(len(light.pyramid), view.weight.shape[0])
-    irradiance = light.coefficient.T @ view.vector
+    irradiance = light.irradiance
+    if irradiance is None:
+        irradiance = diffuse.irradiance(light.coefficient, view.vector)
     if view.points is not None:
         irradiance = view.points.carry(irradiance, axis=1)
     # Colors are contiguous, so that one read gets all. Lobes are summed one by one, so that sums stay in the cache.
@@ -277,7 +283,8 @@ def scales(size: int) -> Scales:
 
 
 @kept
-def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLight:
+def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> Float[Array, "c t"]:
+    """The light, blurred by lobes of all widths."""
     _, size, _, colors = light.radiance.shape
     scale = scales(size)
     mips = {size: light.radiance}
@@ -297,8 +304,7 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> LobeLigh
             tile = math.isqrt(weight.shape[1])
             value = value.reshape(edge // tile, edge // tile, tile, tile, 6, colors).transpose(4, 0, 2, 1, 3, 5)
         levels.append(cubemap.pad(value.reshape(6, edge, edge, colors)).reshape(-1, colors).T)
-    coefficient = harmonics.project(light.radiance, degree=DEGREE)
-    return LobeLight(jnp.concatenate(levels, 1), coefficient, size)
+    return jnp.concatenate(levels, 1)
 
 
 def blur(edge: int, spread: float, *, size: int) -> tuple[int, float, float]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.scene.environment import Environment
 from jaxprt.systems import protocol
+from jaxprt.systems.lobe import diffuse
 from jaxprt.systems.lobe.pyramid import LobeTransport
 from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, view_lobes
 from jaxprt.systems.lobe.table import LobeBrdf
@@ -37,6 +38,12 @@ class LobeSystem(protocol.VertexSystem):
         """The light, blurred by lobes of about a dozen widths; see `jaxprt.lobe.prefilter`."""
         return prefilter(protocol.one_light(environment, size=self.transport.size))
 
+    def shade(self, light: LobeLight, materials: Blend | None = None) -> LobeLight:
+        """The light with the irradiance of the vertices, for the diffuse part. Materials do not change it."""
+        require.kind("the light", light, LobeLight, source="LobeSystem.light")
+        irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
+        return LobeLight(light.pyramid, light.coefficient, light.size, irradiance)
+
     def view(
         self,
         eye: Float[Array, "*p 3"],
@@ -49,10 +56,12 @@ class LobeSystem(protocol.VertexSystem):
         """
         protocol.check_blend(materials)
         options = {"eye": eye, "points": self.points, "variance": variance}
+        # The irradiance comes with the light: each row of points would hold a copy of the vectors.
+        transport = eqx.tree_at(lambda each: each.vector, self.transport, self.transport.vector[:0])
         if materials is None:
-            return view_lobes(self.transport, self.brdf, **options)
+            return view_lobes(transport, self.brdf, **options)
         materials.check(self.vertices, len(self.brdf.weight))
-        seen = view_lobes(self.transport, self.brdf, *materials.parameter, **options)
+        seen = view_lobes(transport, self.brdf, *materials.parameter, **options)
         # Channel by channel with the vertices last: an einsum would be a small matrix product for each vertex.
         channel = jnp.moveaxis(materials.weight, 0, 2)
         pairs = list(zip(seen.weight, seen.diffuse, channel, strict=True))
@@ -64,6 +73,8 @@ class LobeSystem(protocol.VertexSystem):
         """Radiance: the blurred light, read at the texels of the view and weighted."""
         require.kind("the light", light, LobeLight, source="LobeSystem.light")
         require.kind("the view", view, LobeView, source="LobeSystem.view")
+        if light.irradiance is None:
+            light = self.shade(light)
         return combine(light, view)
 
     @property

@@ -59,6 +59,11 @@ class StandardTable:
         return np.array(self._stored["knot"], np.float64)
 
     @property
+    def knots(self) -> tuple[np.ndarray, ...]:
+        """The knots of each parameter of the table: those of the roughness."""
+        return (self.knot,)
+
+    @property
     def most_exponent(self) -> float:
         """The exponent of `BlinnPhong` at the smallest tabulated roughness."""
         return float(2 * np.exp(-2 * self.range[0]) - 2)
@@ -78,10 +83,10 @@ class StandardTable:
     @property
     def family(self) -> RoughnessFamily | ShininessFamily:
         """Function from the logarithm of a roughness to the BRDF with all channels."""
-        scale = _array(self._stored["channel"])
+        scale = constant(self._stored["channel"])
         if self.name == "blinn_phong":
             return ShininessFamily(scale)
-        return RoughnessFamily(tuple(range(len(scale))), scale, _array(np.zeros(())))
+        return RoughnessFamily(tuple(range(len(scale))), scale, constant(np.zeros(())))
 
     def lobes(self, count: int = LOBES) -> LobeBrdf:
         """The BRDF as lobes.
@@ -162,10 +167,13 @@ class StandardTable:
             log_roughness: Logarithm of the smallest roughness of a part.
             weight: Mean weights of the channels, relative to `scale`, averaged over colors; None for ones.
         """
+        return is_traced(self.albedos(log_roughness, weight))
+
+    def albedos(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> Float[np.ndarray, "3"]:
+        """Albedos of traced lobes, of all lobes, and of the diffuse part; arguments as of `is_sharp`."""
         albedo = self._stored["albedo"].astype(np.float64)
         albedo = albedo.sum(2) if weight is None else albedo @ np.asarray(weight, np.float64)
-        each = [np.interp(log_roughness, self._stored["knot"], row) for row in albedo]
-        return float(traced.fraction(*each)) > traced.FEW
+        return np.array([np.interp(log_roughness, self._stored["knot"], row) for row in albedo])
 
     @property
     def _power(self) -> int:
@@ -179,6 +187,11 @@ class StandardTable:
 
 METALLIC_ROUGHNESS = StandardTable("metallic_roughness")
 BLINN_PHONG = StandardTable("blinn_phong")
+
+
+def is_traced(albedo: Float[np.ndarray, "3"]) -> bool:
+    """Whether lobes are traced, given the albedos of traced lobes, of all lobes, and of the diffuse part."""
+    return float(traced.fraction(*albedo)) > traced.FEW
 
 
 def path(name: str) -> pathlib.Path:
@@ -205,23 +218,23 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
     stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse")}
     mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
-    scale, weight, diffuse = (_array(each, dtype) for each in stored.values())
-    knot, error = _array(table._stored["knot"], dtype), _array(np.asarray(np.max(table.errors(count))), dtype)
-    return LobeBrdf(_array(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
+    scale, weight, diffuse = (constant(each, dtype) for each in stored.values())
+    knot, error = constant(table._stored["knot"], dtype), constant(np.asarray(np.max(table.errors(count))), dtype)
+    return LobeBrdf(constant(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
 
 
 @functools.cache
 def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
     stored = table._stored
-    value = _array(stored["harmonics"][: (degree + 1) ** 2], dtype)
-    return HarmonicBrdf(value, (_array(stored["harmonics.knot"], dtype),), _array(stored["harmonics.error"], dtype))
+    value = constant(stored["harmonics"][: (degree + 1) ** 2], dtype)
+    return HarmonicBrdf(value, (constant(stored["harmonics.knot"], dtype),), constant(stored["harmonics.error"], dtype))
 
 
 @functools.cache
 def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, Sent]:
     names = "light", "view", "factor", "error"
-    light, view, factor, error = (_array(table._stored[f"path.{name}"], dtype) for name in names)
-    knot = (_array(table._stored["knot"], dtype),)
+    light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype) for name in names)
+    knot = (constant(table._stored["knot"], dtype),)
     return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), Sent(knot, factor)
 
 
@@ -229,7 +242,7 @@ def _dtype() -> Any:
     return jnp.result_type(float)
 
 
-def _array(value: np.ndarray, dtype: Any = None) -> jax.Array:
+def constant(value: np.ndarray, dtype: Any = None) -> jax.Array:
     """An array on the device, also while JAX traces a function. No program is compiled."""
     with jax.ensure_compile_time_eval():
         return jax.device_put(np.asarray(value, _dtype() if dtype is None else dtype))

@@ -97,6 +97,24 @@ def test_a_point_light_falls_with_the_square_of_the_distance(transport, close):
     close(np.asarray(transport.cosine[-1]), way[:, 1] / square_**1.5, tolerance=1e-4)
 
 
+def test_a_spot_lights_its_cone(transport):
+    axis, inner, outer = np.array([0.3, -1.0, 0.2]), 0.4, 1.0
+    spot = PointLight("spot", BULB.position, 2.0, axis=axis, cone=(inner, outer))
+    lit = lamps.precompute(GROUND, [LAMP, spot], occluder=join([GROUND, LAMP]), progress=False)
+    way = np.asarray(GROUND.position, np.float64) - np.asarray(BULB.position)
+    angle = np.arccos(way @ axis / np.linalg.norm(way, axis=1) / np.linalg.norm(axis))
+    # KHR_lights_punctual, "Inner and Outer Cone Angles".
+    scale = 1 / max(0.001, np.cos(inner) - np.cos(outer))
+    expected = np.clip(np.cos(angle) * scale - np.cos(outer) * scale, 0, 1) ** 2
+    assert (expected == 0).any()
+    assert (expected == 1).any()
+    np.testing.assert_allclose(lit.solid_angle[-1], transport.solid_angle[-1] * expected, atol=1e-4)
+    np.testing.assert_array_equal(lit.solid_angle[:-1], transport.solid_angle[:-1])
+    for wrong in ({"axis": [0, 0, 0]}, {"axis": axis, "cone": (1.0, 0.5)}, {"axis": [np.inf, 0, 0]}):
+        with pytest.raises(ValueError, match="of point light 'spot' must be"):
+            PointLight("spot", BULB.position, 2.0, **wrong)
+
+
 def test_what_stands_between_casts_a_shadow_and_backs_send_nothing():
     wall = square([0, HEIGHT / 2, 0], 3.0, down=True)
     dark = lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP, wall]), samples=16, progress=False)

@@ -183,7 +183,7 @@ def transport(seen):
     """One vertex of each kind at the origin; irradiance is not what is tested here."""
     count = len(VISIBLE)
     frame = jnp.broadcast_to(jnp.eye(3), (count, 3, 3))
-    vector = jnp.zeros(((lobe.pyramid.DEGREE + 1) ** 2, count))
+    vector = jnp.zeros((lobe.diffuse.count(SIZE), count), jnp.uint8)
     return LobeTransport(lobe.pyramid.pyramid(seen), vector, jnp.zeros((count, 3)), frame, SIZE)
 
 

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 
-from jaxprt import harmonic, lobe, visibility
+from jaxprt import lobe, visibility
 from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join
@@ -13,6 +14,7 @@ from jaxprt.sphere import cubemap
 
 SIZE = 16
 BYTE = 2e-3  # half a step of a byte
+SLOPE = 5e-3  # change of slopes over 1e-5, in visibility per radian
 # A pyramid's boxes and tents are no normal distribution: at most .047 was measured, root mean square.
 FRACTION = 0.06
 
@@ -60,7 +62,7 @@ def test_single_texels_are_seen_where_at_least_half_of_them_is(compressed, seen)
 def test_every_texel_is_its_own_bit(seen):
     pyramid = lobe.pyramid.pyramid(jnp.asarray(seen))
     blank = lobe.LobeTransport(
-        pyramid, jnp.zeros((49, len(seen))), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
+        pyramid, jnp.zeros((0, len(seen)), jnp.uint8), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
     )
     every = jnp.arange(seen.shape[1])
     for each in (blank, lobe.texel_bits(blank)):
@@ -74,7 +76,7 @@ def test_a_pyramid_takes_six_kilobytes():
 @pytest.mark.parametrize("value", [0, 16])
 def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
     pyramid = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
-    transport = lobe.LobeTransport(pyramid, jnp.zeros((49, 2)), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
+    transport = lobe.LobeTransport(pyramid, jnp.zeros((0, 2), jnp.uint8), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
     for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
         for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
             visible, by_s, by_t = read(transport, direction, spread)
@@ -92,16 +94,19 @@ def test_visible_parts_are_the_means_over_lobes(compressed, seen, spread):
     assert np.sqrt(np.mean(np.square(wrong))) < FRACTION
 
 
-def test_visible_parts_at_a_scale_of_bytes_are_its_means(compressed, seen):
-    """At the center of a texel, and at the scale's own spread, nothing is interpolated."""
+def test_visible_parts_at_a_scale_of_bytes_are_its_means_weighted_by_splines(compressed, seen):
+    """At the center of a texel, and at the scale's own spread."""
     scale = lobe.pyramid.scales(SIZE)
     mean = seen.reshape(-1, 6, 4, 4, 4, 4).astype(float) / 16
     area = np.asarray(cubemap.solid_angle(size=SIZE)).reshape(6, 4, 4, 4, 4)
     mean = (mean * area).sum((3, 5)) / area.sum((2, 4))
+    mean = np.moveaxis(np.asarray(cubemap.pad(jnp.asarray(np.moveaxis(mean, 0, -1), jnp.float32))), -1, 0)
+    spline = scipy.interpolate.BSpline.basis_element(np.arange(4) - 1.5)([-1, 0, 1])
     for face, row, column in ((0, 1, 2), (3, 2, 1), (5, 0, 3)):
         direction = np.asarray(cubemap.direction(size=4))[face, row, column]
         visible, *_ = read(compressed, direction, float(scale.spread[2]))
-        np.testing.assert_allclose(visible[0], mean[:, face, row, column], atol=BYTE + 1e-5)
+        around = mean[:, face, row : row + 3, column : column + 3]
+        np.testing.assert_allclose(visible[0], np.einsum("i,vij,j->v", spline, around, spline), atol=BYTE + 1e-5)
 
 
 def test_slopes_are_those_of_the_visible_parts(compressed):
@@ -109,7 +114,7 @@ def test_slopes_are_those_of_the_visible_parts(compressed):
     random = np.random.default_rng(1)
     face = jnp.asarray(random.integers(6, size=(3, count)))
     s, t = (jnp.asarray(random.uniform(-0.9, 0.9, (3, count)), jnp.float32) for _ in range(2))
-    spread = jnp.asarray(random.uniform(0.02, 0.4, (3, count)), jnp.float32)
+    spread = jnp.asarray(random.uniform(0.02, 0.04, (3, count)), jnp.float32)
     _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
     along_s = (
         compressed.lobe_visibility(face, s + step, t, spread)[0]
@@ -119,14 +124,14 @@ def test_slopes_are_those_of_the_visible_parts(compressed):
         compressed.lobe_visibility(face, s, t + step, spread)[0]
         - compressed.lobe_visibility(face, s, t - step, spread)[0]
     ) / (2 * step)
+    inside = (np.abs(s) < 0.4) & (np.abs(t) < 0.4)  # beyond, slopes blend over to the neighboring face
     for slope, difference in ((by_s, along_s), (by_t, along_t)):
-        near = np.isclose(slope, difference, atol=5e-3)
-        assert near.mean() > 0.95  # The rest lies across the line between texel centers, where slopes jump.
+        np.testing.assert_allclose(np.asarray(slope)[inside], np.asarray(difference)[inside], atol=5e-3)
 
 
 def test_slopes_are_what_differentiation_gives(compressed):
     face, s, t = cubemap.project(*(jnp.full((1, len(compressed.position)), x) for x in (0.3, 0.9, 0.2)))
-    spread = jnp.full(s.shape, 0.05)
+    spread = jnp.full(s.shape, 0.03)
     _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
     gradient = jax.grad(lambda s, t: jnp.sum(compressed.lobe_visibility(face, s, t, spread)[0]), argnums=(0, 1))(s, t)
     np.testing.assert_allclose(gradient[0], by_s, atol=1e-5)
@@ -136,14 +141,33 @@ def test_slopes_are_what_differentiation_gives(compressed):
 def test_visible_parts_are_continuous_over_the_edges_of_the_cube(compressed):
     """At scales of bytes, whose faces have a rim; bits end at the edge."""
     for spread in (0.05, 0.2):
-        for one, other in (([1, 0.3, 0.9999], [0.9999, 0.3, 1]), ([-0.2, 1, 0.9999], [-0.2, 0.9999, 1])):
+        for one, other in (([1, 0.3, 0.99999], [0.99999, 0.3, 1]), ([-0.2, 1, 0.99999], [-0.2, 0.99999, 1])):
             first, second = (np.asarray(read(compressed, x, spread)[0]) for x in (one, other))
             np.testing.assert_allclose(first, second, atol=2e-3)
 
 
-def test_transfer_vectors_are_those_of_the_harmonic_system(compressed, visible, seen, close):
-    expected = harmonic.transfer.transfer_diffuse(jnp.asarray(seen), visible.frame, degree=lobe.pyramid.DEGREE)
-    close(compressed.vector, expected)
+def gradient(transport, direction, spread):
+    """Gradient on the sphere of the visible part of a lobe, for all vertices."""
+    face, s, t = (float(x) for x in cubemap.project(*(jnp.asarray(float(x)) for x in direction)))
+    _, by_s, by_t = (np.asarray(x, np.float64)[0] for x in read(transport, direction, spread))
+    ways = by_s * (1 + s * s) + by_t * s * t, by_t * (1 + t * t) + by_s * s * t
+    first, second, normal = cubemap.axes()[int(face)]
+    point = s * first + t * second + normal
+    moved = ways[0][:, None] * first + ways[1][:, None] * second
+    return np.linalg.norm(point) * (moved - point * (moved @ point)[:, None] / (point @ point))
+
+
+def test_slopes_are_continuous_between_texels_and_over_the_edges_of_the_cube(compressed):
+    """At scales of bytes: a step of 1e-5 changes them by as much, where slopes of bilinear look-up jump."""
+    for spread in (0.05, 0.2):
+        for one, other in (
+            ([1, 0.3, 0.99999], [0.99999, 0.3, 1]),
+            ([-0.2, 1, 0.99999], [-0.2, 0.99999, 1]),
+            ([1, 0.499995, 0.2], [1, 0.500005, 0.2]),  # between texels of 4 x 4 a face
+            ([1, -0.249995, 0.2], [1, -0.250005, 0.2]),  # at the center of one
+        ):
+            first, second = (gradient(compressed, x, spread) for x in (one, other))
+            np.testing.assert_allclose(first, second, atol=SLOPE)
 
 
 def test_tracing_gives_what_compressing_known_visibility_gives(visible, compressed, close, tmp_path):
@@ -158,7 +182,7 @@ def test_tracing_gives_what_compressing_known_visibility_gives(visible, compress
         np.max(np.abs(np.asarray(traced.pyramid)[:, -96:].astype(int) - np.asarray(compressed.pyramid)[chosen, -96:]))
         <= 2
     )
-    close(traced.vector, compressed.vector[:, chosen], tolerance=1e-3)
+    assert np.max(np.abs(np.asarray(traced.vector).astype(int) - np.asarray(compressed.vector)[:, chosen])) <= 8
     np.testing.assert_array_equal(traced.pyramid, again.pyramid)
 
 

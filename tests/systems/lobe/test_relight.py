@@ -85,7 +85,9 @@ def test_light_that_grows_towards_the_open_side_counts_more():
     open_side = (center[:, 2] > 0) & (center[:, 0] > 0)
     pyramid = lobe.pyramid.pyramid(jnp.asarray(np.where(open_side, 16, 0)[None], jnp.uint8))
     frame = jnp.eye(3)[None]
-    half = lobe.LobeTransport(pyramid, jnp.zeros((49, 1)), jnp.zeros((1, 3)), frame, SIZE)
+    half = lobe.LobeTransport(
+        pyramid, jnp.zeros((lobe.diffuse.count(SIZE), 1), jnp.uint8), jnp.zeros((1, 3)), frame, SIZE
+    )
     radiance = 1 + 0.8 * center[:, 0]
     light = Environment(jnp.asarray(radiance.reshape(6, SIZE, SIZE, 1), jnp.float32))
     for concentration in (8.0, 20.0, 60.0):

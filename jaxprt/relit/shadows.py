@@ -1,0 +1,164 @@
+"""Shadows of the brightest texels of a light in pictures, by rays from the points of the picture.
+
+The radiance by which a few texels exceed the rest of the light is taken out of it. The systems of the scene relight the
+rest, with visibility that is interpolated between vertices. What the texels add is the product of radiance, BRDF and
+cosine at the point itself, times the share of the texel that rays from the point see.
+
+Rays are cast on the host. They are constants of all derivatives.
+"""
+
+import collections
+import threading
+import weakref
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxprt.compile import known, put
+from jaxprt.image.pixels import Pixels
+from jaxprt.relit.casting import caster
+from jaxprt.scene import Environment, Mesh, light_samples
+from jaxprt.scene import environment as environments
+from jaxprt.scene.panorama import Panorama
+from jaxprt.sphere import cubemap
+from jaxprt.systems import bright_texels
+from jaxprt.visibility import texel_rays
+
+TEXELS = 16  # number of traced texels
+_RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the systems sum about as many texels again.
+_LEAST = 1e-3  # smallest share of the light's flux of a traced texel
+_MORE = 16  # rays of a point beyond one for each texel, shared out by flux
+_FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
+_FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
+_KEPT = 4  # number of views whose traced texels are kept
+
+_FINER: weakref.WeakKeyDictionary[Panorama, np.ndarray] = weakref.WeakKeyDictionary()
+
+
+class TexelShares(eqx.Module):
+    """Texels of the light that were traced for the points of a view.
+
+    Attributes:
+        texel: Indices of the texels.
+        share: Share of each texel that each point of the picture sees, in 255ths.
+    """
+
+    texel: Int[Array, " t"]
+    share: UInt8[Array | np.ndarray, "t p"]
+
+
+class TracedLight(eqx.Module):
+    """A light whose brightest texels are traced.
+
+    Attributes:
+        rest: The light without what is taken out of these texels.
+        excess: The radiance that is taken out of each.
+        shares: The texels, and what the points of the picture see of them.
+    """
+
+    rest: Environment
+    excess: Float[Array, "t c"]
+    shares: TexelShares
+
+    def row(self, index: Any) -> tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t p"]]:
+        """The texels, what is taken out of them, and their shares at some points; an index of -1 is padding."""
+        share = self.shares.share
+        if known(share, index):  # The number of points depends on the view.
+            own = put(np.asarray(share)[:, np.maximum(index, 0)])
+        else:
+            own = jnp.asarray(share)[:, jnp.maximum(index, 0)]
+        return self.shares.texel, self.excess, own
+
+
+def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
+    """Traces the brightest texels of a light from the points of a picture.
+
+    Args:
+        mesh: The mesh of all parts of the scene.
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+        environment: The light.
+        keep: Whether to keep the shares for other lights of the same view.
+
+    Returns:
+        The light, or None if no texel stands out of it, or JAX traces the light, the mesh or the points.
+    """
+    if not known(mesh, pixels, environment):
+        return None
+    texel, excess, rest = bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)
+    size = environment.radiance.shape[-2]
+    number = np.asarray(texel)
+    flux = np.asarray(excess, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)).ravel()[number]
+    bright = np.flatnonzero(flux > 0)
+    if not len(bright):
+        return None
+    count = np.clip(1 + np.round(_MORE * flux[bright] / flux.sum()).astype(int), 1, texel_rays.PLACES)
+    fine = _finer(environment)
+    direction = light_samples.in_texels(number[bright], fine, size=size, count=texel_rays.PLACES)
+    share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
+    rays = texel_rays.TexelRays(direction, count)
+    share[bright] = _kept(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
+    return TracedLight(rest, excess, TexelShares(texel, share))
+
+
+def fixed(environment: Environment, shares: TexelShares) -> TracedLight:
+    """A light, known or traced by JAX, with texels that were traced before."""
+    excess, rest = bright_texels.without(environment, shares.texel, rank=_RANK, least=_LEAST)
+    return TracedLight(rest, excess, shares)
+
+
+def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
+    """The light at the resolution at which the places of rays are drawn; its own texels if it knows no finer ones."""
+    size, panorama = light.radiance.shape[-2], light.panorama
+    if panorama is None or size >= _FINE or _FINE % size:
+        return np.asarray(light.radiance)
+    if panorama not in _FINER:
+        _FINER[panorama] = np.asarray(environments.finer(light, size=_FINE).radiance)
+    return _FINER[panorama]
+
+
+def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: texel_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
+    pixel = np.asarray(pixels.pixel)
+    fields = (np.asarray(field) for field in (pixels.triangle, pixels.barycentric, pixels.slope))
+    points = texel_rays.PicturePoints(*fields, pixel // width, pixel % width)
+    return texel_rays.shares(mesh, caster(mesh).occluder, points, rays)
+
+
+# For each view, the traced texels: number of rays, a direction of each, and the shares.
+_VIEWS: collections.OrderedDict[int, tuple[Any, dict]] = collections.OrderedDict()
+_LOCK = threading.Lock()
+
+
+def _kept(
+    mesh: Mesh, pixels: Pixels, width: int, texel: Int[np.ndarray, " t"], rays: texel_rays.TexelRays
+) -> UInt8[np.ndarray, "t p"]:
+    """The shares of texels, of which only those are traced that were not traced before."""
+    rows = _rows_of(pixels.triangle)
+    new = [
+        number
+        for number, (own, direction, count) in enumerate(zip(texel, rays.direction, rays.count, strict=True))
+        if (row := rows.get(int(own))) is None or row[0] < _FEWER * count or not np.array_equal(row[1], direction)
+    ]
+    if new:
+        traced = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.count[new]))
+        for number, share in zip(new, traced, strict=True):
+            rows[int(texel[number])] = int(rays.count[number]), rays.direction[number], share
+        for old in list(rows)[: max(len(rows) - 4 * TEXELS, 0)]:
+            del rows[old]
+    return np.stack([rows[int(own)][2] for own in texel])
+
+
+def _rows_of(triangle: Any) -> dict:
+    key = id(triangle)
+    with _LOCK:
+        alive, rows = _VIEWS.get(key, (lambda: None, None))
+        if rows is None or alive() is not triangle:
+            rows = {}
+            _VIEWS[key] = weakref.ref(triangle), rows
+        _VIEWS.move_to_end(key)
+        while len(_VIEWS) > _KEPT:
+            _VIEWS.popitem(last=False)
+        return rows
