@@ -10,7 +10,7 @@ from jaxprt import visibility
 from jaxprt.scene import Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, join, make_mesh
 from jaxprt.scene.sides import two_sided
-from jaxprt.visibility import Occluder, blocks
+from jaxprt.visibility import Occluder, blocks, texel_rays
 
 SIZE = 8
 RAMP = np.array([[[0.0], [1.0]]], np.float32)  # opacity 2 u - 1/2, clamped: half of it is in each half of the sheet
@@ -116,3 +116,26 @@ def test_the_opacity_is_part_of_a_scenes_key_and_opaque_scenes_have_none():
 
 def test_a_part_that_is_not_there_stops_nothing():
     np.testing.assert_array_equal(seen(scene(alpha_mode="blend", alpha=0.0).mesh), seen(make_mesh(*GROUND)))
+
+
+def test_rays_from_pixels_pass_what_rays_of_vertices_pass():
+    random, count = np.random.default_rng(0), 500
+    spot = random.dirichlet([1, 1, 1], count)
+    way = np.array([[0, 1, 0], [0.3, 0.8, -0.1]], np.float32)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    rays = texel_rays.TexelRays(np.repeat(way[:, None], texel_rays.PLACES, 1), np.array([3, 2]))
+    points = texel_rays.PicturePoints(
+        np.arange(count) % 6, spot, np.zeros((count, 2, 3)), *np.divmod(np.arange(count), 9)
+    )
+    for field in ({"alpha_mode": "mask"}, {"alpha_mode": "blend"}, {"alpha_mode": "blend", "back": "lit"}):
+        mesh = two_sided(scene(**field)).mesh
+        occluder = Occluder(mesh)
+        share = texel_rays.shares(mesh, occluder, points, rays)
+        corner = np.asarray(mesh.position)[np.asarray(mesh.face)[points.triangle]]
+        place = np.einsum("pk,pki->pi", spot, corner).astype(np.float32) + np.array([0, 1e-6, 0], np.float32)
+        number, texel = np.tile(np.arange(count), 2), np.repeat(np.arange(2), count)
+        passed = occluder.passed(place, way, number, texel).reshape(2, count)
+        # A ray in a thousand may pass the edge of a hole on the other side.
+        assert np.mean(np.abs(share / 255 - passed) > 1 / 255) < 1e-3
+        assert np.mean(share < 255) > 0.1
+        assert np.any((share > 0) & (share < 255)) == (field["alpha_mode"] == "blend")
