@@ -19,6 +19,7 @@ from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
 from jaxprt.scene.scene import centered, numbered
+from jaxprt.scene.sides import two_sided
 
 # Rotations that bring an axis of the file to +y.
 UPRIGHT = {
@@ -142,7 +143,7 @@ def about(angle: float) -> Any:
 
 def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
     """The scene, its lights, and a camera that sees everything except the ground."""
-    looked, lit = centered(scene(options)), lights(options, size=size)
+    looked, lit = two_sided(centered(scene(options))), lights(options, size=size)
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
     # The board of the embedded scene and the ground may extend beyond the picture.
     alone = not told_apart(options.files)[0]

@@ -17,13 +17,14 @@ from jaxtyping import Array
 
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
+from jaxprt.image import layers
 from jaxprt.relit import regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
-from jaxprt.scene import Camera, Environment, Mesh, Scene
+from jaxprt.scene import Camera, Environment, Mesh, Scene, sides
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
 from jaxprt.systems.protocol import Blend, System
@@ -77,8 +78,9 @@ class Made(NamedTuple):
     cost: dict[str, Any]
 
     def color(self, light: Environment, eye: Array) -> Array:
-        """Radiance of all vertices under direct light."""
-        return protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
+        """Radiance of the vertices of the scene's file under direct light."""
+        color = protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
+        return color[self.direct.file_vertex] if isinstance(self.direct, relit.RelitScene) else color
 
     def view(self, camera: Camera, *, reflected: bool = False) -> PictureView | RegionsView:
         """The part of a picture that does not depend on the light, for direct light or with bounces."""
@@ -210,8 +212,16 @@ def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
 
 def visible(view: View) -> np.ndarray:
     """Indices of the triangles in the picture."""
-    triangle = np.unique(np.asarray(image.rasterize(view.scene.mesh, view.camera, samples=4).triangle))
+    triangle = np.unique(np.asarray(_points(view).triangle))
     return triangle[triangle >= 0]
+
+
+def _points(view: View) -> image.Pixels:
+    """The points of the picture."""
+    mesh = view.scene.mesh
+    hidden = sides.hidden_backs(view.scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
+    occluder = None if mesh.opacity is None else visibility.Occluder(mesh)
+    return layers.visible_points(mesh, view.camera, samples=4, hidden=hidden, occluder=occluder)
 
 
 def seen(view: View) -> list[np.ndarray]:
@@ -279,9 +289,8 @@ def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> 
 
 def reflect(view: View, system: str, made: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
     """Writes pictures that include interreflection. Returns its fraction of each picture's light."""
-    lights, camera, mesh = list(view.lights.values()), view.camera, view.scene.mesh
+    lights, camera, pixels = list(view.lights.values()), view.camera, _points(view)
     direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
-    pixels = image.shading_points(image.rasterize(mesh, camera, samples=4), mesh, camera)
     result = {}
     for name, light, first, both in zip(view.lights, lights, direct, whole, strict=True):
         _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), tone=view.tone)

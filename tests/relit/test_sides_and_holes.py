@@ -9,6 +9,7 @@ import jaxprt as prt
 from jaxprt.scene import Camera, Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, make_mesh
 from jaxprt.sphere import cubemap
+from jaxprt.systems.protocol import Blend
 
 SIZE = 16
 HALVES = Texture(np.array([[[0.0], [1.0]]], np.float32), np.eye(2, 3, dtype=np.float32), 0, ("clamp", "clamp"))
@@ -60,3 +61,24 @@ def test_a_hole_shows_the_background_and_the_rest_its_light(facing):
     _, seen = picture(sheet(3, 1), mask)
     np.testing.assert_allclose(seen[:, 10:], facing[:, 10:], atol=1e-4)
     np.testing.assert_allclose(seen[:, :7], np.broadcast_to([0.0, 1, 0], seen[:, :7].shape), atol=1e-6)
+
+
+def test_the_vertices_of_the_file_are_known_among_copies_and_added_ones():
+    leaf, ground = sheet(3, 1), sheet(2, 1)
+    above = dataclasses.replace(leaf, position=leaf.position * 0.3 + np.array([0.1, 0.2, 0.3], np.float32))
+    parts = [Part("leaf", above, dataclasses.replace(MATTE, back="lit")), Part("ground", ground, MATTE)]
+    options = {"system": "harmonic", "size": 8, "refine": 0.02, "vertices": 500, "progress": False}
+    relit = prt.precompute(Scene(parts), **options)
+    assert relit.division is not None
+    assert len(relit.mesh.position) > 18 + 4
+    file = np.concatenate([above.position, ground.position])
+    np.testing.assert_array_equal(np.asarray(relit.mesh.position)[relit.file_vertex], file)
+    first = relit.shading[0].blend
+    weight = np.asarray(first.weight)[:9] * np.linspace(0.1, 1, 9, dtype=np.float32)[:, None, None]
+    given = Blend(weight, tuple(np.asarray(each)[:9] for each in first.parameter))
+    spread = np.asarray(relit.appearances({"leaf": given})["leaf"].blend.weight)
+    place = [tuple(row) for row in np.asarray(relit.scene.parts[0].mesh.position).tolist()]
+    assert len(spread) == len(place)
+    for row, here in zip(spread, place, strict=True):  # the same on both sides
+        np.testing.assert_allclose(row, spread[place.index(here)], rtol=1e-5)
+    assert len(set(place)) == len(place) // 2
