@@ -11,6 +11,7 @@ from jaxtyping import Int
 from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.files import objects
+from jaxprt.relit import shadows
 from jaxprt.scene import Environment, Scene, subdivision
 from jaxprt.scene.subdivision import Division
 from jaxprt.visibility import blocks, refinement, shown
@@ -100,7 +101,7 @@ def divided(
         scene: The scene.
         wanted: Largest relative L2 error; True for the default, False to keep the meshes.
         vertices: Largest number of vertices; None for the default.
-        environments: Lights, as in `refine`.
+        environments: Lights, as in `refine`. Their brightest texels do not count, because pictures trace their shadows.
         folder: Folder in which the division is stored.
         progress: Whether to show a progress bar.
 
@@ -120,7 +121,8 @@ def divided(
         len(part.mesh.face) for part in scene.parts
     ):
         return scene, None
-    options = {"error": float(wanted), "vertices": most, "environments": environments, "progress": progress}
+    lights = None if environments is None else [shadows.untraced(light) for light in environments]
+    options = {"error": float(wanted), "vertices": most, "environments": lights, "progress": progress}
     division = _stored(scene, folder, options)
     return (subdivision.subdivide_scene(scene, division.steps), division) if division.face else (scene, None)
 

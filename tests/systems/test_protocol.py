@@ -197,7 +197,7 @@ def of_parts(name: str, model: str, **options) -> tuple[prt.System, Any]:
     """A scene whose parts are the regions of a mesh, all with one BRDF."""
     parts = [prt.Part(str(n), part, MODELS[model]) for n, part in enumerate(split(mesh(name)))]
     recipe = prt.relit.Lobes(lobes=6, texels=0)
-    return prt.precompute(prt.Scene(parts), system=recipe, size=SIZE, progress=False, **options), None
+    return prt.precompute(prt.Scene(parts), refine=False, system=recipe, size=SIZE, progress=False, **options), None
 
 
 def between_parts(name: str, model: str) -> tuple[prt.System, Any]:
