@@ -15,6 +15,7 @@ from jaxprt.relit import shadows
 from jaxprt.scene import Environment, Scene, subdivision
 from jaxprt.scene.subdivision import Division
 from jaxprt.visibility import blocks, refinement, shown
+from jaxprt.visibility.occluder import check
 
 ERROR = 0.015  # of pictures, by default
 _ROOM = 10_000  # vertices that division may add to a scene of few, by default
@@ -166,5 +167,6 @@ def _made(scene: Scene, key: str, options: dict) -> MeshDivision:
 
 def _divisions(scene: Scene, **options) -> tuple[list[Division], float]:
     mesh = scene.mesh
+    check(mesh, "mesh of the scene")
     views = shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
     return refinement.divisions(mesh, mesh, views=views, **options)
