@@ -42,7 +42,7 @@ RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 ONLY_IN = {
     "click": "jaxprt.cli",
     "embreex": "jaxprt.visibility.occluder",
-    "numba": ("jaxprt.visibility.packets", "jaxprt.scene.panorama_loops"),
+    "numba": ("jaxprt.visibility", "jaxprt.scene.panorama_loops"),
     "llvmlite": "jaxprt.visibility.packets",
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",

@@ -53,7 +53,12 @@ class Pixels(eqx.Module):
 
 @in_common_coordinates
 def shading_points(
-    fragments: Fragments, mesh: Mesh, camera: Camera, *, uneven: Bool[Array, " f"] | None = None
+    fragments: Fragments,
+    mesh: Mesh,
+    camera: Camera,
+    *,
+    uneven: Bool[Array, " f"] | None = None,
+    share: Float[Array, "h w s"] | None = None,
 ) -> Pixels:
     """Finds one shading point for each pixel and each surface that the pixel shows.
 
@@ -73,6 +78,8 @@ def shading_points(
         camera: The camera of the rasterization.
         uneven: Mask of triangles whose radiance varies so much within a pixel that each sample becomes a point; none if
             None.
+        share: Share from 0 to 1 of each sample that sees its triangle, or the background; all of it if None. Coverage
+            and background count it.
 
     Raises:
         ValueError: The fragments are of a picture of another size, or refer to triangles that the mesh does not have.
@@ -98,10 +105,14 @@ def shading_points(
     parts = []
     for sample in _numbers(members.ravel(), block):
         triangle, pixel, coverage, corner, step = _points(sample, members, fragments, mesh.face, projected)
+        if share is not None:
+            coverage = _shared(sample, members, share)
         linear = _linear(*corner)
         weight, rate = _weights(*linear, *step)
         parts.append((triangle, *_packed(triangle, weight, rate, *linear[1:]), pixel, coverage))
     triangle, barycentric, slope, pixel, coverage = _joined(parts)
+    if share is not None:
+        background = _empty_share(fragments, share)
     return Pixels(triangle, barycentric, slope, pixel, coverage, background)
 
 
@@ -341,6 +352,23 @@ def _points(
     row = (pixel // width).astype(dtype) + (1 - height) / 2 + start[:, 1]
     s, step = jnp.sign(q), (middle - start).T
     return triangle, pixel, coverage, (x - s * column, y - s * row, q), (step[0], step[1])
+
+
+@jit
+def _shared(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float[Array, "h w s"]) -> Float[Array, " p"]:
+    """Coverage of the surfaces that some samples represent, by the shares of their samples."""
+    samples = members.shape[1]
+    used, sample = sample >= 0, jnp.maximum(sample, 0)
+    member = jnp.where(used, members.ravel()[sample], 0)
+    own = share.reshape(-1, samples)[sample // samples]
+    bits = [jnp.where((member >> number) & 1, own[:, number], 0) for number in range(samples)]
+    return functools.reduce(jnp.add, bits) / samples
+
+
+@jit
+def _empty_share(fragments: Fragments, share: Float[Array, "h w s"]) -> Float[Array, "h w"]:
+    """Share of each pixel that sees no triangle."""
+    return jnp.mean(jnp.where(fragments.triangle.reshape(share.shape) < 0, share, 0), -1)
 
 
 def _affine(x, y, q):

@@ -86,6 +86,14 @@ def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
 
 @in_common_coordinates
 @jit
+def barycentric(triangle: Int[Array, "h w"], mesh: Mesh, camera: Camera) -> Float[Array, "h w 3"]:
+    """Barycentric coordinates of pixel centers in given triangles, perspective-correct; 0 where there is none (-1)."""
+    x, y, q = (axis[mesh.face.T] for axis in project(mesh.position, camera))
+    return _barycentric(triangle, x, y, q, camera)
+
+
+@in_common_coordinates
+@jit
 def front(fragments: Fragments, mesh: Mesh, camera: Camera) -> Bool[Array, "h w *s"]:
     """Whether each pixel or sample shows the front of a surface; backs are black. `front_faces` defines the front."""
     return front_faces(mesh, camera)[fragments.triangle] & (fragments.triangle >= 0)

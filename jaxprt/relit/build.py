@@ -18,7 +18,7 @@ from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
-from jaxprt.scene import Environment, Part, Scene
+from jaxprt.scene import Environment, Part, Scene, sides
 from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import UnfinishedError
@@ -48,7 +48,11 @@ def precompute(
 
     Meshes are divided first where visibility needs it, as `jaxprt.refine` does, because visibility is interpolated
     between vertices. All parts cast shadows on each other. Parts that emit light, and point lights, illuminate all
-    parts. Their colors and strengths may change after precomputation.
+    parts. Their colors and strengths may change after precomputation. Holes, opacity and backs are those of the scene's
+    materials.
+
+    Before that, parts with `back="lit"` get reversed copies of the faces whose backs can be seen
+    (`jaxprt.scene.sides.two_sided`). In `RelitScene.mesh` the copies of a part follow its vertices and faces.
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
@@ -94,6 +98,7 @@ def precompute(
         jaxprt.visibility.UnfinishedError: The share of this executor is done, but other shares are not.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    scene, copied = sides.with_copies(scene)
     _check_options(size, error, rate, environments, rays, path, executor)
     reflection.check(bounces)
     folder = None if path is None else pathlib.Path(path)
@@ -130,7 +135,8 @@ def precompute(
         target = Target(mesh, path=folder and folder / "scene", **options)
         reflected = reflection.make(shadings, place, bounces, target)
         lobes = reflection.lobes(shadings, place, systems) if rays else None
-    return RelitScene(scene, shadings, place, systems, reflected, lamps=lit, lobes=lobes, rays=rays, division=divided)
+    given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
+    return RelitScene(scene, shadings, place, systems, reflected, **given)
 
 
 def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:

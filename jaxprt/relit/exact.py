@@ -10,19 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
 from jaxprt.brdf import Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
-from jaxprt.image import Pixels, front, raster, rasterize, relative_l2, resolve, shading_points, skies
+from jaxprt.image import Pixels, front, raster, relative_l2, resolve, skies
+from jaxprt.image.layers import nearest_fragments, visible_points
 from jaxprt.relit.channels import Shading, at_points, exact_at
-from jaxprt.scene import Camera, Environment, Mesh, Scene, environment
+from jaxprt.scene import Camera, Environment, Mesh, Scene, environment, sides
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.scene.scene import centered
 from jaxprt.systems import reference
-from jaxprt.visibility import blocks
+from jaxprt.visibility import Occluder, blocks
 
 _SIDE = 4  # number of coverage places along the edge of a pixel
 _COARSE = 64  # largest number of points for each vertex at which radiance is interpolated between vertices
@@ -104,7 +105,8 @@ def exact_pixels(
     scene, camera = _near(scene, camera)
     mesh, lights = scene.mesh, Environment(jnp.stack([each.radiance for each in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
-    fragments = finished(rasterize(mesh, fine), between)
+    shown = {"hidden": _hidden_faces(scene, mesh), "occluder": None if mesh.opacity is None else Occluder(mesh)}
+    fragments = finished(nearest_fragments(mesh, fine, **shown), between)
     every = fragments.triangle, fragments.barycentric, front(fragments, mesh, fine)
     triangle, barycentric, seen = (_squares(np.asarray(each)) for each in every)
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
@@ -206,6 +208,11 @@ def exact_picture(
     return ExactPicture(asked, np.stack(pictures))
 
 
+def _hidden_faces(scene: Scene, mesh: Mesh) -> Bool[np.ndarray, " f"]:
+    """Triangles of the mesh of all parts that cameras do not see from behind."""
+    return sides.hidden_backs(scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
+
+
 def _near(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
     """The scene and the camera relative to the scene's origin."""
     return centered(scene), camera.local(scene.parts[0].mesh.origin)
@@ -258,7 +265,8 @@ class _Shown(NamedTuple):
     @classmethod
     def of(cls, scene: Scene, camera: Camera) -> "_Shown":
         mesh = scene.mesh
-        pixels = shading_points(rasterize(mesh, camera, samples=4), mesh, camera)
+        occluder = None if mesh.opacity is None else Occluder(mesh)
+        pixels = visible_points(mesh, camera, samples=4, hidden=_hidden_faces(scene, mesh), occluder=occluder)
         region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
         owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
         return cls(pixels, owner, face, np.cumsum([0, *(len(part.mesh.position) for part in scene.parts)])[:-1])

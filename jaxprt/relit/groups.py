@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
@@ -241,6 +241,7 @@ class Stage(eqx.Module):
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
+        hidden: Whether cameras see through the backs of each part.
     """
 
     whole: Mesh
@@ -254,6 +255,12 @@ class Stage(eqx.Module):
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
+    hidden: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def hidden_faces(self) -> Bool[Array | np.ndarray, " f"] | None:
+        """Triangles that cameras do not see from behind; None without."""
+        return None if not any(self.hidden) else faces_of(self.whole, np.asarray(self.hidden)[self.part])
 
     @property
     def face(self) -> Int[Array | np.ndarray, "f 3"]:
@@ -360,6 +367,13 @@ def alike(one: Shading, other: Shading) -> bool:
     return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in zip(*leaves, strict=True))
 
 
+def faces_of(mesh: Mesh, vertex: Bool[np.ndarray, " v"]) -> Bool[Array | np.ndarray, " f"]:
+    """What holds for the first vertex of each triangle, in NumPy unless JAX traces the mesh."""
+    if known(mesh.face):
+        return vertex[np.asarray(mesh.face)[:, 0]]
+    return jnp.asarray(vertex)[mesh.face[:, 0]]
+
+
 def joined_mesh(shadings: Sequence[Shading]) -> Mesh:
     """The meshes of several parts as one mesh, whose regions are the parts."""
     meshes = [shading.mesh for shading in shadings]
@@ -430,7 +444,7 @@ def padded(mesh: Mesh) -> Mesh:
         name: np.pad(value, [(0, count)] + [(0, 0)] * (value.ndim - 1), mode="edge") for name, value in fields.items()
     }
     face = np.pad(mesh.face, ((0, shared_size(len(mesh.face)) - len(mesh.face)), (0, 0)))
-    return put(dataclasses.replace(mesh, **rows, face=face, texture=None, origin=origins.ZERO))
+    return put(dataclasses.replace(mesh, **rows, face=face, texture=None, origin=origins.ZERO, opacity=None))
 
 
 @jit

@@ -15,9 +15,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
-from jaxprt.image import raster, rasterize, shading_points
+from jaxprt.image import raster
+from jaxprt.image.layers import visible_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import canvas, interpolation, shadows, tracing
+from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.shadows import TexelShares, TracedLight
 from jaxprt.relit.surface import Interpolated, Viewed, between, carried, from_texels, lit, view
@@ -352,10 +354,10 @@ def _placed(
     stage: Stage, camera: Camera, samples: int, between: Between
 ) -> tuple[Pixels, list[Row], tuple[tuple[int, ...], ...]]:
     """The points of a picture in rows that are shaded alike, and the parts of each group that are interpolated."""
-    fragments = finished(rasterize(stage.mesh, camera, samples=samples), between)
     uneven = interpolation.uneven(stage.mesh, camera, stage.bend)
-    pixels = shading_points(fragments, stage.mesh, camera, uneven=uneven)
-    finished(pixels, between)
+    occluder = None if stage.whole.opacity is None else caster(stage.whole).occluder
+    shown = {"hidden": stage.hidden_faces, "occluder": occluder, "uneven": uneven, "between": between}
+    pixels = visible_points(stage.mesh, camera, samples=samples, **shown)
     if not known(pixels, stage.mesh):
         return pixels, list(_traced_rows(stage, pixels)), ((),) * len(stage.surfaces)
     triangle = np.asarray(pixels.triangle)

@@ -25,7 +25,7 @@ from jaxprt.relit import channels, groups, refinement, reflection
 from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
-from jaxprt.scene import Environment, Scene
+from jaxprt.scene import Environment, Scene, sides
 from jaxprt.scene.scene import centered
 from jaxprt.visibility import blocks
 
@@ -185,7 +185,7 @@ def plan(
     asked = ERROR if error is None else error
     size, key = checked(environments, asked, rate), key_of(centered(scene), environments)
     options = {"vertices": None, "environments": None, "folder": None, "progress": progress}
-    scene = centered(refinement.divided(scene, refine, **options)[0])
+    scene = centered(refinement.divided(sides.two_sided(scene), refine, **options)[0])
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, plans = len(mesh.position), []
     looks = channels.looks(scene.parts)
@@ -208,7 +208,7 @@ def plan(
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
-    reflected = reflection.fractions(shadings, environments)
+    reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity)
     bounces = reflection.needed(reflected, asked)
     names = tuple(part.name for part in scene.parts)
     return Plan(names, tuple(plans), reflected, bounces, float(asked), float(rate), size, key)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import filelock
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -155,7 +156,9 @@ def _stored(scene: Scene, folder: pathlib.Path | None, options: dict) -> MeshDiv
 
 def _geometry(scene: Scene) -> list[np.ndarray]:
     mesh = scene.mesh
-    return [np.asarray(each) for each in (mesh.position, mesh.normal, mesh.face, mesh.region)]
+    return [np.asarray(each) for each in (mesh.position, mesh.normal, mesh.face, mesh.region)] + [
+        np.asarray(each) for each in jax.tree.leaves(mesh.opacity)
+    ]
 
 
 def _made(scene: Scene, key: str, options: dict) -> MeshDivision:

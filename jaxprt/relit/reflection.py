@@ -14,6 +14,7 @@ from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment
 from jaxprt.scene.mesh import frames
+from jaxprt.scene.opacity import Opacity
 from jaxprt.systems import bounces, harmonic
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
@@ -67,7 +68,9 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
     of_group = [paths.factored(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
     region, members = _regions(place, typical)
-    mesh = dataclasses.replace(joined_mesh(shadings), region=np.repeat(region, place.counts))
+    mesh = dataclasses.replace(
+        joined_mesh(shadings), region=np.repeat(region, place.counts), opacity=target.occluder.opacity
+    )
     sent = [of_group[place.group[parts[0]]] for parts in members]
     weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in members]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
@@ -149,7 +152,9 @@ def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
     return bool(traced.is_sharp(table))
 
 
-def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) -> Float[np.ndarray, "b p"]:
+def fractions(
+    shadings: Sequence[Shading], environments: Sequence[Environment], *, opacity: Opacity | None = None
+) -> Float[np.ndarray, "b p"]:
     """Estimates the fraction of each part's radiance that surfaces reflected at least once, twice and three times.
 
     The estimate treats all surfaces as diffuse, with the mean albedo of their parts.
@@ -157,11 +162,13 @@ def fractions(shadings: Sequence[Shading], environments: Sequence[Environment]) 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments. The result is the largest fraction under any of them.
+        opacity: Opacity of the vertices of all parts; None if all are opaque.
 
     Returns:
         Relative L2 fraction for each number of bounces (rows) and part (columns).
     """
-    mesh, albedo = joined_mesh(shadings), np.stack([paths.albedo(each) for each in shadings])
+    mesh = dataclasses.replace(joined_mesh(shadings), opacity=opacity)
+    albedo = np.stack([paths.albedo(each) for each in shadings])
     options = {"size": _REFLECTED, "progress": False}
     direct = harmonic.precompute_diffuse(mesh, degree=_DEGREE, size=_DIRECT, progress=False)
     each = [direct.vector]

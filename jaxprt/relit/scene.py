@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
-from jaxprt.image import automatic_exposure, rasterize
+from jaxprt.image import automatic_exposure, layers
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
+from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Shading, appearance
 from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surface
 from jaxprt.relit.lamps import SceneLamps
@@ -25,7 +26,7 @@ from jaxprt.relit.recipes import samples_of
 from jaxprt.relit.refinement import MeshDivision
 from jaxprt.relit.surface import combine, view_of
 from jaxprt.relit.tracing import Reflections
-from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, subdivision
+from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, sides, subdivision
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
@@ -87,6 +88,7 @@ class RelitScene(System):
         sharp: Whether reflections of each part are traced.
         rays: Number of reflection rays that each vertex or point of a sharp part sends.
         division: How the meshes were divided; None for the meshes as they were.
+        copied: For each part, the vertices of the file that have a copy for their back. The copies follow the file's.
     """
 
     scene: Scene
@@ -107,6 +109,7 @@ class RelitScene(System):
     sharp: tuple[bool, ...] = eqx.field(static=True)
     rays: int = eqx.field(static=True)
     division: MeshDivision | None
+    copied: tuple[Int[np.ndarray, " _"], ...]
 
     def __init__(
         self,
@@ -120,6 +123,7 @@ class RelitScene(System):
         lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
         division: MeshDivision | None = None,
+        copied: Sequence[Int[np.ndarray, " _"]] | None = None,
     ):
         """Joins the parts.
 
@@ -134,9 +138,11 @@ class RelitScene(System):
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
             division: How the meshes of the scene were divided; None if they were not.
+            copied: For each part, the vertices that `sides.with_copies` has copied; None for none.
         """
         tracing.check_rays(rays)
         self.division = division
+        self.copied = (np.zeros(0, np.int64),) * len(scene.parts) if copied is None else tuple(copied)
         # Values that are not arrays cannot be arguments of a jitted function.
         parts = [
             part
@@ -171,22 +177,24 @@ class RelitScene(System):
 
     @property
     def file_vertex(self) -> Int[np.ndarray, " _"]:
-        """Index in `mesh` of each vertex of the scene before its meshes were divided, part by part."""
-        own = [np.arange(count) for count in self._file_counts()]
+        """Index in `mesh` of each vertex of the scene before backs were copied and meshes divided, part by part."""
+        own = [np.arange(count - len(copies)) for count, copies in zip(self._whole_counts(), self.copied, strict=True)]
         return np.concatenate([first + index for first, index in zip(self.place.first, own, strict=True)])
 
-    def _file_counts(self) -> list[int]:
-        """Number of vertices of each part before its mesh was divided."""
+    def _whole_counts(self) -> list[int]:
+        """Number of vertices of each part with copies for its back, before its mesh was divided."""
         return list(self.place.counts if self.division is None else self.division.counts)
 
     def _divided(self, number: int, given: Blend | Appearance) -> Blend | Appearance:
-        """Materials at the vertices of a part, interpolated to the added vertices if they are of the file's."""
-        count = self._file_counts()[number]
+        """Materials at the vertices of a part, copied and interpolated to the added ones if they are of the file's."""
+        counts, copies = self._whole_counts(), self.copied[number]
+        count = counts[number] - len(copies)
         rows = {len(leaf) for leaf in jax.tree.leaves(given) if np.ndim(leaf)}
-        if self.division is None or count == self.place.counts[number] or rows != {count}:
+        if count == self.place.counts[number] or rows != {count}:
             return given
-        parents = subdivision.part_parents(self._file_counts(), self.division.parent)[number]
-        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf, parents)), given)
+        parents = [] if self.division is None else subdivision.part_parents(counts, self.division.parent)[number]
+        source = np.concatenate([np.arange(count), copies])
+        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), given)
 
     @property
     def direct(self) -> "RelitScene":
@@ -341,6 +349,7 @@ class RelitScene(System):
             samples,
             sharp,
             lamp,
+            tuple(sides.hidden_backs(self.scene).tolist()),
         )
 
     def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:
@@ -506,9 +515,11 @@ class RelitScene(System):
         """
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
-        fragments = rasterize(self.drawn, camera.local(self.mesh.origin), samples=samples)
-        seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
-        return seen if seen.ndim == 2 else jnp.mean(seen, -1)
+        backs = sides.hidden_backs(self.scene)
+        hidden = groups.faces_of(self.mesh, np.repeat(backs, self.place.counts)) if backs.any() else None
+        occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
+        options = {"samples": samples, "hidden": hidden, "occluder": occluder}
+        return layers.coverage(self.drawn, camera.local(self.mesh.origin), **options)
 
     @promoted
     def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:

@@ -179,9 +179,13 @@ def _seen_lamps(chord: Array, met: Array, weight: Array, concentration: Array) -
     return jnp.einsum("njv,jvc->nvc", share, weight, precision="highest")
 
 
-@jit
 def facing(mesh: Mesh, eye: Float[Array, "3"]) -> Float[Array, " v"]:
     """1 for vertices of a triangle whose front faces the eye, 0 for others."""
+    return _facing(mesh if mesh.opacity is None else dataclasses.replace(mesh, opacity=None), eye)
+
+
+@jit
+def _facing(mesh: Mesh, eye: Float[Array, "3"]) -> Float[Array, " v"]:
     a, b, c = (mesh.position[mesh.face[:, k]] for k in range(3))
     across = jnp.cross(b - a, c - a)
     side = jnp.sum(across * jnp.sum(mesh.normal[mesh.face], 1), -1)

@@ -56,7 +56,7 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
             remedy = "it encloses the scene, so give a camera inside of it"
         warnings.warn(
             f"a camera at {tuple(np.round(np.asarray(camera.eye, float), 3).tolist())} sees {np.mean(seen):.0%} of "
-            f"part {part.name!r} from behind, and backs are black: {remedy}",
+            f"part {part.name!r} from behind, and {_backs(part)}: {remedy}",
             stacklevel=3,
         )
 
@@ -99,6 +99,12 @@ def enclosing(scene: Scene) -> list[int]:
 
 def _has_lamps(scene: Scene) -> bool:
     return bool(scene.point_lights) or any(_emits(part) for part in scene.parts)
+
+
+def _backs(part: Part) -> str:
+    """What cameras see of the backs of a part."""
+    hidden = isinstance(part.material, TexturedMaterial) and part.material.back != "black"
+    return "its material hides backs" if hidden else "backs are black"
 
 
 def _emits(part: Part) -> bool:

@@ -103,7 +103,9 @@ def in_common_coordinates(function: Function) -> Function:
             exact = any(isinstance(position, np.ndarray) for position in (camera.eye, camera.target))
             arguments["camera"] = camera.local(tuple(np.asarray(camera.eye, float).tolist())) if exact else camera
         elif isinstance(arguments["mesh"], Mesh):
-            arguments["mesh"], arguments["camera"] = localized(arguments["mesh"], camera)
+            mesh, arguments["camera"] = localized(arguments["mesh"], camera)
+            # Opacity is for rays; programs for all scenes are the same.
+            arguments["mesh"] = mesh if mesh.opacity is None else dataclasses.replace(mesh, opacity=None)
         return function(*bound.args, **bound.kwargs)
 
     return cast(Function, moved)

@@ -14,6 +14,8 @@ from jaxprt.compile import jit
 from jaxprt.scene import texture
 
 _COLORS = "base_color", "emissive", "specular_color"
+ALPHA_MODES = "opaque", "mask", "blend"
+BACKS = "black", "hidden", "lit"
 
 
 def _scalar(value: Any) -> Any:
@@ -130,10 +132,17 @@ class TexturedMaterial(eqx.Module):
         clearcoat_texture: Texture [h w 1] that multiplies `clearcoat`.
         clearcoat_roughness_texture: Texture [h w 1] that multiplies `clearcoat_roughness`.
         transmission_texture: Texture [h w 1] that multiplies `transmission`.
+        alpha: Opacity, from 0 for a surface that is not there to 1. Ignored if `alpha_mode` is "opaque".
+        alpha_texture: Texture [h w 1] that multiplies `alpha`.
+        alpha_cutoff: Opacity from which on a surface is there, for "mask"; at least 0. It is absent below.
+        alpha_mode: "opaque"; "mask" for a surface with holes; or "blend" for one that hides the share `alpha` of
+            what is behind it, and stops that share of light.
+        back: What cameras see of the back of the surface: "black"; "hidden" for nothing, so that they see what is
+            behind it; or "lit" for the same material. Backs cast shadows in all cases.
 
     Raises:
         TypeError: A texture is an array, not a `Texture`.
-        ValueError: A factor is not finite or out of its range.
+        ValueError: A factor is not finite or out of its range, or `alpha_mode` or `back` is another word.
 
     Reference: Khronos glTF 2.0 specification, section 3.9 and appendix B; its extensions KHR_materials_ior,
     KHR_materials_specular, KHR_materials_anisotropy, KHR_materials_emissive_strength, KHR_materials_clearcoat and
@@ -164,17 +173,29 @@ class TexturedMaterial(eqx.Module):
     clearcoat_texture: Texture | None = None
     clearcoat_roughness_texture: Texture | None = None
     transmission_texture: Texture | None = None
+    alpha: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    alpha_texture: Texture | None = None
+    alpha_cutoff: Float[Array, ""] = eqx.field(converter=_scalar, default=0.5)
+    alpha_mode: str = eqx.field(static=True, default="opaque")
+    back: str = eqx.field(static=True, default="black")
 
     def __check_init__(self):
         """Refuses factors that are not finite or out of their range."""
+        for name, words in (("alpha_mode", ALPHA_MODES), ("back", BACKS)):
+            if getattr(self, name) not in words:
+                raise ValueError(
+                    f"{name} of TexturedMaterial must be one of {', '.join(words)}, got {getattr(self, name)!r}"
+                )
         layers = "clearcoat", "clearcoat_roughness", "transmission"
-        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", *layers):
+        for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", "alpha", *layers):
             require.within(f"{name} of TexturedMaterial", getattr(self, name), 0, 1)
-        for name in ("emissive", "specular_color", "ior"):
+        for name in ("emissive", "specular_color", "ior", "alpha_cutoff"):
             require.at_least(f"{name} of TexturedMaterial", getattr(self, name), 0.0)
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
         for name, value in vars(self).items():
+            if isinstance(value, str):
+                continue
             if not name.endswith("_texture"):
                 shape = (3,) if name in _COLORS else ()
                 if jnp.shape(value) != shape:

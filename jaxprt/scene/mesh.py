@@ -18,6 +18,7 @@ from jaxprt.scene import origin as origins
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry, rows_of
 from jaxprt.scene.normals import vertex_normals
+from jaxprt.scene.opacity import Opacity
 from jaxprt.sphere import directions
 
 _GAP = 5e-4  # gap above the ground, relative to the diagonal; larger than the offset of ray origins
@@ -40,6 +41,7 @@ class Mesh(eqx.Module):
             from zero than 64 times its size, as at map coordinates, which float32 would round. Scenes, cameras, lamps,
             pictures and `reference.radiance` keep the coordinates of the file. Systems that were precomputed for a mesh
             take eyes relative to the origin.
+        opacity: Opacity of the vertices for rays and pictures; None if all are opaque. `jaxprt.Scene.mesh` has it.
     """
 
     position: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
@@ -49,6 +51,7 @@ class Mesh(eqx.Module):
     region: Int[Array, " v"] = eqx.field(converter=mesh_arrays.as_array)
     texture: Float[Array, "v 2"] | None = eqx.field(converter=mesh_arrays.as_array, default=None)
     origin: origins.Origin = eqx.field(static=True, default=origins.ZERO)
+    opacity: Opacity | None = None
 
     def __check_init__(self):
         """Refuses arrays of other types and lengths. `make_mesh` and `jaxprt.Part` check values too."""
@@ -94,9 +97,9 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
 
 def from_file(geometry: Geometry, path: pathlib.Path) -> Mesh:
     """A mesh from the geometry of a file, with the normals and checks of `load_mesh`."""
-    position, face, normal, tangent, _, texture, _, _, region = geometry
-    welded = path.suffix.lower() != ".stl"
-    return _make(position, face, normal, tangent, region, texture, name=str(path), welded=welded)
+    frame, welded = (geometry.normal, geometry.tangent), path.suffix.lower() != ".stl"
+    fields = geometry.position, geometry.face, *frame, geometry.region, geometry.texture
+    return _make(*fields, name=str(path), welded=welded)
 
 
 def make_mesh(
@@ -238,7 +241,7 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
         for each in (mesh.position, mesh.normal, mesh.tangent)
     )
     x, y, z = (matrix @ np.asarray(mesh.origin)).tolist()
-    return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z))
+    return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z), mesh.opacity)
 
 
 @require.arguments(mesh=mesh_arrays.check_mesh, direction=partial(require.real, "direction"))

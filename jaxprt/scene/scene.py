@@ -1,6 +1,7 @@
 """Scenes: meshes with materials, cameras, and lights."""
 
 import collections
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.scene import mesh as meshes
-from jaxprt.scene import mesh_arrays
+from jaxprt.scene import mesh_arrays, part_opacity
 from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
@@ -38,6 +39,7 @@ class Part(eqx.Module):
         second: Second set of texture coordinates (`Mesh.texture` is the first); None if there is none.
         handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; None
             for 1 everywhere.
+        alpha: Opacity of the vertices, from 0 to 1, which multiplies that of the material; None for 1.
 
     Raises:
         TypeError: The name is not a string, the mesh is not a `Mesh`, or the material is neither a `TexturedMaterial`
@@ -52,6 +54,7 @@ class Part(eqx.Module):
     color: Float[Array, "v 3"] | None = eqx.field(converter=require.floating, default=None)
     second: Float[Array, "v 2"] | None = eqx.field(converter=require.floating, default=None)
     handedness: Float[Array, " v"] | None = eqx.field(converter=require.floating, default=None)
+    alpha: Float[Array, " v"] | None = eqx.field(converter=require.floating, default=None)
 
     def __check_init__(self):
         """Refuses a wrong type of name or mesh, a mesh without vertices, and arrays of other vertices."""
@@ -66,17 +69,19 @@ class Part(eqx.Module):
             raise ValueError(
                 f"part {self.name!r} must have vertices and faces, got {count} vertices and {len(self.mesh.face)} faces"
             )
-        for name in ("color", "second", "handedness"):
+        for name in ("color", "second", "handedness", "alpha"):
             value = getattr(self, name)
             if value is not None:
                 require.real(f"{name} of part {self.name!r}", value)
                 require.length(f"rows of {name} of part {self.name!r}", value, count)
-                shape = {"color": (count, 3), "second": (count, 2), "handedness": (count,)}[name]
+                shape = {"color": (count, 3), "second": (count, 2)}.get(name, (count,))
                 if jnp.shape(value) != shape:
                     raise ValueError(
                         f"{name} of part {self.name!r} must be {list(shape)}, got {list(jnp.shape(value))}"
                     )
                 require.finite(f"{name} of part {self.name!r}", value)
+        if self.alpha is not None:
+            require.within(f"alpha of part {self.name!r}", self.alpha, 0, 1)
         if not isinstance(self.material, TexturedMaterial):
             if not callable(self.material):
                 got = type(self.material).__name__
@@ -254,14 +259,17 @@ class Scene(eqx.Module):
     def mesh(self) -> Mesh:
         """All parts joined into one mesh. It is computed at each access.
 
-        Regions are the indices of the parts, so `mesh.split` takes the mesh apart again.
+        Regions are the indices of the parts, so `mesh.split` takes the mesh apart again. Parts with holes and
+        translucent ones give it its `opacity`.
         """
-        return meshes.join(
+        whole = meshes.join(
             [
                 eqx.tree_at(lambda each: each.region, part.mesh, np.zeros(len(part.mesh.position), np.int32))
                 for part in self.parts
             ]
         )
+        opacity = part_opacity.of_parts(self.parts)
+        return whole if opacity is None else dataclasses.replace(whole, opacity=opacity)
 
 
 def centered(scene: Scene) -> Scene:

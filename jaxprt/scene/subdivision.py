@@ -309,11 +309,12 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
 
 def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
     """The part with added vertices, each between two earlier ones."""
-    color, second = (
-        None if each is None else jax.device_put(spread(each, parents)) for each in (part.color, part.second)
+    color, second, alpha = (
+        None if each is None else jax.device_put(spread(each, parents))
+        for each in (part.color, part.second, part.alpha)
     )
     handedness = None if part.handedness is None else jax.device_put(_first(part.handedness, parents))
-    return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness)
+    return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness, alpha)
 
 
 def spread(value: Any, parents: Sequence[np.ndarray]) -> Any:

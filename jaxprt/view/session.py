@@ -16,12 +16,13 @@ from jaxtyping import Bool, Float
 
 from jaxprt import require
 from jaxprt.image import display, render, sky
+from jaxprt.image.layers import seen_from_front
 from jaxprt.image.tone_curves import TONES
 from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, load_environment
+from jaxprt.scene import Environment, load_environment, sides
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
 from jaxprt.view.messages import Lamp, Look, Reply
@@ -118,7 +119,8 @@ class Session:
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         behind = sky(self.stages.lights[0], camera)
-        return np.asarray(display(render(scene.mesh, color, camera, background=behind)))
+        mesh = seen_from_front(scene.mesh, camera, self._hidden_faces())
+        return np.asarray(display(render(mesh, color, camera, background=behind)))
 
     def sky(self, number: int, lamps: tuple[Lamp, ...] = (), *, rows: int) -> Reply:
         """Pictures of a light before rotation, as `Stages.sky` makes them, in half floats one after another."""
@@ -126,6 +128,11 @@ class Session:
         height, width, _ = levels[0].shape
         data, scale = messages.encode(np.concatenate([level.reshape(-1, 3) for level in levels]), stops=None)
         return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
+
+    def _hidden_faces(self) -> Bool[np.ndarray, " f"]:
+        """Triangles that cameras do not see from behind."""
+        mesh = self.stages.scene.mesh
+        return sides.hidden_backs(self.stages.scene.scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
 
     def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         scene = self.stages.scene
@@ -149,7 +156,10 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        arrays = np.asarray(mesh.position, "<f4"), stages.counterclockwise(mesh)
+        hidden, face = self._hidden_faces(), stages.counterclockwise(mesh)
+        # Those with black backs come first: of the others the viewer draws no backs.
+        content["backs"] = int(np.count_nonzero(~hidden))
+        arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
         return Reply(content, [each.tobytes() for each in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:

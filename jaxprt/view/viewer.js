@@ -159,7 +159,7 @@ class Drawing {
     this.skyImage = null;
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
-  setMesh(position, face) {
+  setMesh(position, face, backs) { // of faces after the first `backs` no backs are seen
     const gl = this.gl;
     gl.bindVertexArray(this.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.position);
@@ -169,6 +169,7 @@ class Drawing {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.index);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face, gl.STATIC_DRAW);
     this.count = face.length;
+    this.backs = 3 * (backs ?? face.length / 3);
     this.colored = false;
   }
   setColor(data, encoded, scale) {
@@ -246,7 +247,7 @@ class Drawing {
       gl.enable(gl.POLYGON_OFFSET_FILL);
       gl.polygonOffset(2, 4);
       gl.cullFace(gl.FRONT);
-      gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
+      gl.drawElements(gl.TRIANGLES, this.backs, gl.UNSIGNED_INT, 0);
       gl.disable(gl.POLYGON_OFFSET_FILL);
       gl.cullFace(gl.BACK);
       gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
@@ -476,7 +477,7 @@ export function mount(root, ask) {
       camera ??= new Camera(scene);
       state.system ||= Object.keys(scene.systems)[0];
       state.bounces = scene.systems[state.system].bounces;
-      drawing.setMesh(scene.position, scene.face);
+      drawing.setMesh(scene.position, scene.face, scene.backs);
       controls = panelOf(panel, scene, state, { set, expose, map, moved });
       controls.show();
       resize();
@@ -491,7 +492,7 @@ export function mount(root, ask) {
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); if (!closed) tell("the graphics context was lost; it comes back by itself"); });
   canvas.addEventListener("webglcontextrestored", () => {
     drawing.build();
-    if (scene) drawing.setMesh(scene.position, scene.face);
+    if (scene) drawing.setMesh(scene.position, scene.face, scene.backs);
     skyKey = {};
     moved();
   });

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
 
+import jax
 import numpy as np
 import tqdm
 from threadpoolctl import threadpool_limits
@@ -212,10 +213,11 @@ def fingerprint(*array: Any) -> str:
 def scene_key(mesh: Mesh) -> str:
     """Fingerprint of a mesh: its positions, normals, faces and regions. Results of the same mesh have the same key.
 
-    Tangents do not count, and neither do the element types of the arrays.
+    Tangents do not count, and neither do the element types of the arrays. The opacity counts where there is one.
     """
     single = [np.asarray(each, np.float32) for each in (mesh.position, mesh.normal)]
-    return fingerprint(*single, *(np.asarray(each, np.int32) for each in (mesh.face, mesh.region)))
+    whole = [np.asarray(each, np.int32) for each in (mesh.face, mesh.region)]
+    return fingerprint(*single, *whole, *jax.tree.leaves(mesh.opacity))
 
 
 def _run(job, todo, keep, store, executor, bar) -> None:

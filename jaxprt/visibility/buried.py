@@ -59,6 +59,14 @@ def _normals(occluder: Occluder) -> Float32[np.ndarray, "f 3"]:
     return np.cross(b - a, c - a)
 
 
+def _hit(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first triangle on each ray, -1 for none, and its distance. Of the two sides of a sheet no ray hits a back."""
+    triangle, distance, weight = occluder.hit(start, way)
+    met = np.flatnonzero(triangle >= 0)
+    triangle[met] = occluder.toward(triangle[met], way[met], weight[met])[0]
+    return triangle, distance
+
+
 def _inside(occluder: Occluder, facing: np.ndarray, start: np.ndarray, out: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Whether points are inside of solids. Most points are told by the first ray."""
     number = np.arange(_RAYS) + 0.5
@@ -72,7 +80,7 @@ def _inside(occluder: Occluder, facing: np.ndarray, start: np.ndarray, out: np.n
     other = np.cross(out, side)
     for x, y, z in local:
         way = x * side[hidden] + y * other[hidden] + z * out[hidden]
-        triangle, _, _ = occluder.hit(start[hidden], way)
+        triangle = _hit(occluder, start[hidden], way)[0]
         back = np.sum(facing[triangle] * way, 1) > 0
         behind[hidden] += back & (triangle >= 0)
         hidden = hidden[triangle >= 0]
@@ -109,7 +117,7 @@ def _outside(
     reached = np.full(len(origin), np.inf, np.float32)
     active = np.flatnonzero(length > 4 * offset)
     for _ in range(_CROSSINGS):
-        triangle, distance, _ = occluder.hit(place[active], way[active])
+        triangle, distance = _hit(occluder, place[active], way[active])
         step = distance + 2 * offset[active]
         on_way = (triangle >= 0) & (travelled[active] + step < length[active])
         active, triangle, step = active[on_way], triangle[on_way], step[on_way]

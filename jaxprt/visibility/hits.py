@@ -65,6 +65,7 @@ def first_fronts(
     """
     triangle, _, barycentric = occluder.hit(start, direction)
     met = np.flatnonzero(triangle >= 0)
+    triangle[met], barycentric[met] = occluder.toward(triangle[met], direction[met], barycentric[met])
     triangle[met[~front(occluder, normal, occluder.face[triangle[met]], direction[met])]] = -1
     weight = np.clip(barycentric, 0, 1)
     return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

@@ -21,11 +21,12 @@ class Occluder:
     """Triangles that cast shadows, as an Embree scene.
 
     Args:
-        mesh: The triangles. Degenerate ones cast no shadow.
+        mesh: The triangles. Degenerate ones cast no shadow. Those with an opacity stop as much light as it says.
 
     Attributes:
         position: Positions of the vertices.
         face: Vertex indices of each triangle.
+        opacity: Opacity of the vertices; None if all are opaque.
         diagonal: Diagonal of the bounding box of all triangles.
         offset: Distance from each triangle at which rays start, from `offsets`.
 
@@ -38,6 +39,7 @@ class Occluder:
         check(mesh, "occluder")
         self.position = np.asarray(mesh.position, np.float32)
         self.face = np.asarray(mesh.face, np.int32)
+        self.opacity = mesh.opacity
         used = self.position[self.face.ravel()]
         low, high = used.min(0), used.max(0)
         self.diagonal = float(np.linalg.norm(high.astype(np.float64) - low)) or 1.0
@@ -64,11 +66,32 @@ class Occluder:
 
         return packets.Packets(self.position, self.face) if packets.available() else None
 
-    @cached_property
-    def _twin(self) -> np.ndarray:
-        """For each face, the corners of the coincident face of opposite orientation, in the order of its own corners.
+    def _alpha(self, **options: bool):
+        from jaxprt.visibility.alpha_packets import AlphaPackets
 
-        A face without such a partner keeps its own corners. Which of the two a ray hits is arbitrary.
+        assert self.opacity is not None
+        return AlphaPackets(self.position, self.face, self.opacity, **options)
+
+    @cached_property
+    def _partial(self):
+        """The Embree scene for rays that pass holes and translucent surfaces."""
+        return self._alpha()
+
+    @cached_property
+    def translucent(self):
+        """The triangles that are not opaque alone, as `jaxprt.visibility.alpha_packets.AlphaPackets`."""
+        return self._alpha(clear_only=True)
+
+    @property
+    def blends(self) -> bool:
+        """Whether some surfaces stop a share of the light, so that `passed` says more than `blocked`."""
+        return self.opacity is not None and self.opacity.blends
+
+    @cached_property
+    def _twin(self) -> tuple[np.ndarray, np.ndarray]:
+        """For each face, the coincident face of opposite orientation, and its corners in the order of its own corners.
+
+        A face without such a partner is its own. Which of the two a ray hits is arbitrary.
         """
         _, place = np.unique(self.position, axis=0, return_inverse=True)
         at = place.reshape(-1)[self.face]
@@ -84,7 +107,7 @@ class Occluder:
         found = np.where((other >= 0)[:, None], corner[other], corner)
         result = np.empty_like(self.face)
         np.put_along_axis(result, order, found, 1)
-        return result
+        return np.where(other >= 0, other, np.arange(len(other))), result
 
     def facing(
         self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
@@ -95,10 +118,36 @@ class Occluder:
             triangle: Indices of the triangles.
             direction: Directions of the rays.
         """
-        corner = self.face[triangle]
-        a, b, c = (self.position[corner[:, each]] for each in range(3))
-        back = np.sum(np.cross(b - a, c - a) * direction, -1) > 0
-        return np.where(back[:, None], self._twin[triangle], corner)
+        return np.where(self._away(triangle, direction)[:, None], self._twin[1][triangle], self.face[triangle])
+
+    def toward(
+        self,
+        triangle: Integer[np.ndarray, " n"],
+        direction: Float32[np.ndarray, "n 3"],
+        barycentric: Float32[np.ndarray, "n 3"],
+    ) -> tuple[Integer[np.ndarray, " n"], Float32[np.ndarray, "n 3"]]:
+        """The triangles that rays hit and where. Of two coincident faces it takes the one that faces the ray.
+
+        Args:
+            triangle: Indices of the triangles.
+            direction: Directions of the rays.
+            barycentric: Barycentric coordinates of the hits.
+        """
+        away = np.flatnonzero(self._away(triangle, direction))
+        if not away.size:
+            return triangle, barycentric
+        partner, corner = (each[triangle[away]] for each in self._twin)
+        same = self.face[partner][:, :, None] == corner[:, None]
+        triangle, barycentric = triangle.copy(), barycentric.copy()
+        triangle[away], barycentric[away] = partner, np.einsum("nij,nj->ni", same, barycentric[away])
+        return triangle, barycentric
+
+    def _away(
+        self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether rays hit triangles from behind, by the order of their corners."""
+        a, b, c = (self.position[self.face[triangle, each]] for each in range(3))
+        return np.sum(np.cross(b - a, c - a) * direction, -1) > 0
 
     def blocked(
         self,
@@ -109,7 +158,8 @@ class Occluder:
     ) -> Bool[np.ndarray, " n"]:
         """Whether each ray hits a triangle. Releases the global interpreter lock.
 
-        It is fastest if every sixteen consecutive rays have nearby origins and similar directions.
+        It is fastest if every sixteen consecutive rays have nearby origins and similar directions. Translucent surfaces
+        stop a ray with the probability that its light is stopped, by a hash of its origin and direction.
 
         Args:
             origin: Origins in world units.
@@ -118,12 +168,24 @@ class Occluder:
             way: Index of each ray's direction in `direction`.
         """
         with self._building:
-            packed = self._packed
+            packed = self._packed if self.opacity is None else self._partial
         if packed is not None:
             return packed.blocked(origin, direction, point, way)
         with self._building:
             single = self._single
         return single.run(origin.take(point, axis=0), direction.take(way, axis=0), query="OCCLUDED") == 0
+
+    def passed(
+        self,
+        origin: Float32[np.ndarray, "m 3"],
+        direction: Float32[np.ndarray, "d 3"],
+        point: Integer[np.ndarray, " n"],
+        way: Integer[np.ndarray, " n"],
+    ) -> Float32[np.ndarray, " n"]:
+        """Share of light that passes along each ray, for an occluder that `blends`. `blocked` has the arguments."""
+        with self._building:
+            partial = self._partial
+        return partial.passed(origin, direction, point, way)
 
     def shares(
         self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
@@ -134,13 +196,24 @@ class Occluder:
             RuntimeError: The Embree library that embreex ships has no packets of rays.
         """
         with self._building:
-            packed = self._packed
+            packed = self._packed if self.opacity is None else self._partial
         if packed is None:
             raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
         packed.shares(surface, points, texels, part, share)
 
-    def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
-        """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates."""
+    def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
+        """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.
+
+        Args:
+            origin: Origins of the rays.
+            direction: Their unit directions.
+            solid: Whether surfaces with an opacity count as opaque. Otherwise rays pass holes, and translucent surfaces
+                stop a ray with the probability of their opacity, by a hash of the ray.
+        """
+        if self.opacity is not None and not solid:
+            with self._building:
+                partial = self._partial
+            return partial.hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
         with self._building:
             single = self._single
         found = single.run(origin, direction, query="INTERSECT", output=True)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import llvmlite.ir
 import numba
@@ -25,8 +25,8 @@ _ROBUST = 1 << 2
 _TRIANGLES = 0
 _INDEX, _VERTEX = 0, 1
 _UINT3, _FLOAT3 = 0x5003, 0x9003
-_COHERENT = 1 << 16
-_EVERY_FEATURE = 0xFFFFFFFF
+COHERENT = 1 << 16
+EVERY_FEATURE = 0xFFFFFFFF
 _NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # places of ray origins in a pixel, from its center
@@ -37,6 +37,9 @@ _PROTOTYPES = {
     "rtcSetSceneFlags": (None, [_POINTER, _INT]),
     "rtcNewGeometry": (_POINTER, [_POINTER, _INT]),
     "rtcSetNewGeometryBuffer": (_POINTER, [_POINTER, _INT, _UINT, _INT, _SIZE, _SIZE]),
+    "rtcSetGeometryUserData": (None, [_POINTER, _POINTER]),
+    "rtcSetGeometryIntersectFilterFunction": (None, [_POINTER, _POINTER]),
+    "rtcSetGeometryOccludedFilterFunction": (None, [_POINTER, _POINTER]),
     "rtcCommitGeometry": (None, [_POINTER]),
     "rtcAttachGeometry": (_UINT, [_POINTER, _POINTER]),
     "rtcReleaseGeometry": (None, [_POINTER]),
@@ -59,31 +62,15 @@ class Packets:
     """
 
     def __init__(self, position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"]):
-        embree = _library()
+        embree = library()
         assert embree is not None
-        library, self._occluded, device = embree
-        self._scene = library.rtcNewScene(device)
-        weakref.finalize(self, library.rtcReleaseScene, self._scene)
-        library.rtcSetSceneFlags(self._scene, _ROBUST)
-        geometry = library.rtcNewGeometry(device, _TRIANGLES)
-        for kind, form, array in (
-            (_VERTEX, _FLOAT3, np.ascontiguousarray(position, np.float32)),
-            (_INDEX, _UINT3, np.ascontiguousarray(face, np.uint32)),
-        ):
-            buffer = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, array.strides[0], len(array))
-            if buffer is not None:
-                ctypes.memmove(buffer, array.ctypes.data, array.nbytes)
-        library.rtcCommitGeometry(geometry)
-        library.rtcAttachGeometry(self._scene, geometry)
-        library.rtcReleaseGeometry(geometry)
-        library.rtcCommitScene(self._scene)
-        if code := library.rtcGetDeviceError(device):
-            raise (MemoryError if code == _OUT_OF_MEMORY else RuntimeError)(
-                f"Embree failed for a scene of {len(position)} vertices and {len(face)} triangles, error code {code}"
-            )
+        self._occluded = embree.occluded
+        self._scene = new_scene(self)
+        attach(self._scene, position, face)
+        commit(self._scene, f"{len(position)} vertices and {len(face)} triangles")
         self._context = np.full(WIDTH, _NONE, np.uint32)
         # RTCOccludedArguments: flags and features, 32 bits each; context; filter; callback.
-        self._arguments = np.array([_COHERENT | _EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
+        self._arguments = np.array([COHERENT | EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
 
     def blocked(
         self,
@@ -109,39 +96,122 @@ class Packets:
             part: The points to trace.
             share: The result, in 255ths.
         """
-        address, arguments = self._occluded, self._arguments.ctypes.data
-        _shares(address, self._scene, arguments, surface, points, texels, part.start, part.stop, share)
+        query = self._occluded, self._scene, self._arguments.ctypes.data, np.ones(WIDTH, np.float32)
+        trace_shares(query, surface, points, texels, part.start, part.stop, share)
+
+
+class Embree(NamedTuple):
+    """The Embree library that embreex ships.
+
+    Attributes:
+        functions: The library.
+        occluded: Address of `rtcOccluded16`.
+        intersect: Address of `rtcIntersect16`.
+        device: A device.
+    """
+
+    functions: ctypes.CDLL
+    occluded: int
+    intersect: int
+    device: int
+
+
+def new_scene(owner: object) -> int:
+    """An empty Embree scene, which is released together with an object."""
+    embree = library()
+    assert embree is not None
+    scene = embree.functions.rtcNewScene(embree.device)
+    weakref.finalize(owner, embree.functions.rtcReleaseScene, scene)
+    embree.functions.rtcSetSceneFlags(scene, _ROBUST)
+    return scene
+
+
+def attach(
+    scene: int,
+    position: Float32[np.ndarray, "v 3"],
+    face: Integer[np.ndarray, "f 3"],
+    *,
+    filter_function: int | None = None,
+    data: int | None = None,
+) -> None:
+    """Adds triangles to an Embree scene.
+
+    Args:
+        scene: The scene.
+        position: Vertex positions.
+        face: Three vertex indices for each triangle.
+        filter_function: Address of a function that may refuse hits.
+        data: Address that this function gets.
+    """
+    embree = library()
+    assert embree is not None
+    functions = embree.functions
+    geometry = functions.rtcNewGeometry(embree.device, _TRIANGLES)
+    for kind, form, array in (
+        (_VERTEX, _FLOAT3, np.ascontiguousarray(position, np.float32)),
+        (_INDEX, _UINT3, np.ascontiguousarray(face, np.uint32)),
+    ):
+        buffer = functions.rtcSetNewGeometryBuffer(geometry, kind, 0, form, array.strides[0], len(array))
+        if buffer is not None:
+            ctypes.memmove(buffer, array.ctypes.data, array.nbytes)
+    if filter_function is not None:
+        functions.rtcSetGeometryUserData(geometry, data)
+        functions.rtcSetGeometryIntersectFilterFunction(geometry, filter_function)
+        functions.rtcSetGeometryOccludedFilterFunction(geometry, filter_function)
+    functions.rtcCommitGeometry(geometry)
+    functions.rtcAttachGeometry(scene, geometry)
+    functions.rtcReleaseGeometry(geometry)
+
+
+def commit(scene: int, content: str) -> None:
+    """Builds the tree of an Embree scene.
+
+    Args:
+        scene: The scene.
+        content: What it holds, for error messages.
+
+    Raises:
+        MemoryError: Embree runs out of memory.
+        RuntimeError: Embree reports another error.
+    """
+    embree = library()
+    assert embree is not None
+    embree.functions.rtcCommitScene(scene)
+    if code := embree.functions.rtcGetDeviceError(embree.device):
+        failure = MemoryError if code == _OUT_OF_MEMORY else RuntimeError
+        raise failure(f"Embree failed for a scene of {content}, error code {code}")
 
 
 def available() -> bool:
     """Whether embreex ships an Embree 4 library with packet tracing where this module looks for it."""
-    return _library() is not None
+    return library() is not None
 
 
 @cache
-def _library():
-    """The Embree library, the address of `rtcOccluded16`, and a device; None if no library can be used."""
+def library() -> Embree | None:
+    """The Embree library; None if none can be used."""
     for file in metadata.files("embreex") or ():
         if not Path(str(file)).name.startswith(("libembree4", "embree4")):
             continue
         try:
-            library = ctypes.CDLL(str(file.locate()))
-            occluded = ctypes.cast(library.rtcOccluded16, _POINTER).value
+            functions = ctypes.CDLL(str(file.locate()))
+            queries = functions.rtcOccluded16, functions.rtcIntersect16
+            occluded, intersect = (ctypes.cast(query, _POINTER).value or 0 for query in queries)
             for name, (result, arguments) in _PROTOTYPES.items():
-                function = getattr(library, name)
+                function = getattr(functions, name)
                 function.restype, function.argtypes = result, arguments
         except (OSError, AttributeError):
             continue
-        device = library.rtcNewDevice(None)
+        device = functions.rtcNewDevice(None)
         if device is not None:
-            return library, occluded, device
+            return Embree(functions, occluded, intersect, device)
     return None
 
 
 @no_type_check
 @intrinsic
-def _call(typing, address, valid, scene, ray, arguments):
-    """Calls void (*)(const int*, RTCScene, RTCRay16*, RTCOccludedArguments*) at an address.
+def call(typing, address, valid, scene, ray, arguments):
+    """Calls void (*)(const int*, RTCScene, RTCRay16*, RTCOccludedArguments*), or `rtcIntersect16`, at an address.
 
     The address is an argument, rather than a ctypes function, so that numba can cache the compiled code on disk.
     """
@@ -156,7 +226,15 @@ def _call(typing, address, valid, scene, ray, arguments):
     return types.none(*[types.intp] * 5), generate
 
 
-def _cached(function: Callable) -> Callable:
+def callback(signature: Any, function: Callable) -> Any:
+    """A function that C calls, compiled by numba as `compiled` compiles; its address is `address`."""
+    try:
+        return numba.cfunc(signature, cache=True)(function)
+    except RuntimeError:
+        return numba.cfunc(signature)(function)
+
+
+def compiled(function: Callable) -> Callable:
     """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
     try:
         return numba.njit(nogil=True, cache=True)(function)
@@ -165,13 +243,12 @@ def _cached(function: Callable) -> Callable:
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@_cached
+@compiled
 def _blocked(address, scene, arguments, origin, direction, point, way, found):
     # RTCRay16: twelve rows of sixteen values, aligned to 64 bytes.
     memory = np.empty(13 * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
     ray = memory[first : first + 12 * 16].reshape(12, 16)
-    number = ray.view(np.uint32)
     valid = memory[first + 12 * 16 : first + 13 * 16].view(np.int32)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
@@ -181,19 +258,14 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
             for axis in range(3):
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
-            ray[3, lane] = 0.0  # near
-            ray[7, lane] = 0.0  # time
-            ray[8, lane] = 1e37  # far; minus infinity after a hit
-            number[9, lane] = 0xFFFFFFFF  # mask
-            number[10, lane] = lane
-            number[11, lane] = 0  # flags
-        _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+        _whole_ray(ray)
+        call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
             found[packet + lane] = ray[8, lane] < 0
 
 
 @no_type_check
-@_cached
+@compiled
 def _start(surface, points, point, lane, origin, facing):
     """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
 
@@ -223,9 +295,14 @@ def _start(surface, points, point, lane, origin, facing):
 
 
 @no_type_check
-@_cached
-def _shares(address, scene, arguments, surface, points, texels, first, last, share):
-    """Visible shares of texels at points of a picture: see `Packets.shares`."""
+@compiled
+def trace_shares(query, surface, points, texels, first, last, share):
+    """Visible shares of texels at points of a picture: see `Packets.shares`.
+
+    `query` holds the address of `rtcOccluded16`, the scene, the address of the arguments, and sixteen numbers. A filter
+    function may multiply the number of a ray by the share of light that a surface on it lets pass.
+    """
+    address, scene, arguments, passed = query
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
@@ -234,7 +311,7 @@ def _shares(address, scene, arguments, surface, points, texels, first, last, sha
     ray = memory[begin : begin + 12 * 16].reshape(12, 16)
     valid = memory[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
-    above, visible = np.empty(16, np.bool_), np.empty(16, np.int32)
+    above, visible = np.empty(16, np.bool_), np.empty(16)
     for packet in range(first, last, 16):
         lanes = min(16, last - packet)
         for lane in range(lanes):
@@ -256,15 +333,16 @@ def _shares(address, scene, arguments, surface, points, texels, first, last, sha
                         ray[axis, lane] = origin[place, axis, here]
                         ray[4 + axis, lane] = direction[texel, stratum, axis]
                 _whole_ray(ray)
-                _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                passed[:] = 1.0
+                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
                 for lane in range(lanes):
-                    visible[lane] += above[lane] and ray[8, lane] > 0
+                    visible[lane] += passed[lane] if above[lane] and ray[8, lane] > 0 else 0.0
             for lane in range(lanes):
-                share[texel, packet + lane] = (255 * visible[lane] + count[texel] // 2) // count[texel]
+                share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / count[texel] + 0.5))
 
 
 @no_type_check
-@_cached
+@compiled
 def _whole_ray(ray):
     """Fills in the fields of sixteen rays that are always the same."""
     number = ray.view(np.uint32)

@@ -168,7 +168,7 @@ def _added(index: np.ndarray, vector: np.ndarray, count: int) -> np.ndarray:
 
 def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Ray origins of vertices that are not vertices of the occluder, which then only approximates the mesh."""
-    triangle, distance, _ = occluder.hit(position - offset * out, out)
+    triangle, distance, _ = occluder.hit(position - offset * out, out, solid=True)
     corner = occluder.position[occluder.face[triangle]]
     edge = np.linalg.norm(corner - np.roll(corner, 1, 1), axis=2).max(1)
     sink = np.minimum(_SINK * occluder.diagonal, _SINK_EDGE * edge)
@@ -192,7 +192,7 @@ def _off_contact(
     result = start.copy()
     open_start = np.ones(len(start), bool)
     for beside in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
-        triangle, distance, _ = occluder.hit(start + offset / 2 * beside, -out)
+        triangle, distance, _ = occluder.hit(start + offset / 2 * beside, -out, solid=True)
         # Distances of a few spacings of float32 are themselves rounded by one or two.
         hit = np.flatnonzero(open_start & (triangle >= 0) & (distance < _BACK * offset[:, 0]))
         if not hit.size:

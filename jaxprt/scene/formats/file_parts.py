@@ -60,7 +60,8 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
     if place is not None and (source is not None or material.anisotropy > 0):
         given = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[own] != 0).any(axis=1)
         mesh, side = _with_tangents(mesh, place, given, side)
-    return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side))
+    alpha = None if material.alpha_mode == "opaque" else rows(geometry.alpha, 1)
+    return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side), _array(alpha))
 
 
 def _with_tangents(

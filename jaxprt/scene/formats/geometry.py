@@ -18,6 +18,7 @@ class Geometry(NamedTuple):
         texture: Texture coordinates [v 2], v up.
         second: Second set of texture coordinates [v 2].
         color: Linear vertex colors [v 3], which multiply the base color.
+        alpha: Opacity of vertices [v], which multiplies that of the material.
         region: Index of the region of each vertex [v].
     """
 
@@ -30,6 +31,7 @@ class Geometry(NamedTuple):
     second: np.ndarray | None = None
     color: np.ndarray | None = None
     region: np.ndarray | None = None
+    alpha: np.ndarray | None = None
 
 
 class MeshContent(NamedTuple):
@@ -55,6 +57,7 @@ _MISSING = {
     "second": ((2,), 0.0),
     "color": ((3,), 1.0),
     "region": ((), 0.0),
+    "alpha": ((), 1.0),
 }
 
 

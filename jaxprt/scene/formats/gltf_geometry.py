@@ -320,6 +320,7 @@ def _geometry(
         texture,
         second,
         None if color is None else np.clip(np.nan_to_num(color[:, :3]), 0, 1),
+        alpha=None if color is None or color.shape[1] < 4 else np.clip(np.nan_to_num(color[:, 3], nan=1.0), 0, 1),
     )
     bound = gltf_skin.binding(document, primitive.attribute, primitive.joints, used, primitive.name)
     return geometry, bound

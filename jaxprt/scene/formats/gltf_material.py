@@ -16,6 +16,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
+_ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 _SOURCES = ("KHR_texture_basisu", "EXT_texture_webp")
 _SHOWN = 80  # characters of a URI in warnings
 
@@ -43,7 +44,7 @@ class MaterialReader:
             MemoryError: An image does not fit into memory.
         """
         if index is None:
-            return TexturedMaterial()
+            return TexturedMaterial(back="hidden")
         owner = f"material {index}"
         item = self._document.item("materials", index, owner)
         extensions = self._document.object(item, "extensions", owner)
@@ -91,6 +92,7 @@ class MaterialReader:
             "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
             "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
         }
+        field |= self._cover(item, pbr, owner)
         try:
             return TexturedMaterial(**field)
         except ValueError as error:
@@ -99,13 +101,27 @@ class MaterialReader:
     def _number(self, item: dict[str, Any], key: str, default: float | tuple[float, ...], owner: str) -> np.ndarray:
         return self._document.numbers(item.get(key, default), np.shape(default), f"{key} of {owner}")
 
+    def _cover(self, item: dict[str, Any], pbr: dict[str, Any], owner: str) -> dict[str, Any]:
+        """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5).
+
+        An alpha mode that the specification does not have counts as opaque, and is recorded.
+        """
+        field: dict[str, Any] = {"back": "lit" if self._document.boolean(item, "doubleSided", owner) else "hidden"}
+        mode = item.get("alphaMode", "OPAQUE")
+        if not isinstance(mode, str) or mode not in _ALPHA_MODES:
+            self.ignored.add(f"alpha mode {excerpt(mode)}")
+            return field
+        if mode == "OPAQUE":
+            return field
+        return field | {
+            "alpha_mode": _ALPHA_MODES[mode],
+            "alpha": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[3],
+            "alpha_cutoff": self._number(item, "alphaCutoff", 0.5, owner) if mode == "MASK" else 0.5,
+            "alpha_texture": self._texture(pbr, "baseColorTexture", (3,), owner, decoded=True),
+        }
+
     def _note(self, item: dict[str, Any], owner: str) -> None:
         """Records unsupported features of a material."""
-        mode = item.get("alphaMode", "OPAQUE")
-        if mode != "OPAQUE":
-            self.ignored.add(f"alpha mode {mode if mode in ('MASK', 'BLEND') else excerpt(mode)}")
-        if self._document.boolean(item, "doubleSided", owner):
-            self.ignored.add("doubleSided (backs of surfaces are black)")
         if "occlusionTexture" in item:
             self.ignored.add("occlusion textures (occlusion is computed)")
         self.ignored |= set(item.get("extensions", {}))

@@ -86,12 +86,17 @@ class MaterialMaker:
         """Factors and textures of the material for a BSDF."""
         kind = str(item.get("type"))
         if kind in _WRAPPERS:
-            backs = kind == "twosided"
-            self._ignored.add("twosided (backs of surfaces are black)" if backs else f"{kind} in {name}")
+            wrapped: dict[str, Any] = {}
+            if kind == "twosided":
+                wrapped = {"back": "lit"}
+            elif kind == "mask":
+                wrapped = {"alpha_mode": "blend"} | self._opacity(item, name)
+            else:
+                self._ignored.add(f"{kind} in {name}")
             for each in item.values():
                 inner = self._resolved(each, name)
                 if inner is not None and inner.get("type") in _MAKERS | _WRAPPERS:
-                    return self._field(inner, name)
+                    return self._field(inner, name) | wrapped
         if kind not in _MAKERS:
             raise ValueError(f"{name} must be one of {', '.join(sorted(_MAKERS | _WRAPPERS))}, got {kind!r}")
         return {
@@ -102,6 +107,15 @@ class MaterialMaker:
             "plastic": self._plastic,
             "roughplastic": self._plastic,
         }[kind](item, name)
+
+    def _opacity(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+        """The share of light that a `mask` stops. Colors count by their mean, bitmaps by their luminance."""
+        value = self._resolved(item.get("opacity"), name)
+        if value is not None and value.get("type") == "bitmap":
+            return {"alpha_texture": self._texture(value, f"opacity of {name}", colors=False)}
+        return {
+            "alpha": float(np.mean(rgb(item.get("opacity", 0.5) if value is None else value, f"opacity of {name}")))
+        }
 
     def _diffuse(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
         self._rest(item, name, {"reflectance"})

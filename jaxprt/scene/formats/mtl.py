@@ -27,8 +27,8 @@ _MAPS = {
     "norm": ("normal_texture", (0, 1, 2), False),
 }
 _ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # most values of map options; all other options have one
-_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # ambient light is computed; the others concern transparency
-_OPAQUE = {"d": 1.0, "Tr": 0.0}
+_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # ambient light is computed; the others concern refraction
+_OPACITY = {"d", "Tr", "map_d"}
 _BLENDER = re.compile(
     r"# Blender (v?)(\d+)\.(\d+)"
 )  # first line of OBJ files by Blender; the v is from its older exporter
@@ -103,6 +103,8 @@ def read(
     closest to the lobe of exponent Ns: alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007,
     "Microfacet models for refraction through rough surfaces", section 5.2).
 
+    The opacity is d (or 1 - Tr) times map_d, a share of the light. It is read whatever illum says.
+
     Blender 2.80 and newer writes its principled material differently: Ns = `blender` (1 - roughness)^2, Ks = 12.5 times
     the reflectance at normal incidence, and metalness as Ka if illum is 3 or 6. Its textures replace the factors, and
     map_Bump is a normal map. Factors that accompany Pr and Pm are read in this way too.
@@ -132,7 +134,7 @@ def read(
         if key == "newmtl":
             named[" ".join(rest)] = statements = {}
         elif key:
-            statements[key] = rest if key in _MAPS else " ".join(rest).partition("#")[0].split()
+            statements[key] = rest if key in _MAPS or key == "map_d" else " ".join(rest).partition("#")[0].split()
     material = {
         name: _material(named[name], path, name, ignored, blender, refer, pictures) for name in named if name in wanted
     }
@@ -159,15 +161,14 @@ def _material(
             value[key] = np.minimum(value[key], 1)
     field: dict[str, Any] = {_COLORS[key]: value[key] for key in ("Kd", "Ke") if key in value}
     for key, words in statements.items():
-        if key in _MAPS:
+        if key in _MAPS or key == "map_d":
             options, words = _options(words)
             owner = f"{path}, {key} of material {name!r}"
             file = refer(" ".join(words), path.parent, owner=owner)
             _add_map(field, key, options, file, owner, ignored, pictures)
-        elif key in _OPAQUE and _number(statements, key, path, name) == _OPAQUE[key]:
-            continue
-        elif key not in value and key not in _SILENT:
+        elif key not in value and key not in _SILENT | _OPACITY:
             ignored.add(key)
+    field |= _opacity(statements, "alpha_texture" in field, path, name, ignored)
     if blender is not None:
         field |= _principled(value, field.keys(), blender)
         return _checked(field, path, name)
@@ -182,6 +183,22 @@ def _material(
     else:  # with the default index of refraction the reflectance is 4 % times the color
         field |= {"metallic": 0.0, "roughness": roughness, "specular_color": value["Ks"] / 0.04}
     return _checked(field, path, name)
+
+
+def _opacity(
+    statements: dict[str, list[str]], textured: bool, path: pathlib.Path, name: str, ignored: set[str]
+) -> dict[str, Any]:
+    """The opacity of a material: d, or 1 - Tr without d. An opaque material without map_d has none."""
+    alpha = 1.0
+    key = "d" if "d" in statements else "Tr"
+    if key in statements:
+        number = _number(statements, key, path, name)
+        if not 0 <= number <= 1:
+            ignored.add(f"{key} below 0 or above 1")
+        alpha = min(max(number if key == "d" else 1 - number, 0.0), 1.0)
+    if alpha == 1 and not textured:
+        return {}
+    return {"alpha": alpha, "alpha_mode": "blend"}
 
 
 def _principled(value: dict[str, Any], given: Collection[str], exponent: float) -> dict[str, Any]:
@@ -240,13 +257,18 @@ def _add_map(
     ignored: set[str],
     pictures: TextureImages,
 ) -> None:
-    """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`."""
-    name, channels, decoded = _MAPS[key]
+    """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`.
+
+    The opacity of map_d is the alpha of an image that has one, and otherwise its first channel.
+    """
+    name, channels, decoded = _MAPS.get(key, ("alpha_texture", (3,), False))
     try:
         absence = _absence(file)
         if absence:
             raise ValueError(f"{file}, {absence}")
         image = pictures.read(file, channels, decoded=decoded)
+        if key == "map_d" and np.min(image) == 1:
+            image = pictures.read(file, (0,), decoded=False)
     except ValueError as error:
         ignored.add(f"{key} ({error})")
         return

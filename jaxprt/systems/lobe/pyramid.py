@@ -34,6 +34,7 @@ _BITS = 2  # largest number of scales that are read from the bits
 _FINE = 16
 _TAPS = 3  # texels along an axis from which visibility is interpolated
 _BYTE = 255
+_R2 = 0.7548776662466927, 0.5698402909980532  # steps of a sequence that fills squares evenly
 _BLOCK = 1024
 
 
@@ -451,4 +452,21 @@ class _Job(visibility.rays.VisibilityJob):
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         vector = diffuse.vectors(seen, self.frame[self.part(block)])
-        return {"pyramid": np.asarray(pyramid(seen)), "vector": np.asarray(vector)}, count.rays
+        pyramids = np.array(pyramid(seen))
+        if self.rays.blends:
+            bits = 6 * self.size**2 // 8
+            pyramids[:, :bits] = np.asarray(pyramid(dithered(seen)))[:, :bits]
+        return {"pyramid": pyramids, "vector": np.asarray(vector)}, count.rays
+
+
+def dithered(seen: UInt8[np.ndarray, "b d"]) -> UInt8[np.ndarray, "b d"]:
+    """Visibility of 0 or 16 sixteenths, whose mean over neighboring texels is that of `seen`, by ordered dithering.
+
+    The finest level has one bit for each texel. Behind a translucent surface half-visible texels are no border between
+    light and shadow, where it does not matter on which side they count. Thresholds depend on the texel alone, so that
+    neighboring vertices do not differ.
+    """
+    size = haar.face_edge(seen.shape[1])
+    row, column = np.divmod(np.arange(seen.shape[1]), size)
+    threshold = visibility.LEVELS * ((_R2[0] * row + _R2[1] * column) % 1)
+    return np.where(seen > threshold, visibility.LEVELS, 0).astype(np.uint8)

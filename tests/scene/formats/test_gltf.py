@@ -371,12 +371,40 @@ def test_cameras_stand_where_their_nodes_are(tmp_path, close):
     assert (camera.width, camera.height, float(camera.field_of_view)) == (768, 512, pytest.approx(0.7))
 
 
+def test_alpha_is_that_of_factor_texture_and_vertices(tmp_path):
+    writer = Writer()
+    image = np.concatenate([IMAGE[..., :3], np.full((*IMAGE.shape[:2], 1), 0.25)], -1)
+    base = {"baseColorFactor": [1, 1, 1, 0.5], "baseColorTexture": writer.texture(tmp_path, image)}
+    writer.header["materials"] = [
+        {"alphaMode": "MASK", "alphaCutoff": 0.1, "doubleSided": True, "pbrMetallicRoughness": base},
+        {"alphaMode": "BLEND", "pbrMetallicRoughness": base},
+        {"pbrMetallicRoughness": base},
+    ]
+    color = np.tile(np.float32([1, 1, 1, 0.75]), (4, 1))
+    one(*(writer.square(material=number, TEXCOORD_0=PLACE, COLOR_0=color) for number in range(3)), writer=writer)
+    scene = load_scene(writer.write(tmp_path / "alpha.glb"))
+    for part, (mode, back) in zip(
+        scene.parts, [("mask", "lit"), ("blend", "hidden"), ("opaque", "hidden")], strict=True
+    ):
+        assert (part.material.alpha_mode, part.material.back) == (mode, back)
+        if mode == "opaque":
+            assert part.alpha is None
+            assert part.material.alpha_texture is None
+            continue
+        np.testing.assert_allclose(part.alpha, 0.75, atol=1e-6)
+        assert float(part.material.alpha) == 0.5
+        np.testing.assert_allclose(part.material.alpha_texture.image, 64 / 255, atol=1e-6)
+    writer.header["materials"][0]["alphaCutoff"] = -1
+    with pytest.raises(ValueError, match="material 0: alpha_cutoff of TexturedMaterial must be at least 0"):
+        load_scene(writer.write(tmp_path / "alpha.glb"))
+
+
 def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     writer = Writer()
     image = writer.texture(tmp_path, IMAGE)
     writer.header["materials"] = [
         {
-            **{"alphaMode": "BLEND", "doubleSided": True, "occlusionTexture": image, "emissiveTexture": image},
+            **{"alphaMode": "DITHER", "occlusionTexture": image, "emissiveTexture": image},
             "extensions": {"KHR_materials_sheen": {}, "KHR_materials_ior": {}},
         }
     ]
@@ -386,8 +414,8 @@ def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(writer.write(tmp_path / "much.glb"))
     (message,) = [str(each.message) for each in caught]
-    expected = ["COLOR_1", "KHR_animation_pointer", "KHR_materials_sheen", "alpha mode BLEND"]
-    expected += ["doubleSided", "occlusion textures", "points and lines"]
+    expected = ["COLOR_1", "KHR_animation_pointer", "KHR_materials_sheen", "alpha mode 'DITHER'"]
+    expected += ["occlusion textures", "points and lines"]
     expected += ["textures of primitives without texture coordinates"]
     assert message.startswith(f"{tmp_path / 'much.glb'}: not supported and ignored are ")
     for each in expected:

@@ -154,6 +154,20 @@ def test_bsdfs_become_metallic_roughness_materials():
     )
 
 
+def test_masks_are_opacities_and_two_sided_backs_are_lit(tmp_path):
+    write_png(tmp_path / "hole.png", np.array([[[0.0, 0, 0], [1, 1, 1]]]))
+
+    def one(opacity, **field):
+        mask = {"type": "mask", "opacity": opacity, "inner": {"type": "twosided", "a": {"type": "diffuse"}}}
+        (part,) = load_scene({"type": "scene", "a": {"type": "rectangle", "bsdf": mask | field}}).parts
+        return part.material
+
+    plain = one(0.25)
+    assert (plain.alpha_mode, float(plain.alpha), plain.back) == ("blend", 0.25, "lit")
+    texture = one({"type": "bitmap", "filename": str(tmp_path / "hole.png"), "raw": True}).alpha_texture
+    np.testing.assert_allclose(texture.image[0, :, 0], [0, 1], atol=1e-6)
+
+
 def test_what_has_no_equal_is_said_by_name():
     inner = {"type": "principled", "clearcoat": 0.5, "sheen": 0.0, "anisotropic": 0.2}
     scene = {
@@ -163,7 +177,7 @@ def test_what_has_no_equal_is_said_by_name():
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(scene)
     (message,) = [str(each.message) for each in caught]
-    expected = r"clearcoat of bsdf of sheet, lamp (point), pane (disk), twosided (backs of surfaces are black)"
+    expected = r"clearcoat of bsdf of sheet, lamp (point), pane (disk)"
     assert message == f"the dictionary: not supported and ignored are {expected}"
 
 

@@ -155,13 +155,24 @@ def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("statement", "ignored"), [("d -halo 0.5", True), ("d -halo 1.0", False), ("d 1 # -halo", False)]
+    ("statement", "alpha"),
+    [("d -halo 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .25", 0.5)],
 )
-def test_halos_are_opacities(tmp_path, statement, ignored):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        assert one(tmp_path, f"{statement}\n").name == "a"
-    assert [str(warning.message).endswith("ignored are d") for warning in caught] == [True] * ignored
+def test_d_and_tr_are_opacities(tmp_path, statement, alpha):
+    material = one(tmp_path, f"{statement}\n").material
+    got = None if material.alpha_mode == "opaque" else float(material.alpha)
+    assert (got, material.alpha_mode) == (alpha, "opaque" if alpha is None else "blend")
+
+
+def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
+    write_png(tmp_path / "alpha.png", np.array([[[0.1, 0.1, 0.1, 0.2]]]))
+    write_png(tmp_path / "gray.png", np.array([[[0.2, 0.1, 0.1]]]))
+    for name in ("alpha", "gray"):
+        material = one(tmp_path, f"d .5\nmap_d {name}.png\n").material
+        assert (float(material.alpha), material.alpha_mode) == (0.5, "blend")
+        np.testing.assert_allclose(material.alpha_texture.image, [[[0.2]]], rtol=1e-6)
+    with pytest.warns(UserWarning, match="ignored are d below 0 or above 1"):
+        assert float(one(tmp_path, "d -1\n").material.alpha) == 0
 
 
 def test_maps_that_move_without_end_are_refused_by_name(tmp_path):
@@ -188,7 +199,7 @@ def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):
 
 
 def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
-    statements = "Kd 2 1 1\nd 0.5\nbump a.png\nmap_Kd absent.png\nmap_Ke text.png\naniso 1\n"
+    statements = "Kd 2 1 1\nbump a.png\nmap_Kd absent.png\nmap_Ke text.png\naniso 1\n"
     (tmp_path / "text.png").write_text("no picture")
     path = write(tmp_path, f"newmtl a\n{statements}", "usemtl a\n" + FACE + "usemtl b\n" + FACE)
     path.write_text("mtllib gone.mtl\n" + path.read_text())
@@ -196,7 +207,7 @@ def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
         scene = load_scene(path)
     (message,) = [str(each.message) for each in caught]
     assert message.startswith(f"{path}: not supported and ignored are ")
-    expected = ["Kd above 1", "aniso", "bump", ", d,", r"absent.png, which does not exist", "text.png must be an EXR"]
+    expected = ["Kd above 1", "aniso", "bump", r"absent.png, which does not exist", "text.png must be an EXR"]
     for each in [*expected, "gone.mtl, which does not exist", "usemtl b (no such material)"]:
         assert message.count(each) == 1, each
     np.testing.assert_array_equal(scene["a"].material.base_color, [1, 1, 1])
