@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import llvmlite.ir
 import numba
@@ -85,6 +85,11 @@ class Packets:
         # RTCOccludedArguments: flags and features, 32 bits each; context; filter; callback.
         self._arguments = np.array([_COHERENT | _EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
 
+    @property
+    def embree(self) -> tuple[int, int, int]:
+        """Addresses of `rtcOccluded16`, of the scene, and of the arguments."""
+        return self._occluded, self._scene, self._arguments.ctypes.data
+
     def blocked(
         self,
         origin: Float32[np.ndarray, "m 3"],
@@ -140,7 +145,7 @@ def _library():
 
 @no_type_check
 @intrinsic
-def _call(typing, address, valid, scene, ray, arguments):
+def call(typing, address, valid, scene, ray, arguments):
     """Calls void (*)(const int*, RTCScene, RTCRay16*, RTCOccludedArguments*) at an address.
 
     The address is an argument, rather than a ctypes function, so that numba can cache the compiled code on disk.
@@ -156,16 +161,16 @@ def _call(typing, address, valid, scene, ray, arguments):
     return types.none(*[types.intp] * 5), generate
 
 
-def _cached(function: Callable) -> Callable:
+def compiled(function: Callable, **options: Any) -> Callable:
     """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
     try:
-        return numba.njit(nogil=True, cache=True)(function)
+        return numba.njit(nogil=True, cache=True, **options)(function)
     except RuntimeError:
-        return numba.njit(nogil=True)(function)
+        return numba.njit(nogil=True, **options)(function)
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@_cached
+@compiled
 def _blocked(address, scene, arguments, origin, direction, point, way, found):
     # RTCRay16: twelve rows of sixteen values, aligned to 64 bytes.
     memory = np.empty(13 * 16 + 16, np.float32)
@@ -187,14 +192,14 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
             number[9, lane] = 0xFFFFFFFF  # mask
             number[10, lane] = lane
             number[11, lane] = 0  # flags
-        _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+        call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
             found[packet + lane] = ray[8, lane] < 0
 
 
 @no_type_check
-@_cached
-def _start(surface, points, point, lane, origin, facing):
+@compiled
+def start(surface, points, point, lane, origin, facing):
     """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
 
     The normal is zero in padding and for triangles without an area, which have no side to start from.
@@ -223,7 +228,7 @@ def _start(surface, points, point, lane, origin, facing):
 
 
 @no_type_check
-@_cached
+@compiled
 def _shares(address, scene, arguments, surface, points, texels, first, last, share):
     """Visible shares of texels at points of a picture: see `Packets.shares`."""
     pattern = points[3]
@@ -238,7 +243,7 @@ def _shares(address, scene, arguments, surface, points, texels, first, last, sha
     for packet in range(first, last, 16):
         lanes = min(16, last - packet)
         for lane in range(lanes):
-            _start(surface, points, packet + lane, lane, origin, facing)
+            start(surface, points, packet + lane, lane, origin, facing)
         for texel in range(len(count)):
             visible[:] = 0
             for lane in range(16):
@@ -255,8 +260,8 @@ def _shares(address, scene, arguments, surface, points, texels, first, last, sha
                     for axis in range(3):
                         ray[axis, lane] = origin[place, axis, here]
                         ray[4 + axis, lane] = direction[texel, stratum, axis]
-                _whole_ray(ray)
-                _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                whole_ray(ray)
+                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
                 for lane in range(lanes):
                     visible[lane] += above[lane] and ray[8, lane] > 0
             for lane in range(lanes):
@@ -264,8 +269,8 @@ def _shares(address, scene, arguments, surface, points, texels, first, last, sha
 
 
 @no_type_check
-@_cached
-def _whole_ray(ray):
+@compiled
+def whole_ray(ray):
     """Fills in the fields of sixteen rays that are always the same."""
     number = ray.view(np.uint32)
     for lane in range(16):
