@@ -259,8 +259,8 @@ def test_a_white_surface_in_a_white_furnace_is_white(name):
 
 # Root mean square and largest error of white metals in a white furnace, by roughness, from all views. Lobes of .05 are
 # narrower than the `coarse` directions: the package's own leave .004 and .06. Lobes of tables of 8 x 8 are off near the
-# horizon; lobes of .3 are narrower than splines over 8 x 8 texels, which read some of what is below it. Maps of 16 x 16,
-# whose texels are wider than narrow lobes, hold wide ones alone.
+# horizon; lobes of .3 are narrower than splines over 8 x 8 texels, which read some of what is below it. Maps of 16 x 16
+# have texels wider than narrow lobes and hold wide ones alone.
 METALS = {
     "harmonic": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
     "harmonic, clustered": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
