@@ -149,7 +149,7 @@ def _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free):
 @no_type_check
 @compiled
 def _placed(surface, points, fields, packet, lanes, origin, sight, pattern):
-    """Sets what does not depend on lamps for sixteen points; padding has no normal, and so nothing above its horizon."""
+    """Sets what does not depend on lamps for sixteen points; padding has no normal, so nothing is above its horizon."""
     position, normals = fields
     center, normal, facing, least = sight
     for lane in range(16):
