@@ -134,7 +134,7 @@ def direct(mesh: str, light: str, brdf: str, recipes: dict[str, Any], sizes: Siz
     mine = {}
     for name, recipe in recipes.items():
         path = sizes.path(f"{mesh} {name if isinstance(recipe, Terms) else type(recipe).__name__}")
-        made = precompute(scene, system=recipe, size=size, path=path, progress=False)
+        made = precompute(scene, refine=False, system=recipe, size=size, path=path, progress=False)
         mine[name] = (lambda made=made: made.picture(lit, camera)), memory(made)
     seen, samples = denoised.View(traced_parts(scene), lit, camera), 16 if sizes.quick else SAMPLES
     exact = seen.radiance(samples, 1)[..., :3], seen.radiance(samples, 2)[..., :3]
@@ -163,7 +163,7 @@ def metal(sizes: Sizes) -> Pictures:
     ball = builtin.sphere(rings=36, sectors=72)
     scene = Scene([Part("ball", ball, _GOLD), Part("ground", ground_plane(ball, vertices=2500, extent=2.0), _MATTE)])
     light, camera = environment("grace"), orbit(scene.mesh, elevation=0.3, width=sizes.edge, height=sizes.edge)
-    made = precompute(scene, system=Lobes(8), bounces=1, path=sizes.path("metal"), progress=False)
+    made = precompute(scene, refine=False, system=Lobes(8), bounces=1, path=sizes.path("metal"), progress=False)
     several = {"harmonics": made.with_rays(0), "16 rays": made.with_rays(16)}
     mine = {name: ((lambda each=each: each.picture(light, camera)), memory(each)) for name, each in several.items()}
     return Pictures(mine, reflected(scene, light, camera), inside(scene.mesh, camera))
@@ -178,7 +178,7 @@ def caustic(sizes: Sizes) -> Pictures:
     mine = {}
     for bounces in (0, 1):
         path = sizes.path(f"ring_{bounces}")
-        made = precompute(scene, system=Lobes(8), bounces=bounces, path=path, progress=False)
+        made = precompute(scene, refine=False, system=Lobes(8), bounces=bounces, path=path, progress=False)
         mine[f"bounces {bounces}"] = (lambda made=made: made.picture(light, camera)), memory(made)
     return Pictures(mine, reflected(scene, light, camera), inside(scene.mesh, camera))
 
@@ -201,7 +201,7 @@ def lamp(sizes: Sizes) -> Pictures:
     camera = Camera([0.0, 1.0, 2.2], [0.0, 0.0, -0.1], [0.0, 1.0, 0.0], 0.75, sizes.edge, sizes.edge)
     polished = TexturedMaterial(base_color=0.2, metallic=0.0, roughness=0.2)
     scene = Scene([Part("floor", floor, polished), Part("panel", panel, glowing)])
-    made = precompute(scene, system=Lobes(12), progress=False)
+    made = precompute(scene, refine=False, system=Lobes(12), progress=False)
     exact = lit_by_panel(traced_parts(scene)[0], light, camera)
     mine = {"four disks": ((lambda: made.picture(light, camera)), memory(made))}
     return Pictures(mine, exact, inside(scene.mesh, camera))

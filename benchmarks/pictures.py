@@ -148,7 +148,7 @@ def relit(case: Case, recipe: Any, path: pathlib.Path | None) -> Iterator[tuple[
             path and path.with_name(f"{path.name}_divided"),
             Lobes(recipe.lobes, min(TEXELS, 4 * recipe.texels)),
         )
-        divided = precompute(finer, system=more, size=size, path=path, progress=False)
+        divided = precompute(finer, refine=False, system=more, size=size, path=path, progress=False)
         yield "pixels, refined", divided, lambda: divided.picture(light, camera)
 
 

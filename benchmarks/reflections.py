@@ -112,7 +112,7 @@ def measure(name: str, quick: bool, store: pathlib.Path | None, pictures: pathli
     recipe = Lobes(lobes=8, texels=2) if quick else Lobes(lobes=8)
     low = (0.4, 0.5) if quick else RANGE
     size = lights[0].radiance.shape[-2]
-    whole = precompute(scene, system=recipe, bounces=BOUNCES, size=size, path=path, progress=False)
+    whole = precompute(scene, refine=False, system=recipe, bounces=BOUNCES, size=size, path=path, progress=False)
     common = {"benchmark": "reflections", "scene": name, "vertices": whole.vertices, "bytes": memory(whole)}
     keep = store and store / f"mitsuba_{name}"
     random = np.random.default_rng(5)

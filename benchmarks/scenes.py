@@ -121,7 +121,7 @@ def measure(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, pi
     relit: dict[str, RelitScene] = {}
     for system, recipe in systems(scene, quick).items():
         path = store and store / file_name(name, system)
-        relit[system] = precompute(scene, system=recipe, size=size, path=path, progress=False)
+        relit[system] = precompute(scene, refine=False, system=recipe, size=size, path=path, progress=False)
     for light_name, light in given.items():
         judge = Judge(scene, light, camera, 16 if quick else SAMPLES)
         for system, timing, drawn, held in frames(scene, relit, light, camera, quick):
@@ -137,7 +137,7 @@ def reflected(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, 
     camera, given = camera_of(name, scene, 16 if quick else EDGE), lights(quick)
     size, lobes = next(iter(given.values())).radiance.shape[-2], Lobes(lobes=3, texels=4) if quick else Lobes()
     path = store and store / file_name(name, "lobe")
-    whole = precompute(scene, system=lobes, bounces=BOUNCES, size=size, path=path, progress=False)
+    whole = precompute(scene, refine=False, system=lobes, bounces=BOUNCES, size=size, path=path, progress=False)
     direct = whole.direct
     for light_name, light in given.items():
         judge = Judge(scene, light, camera, 16 if quick else SAMPLES, bounces=BOUNCES)

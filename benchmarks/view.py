@@ -76,7 +76,9 @@ def hands(bounces: int, *, quick: bool) -> Iterator[dict[str, Any]]:
     """Looks in which one thing is new."""
     size, repeats = (8, 3) if quick else (64, 15)
     recipe = prt.relit.Lobes(8, texels=2) if quick else prt.relit.Lobes(8)
-    made = prt.precompute(embedded(playable=True), system=recipe, bounces=bounces, size=size, progress=False)
+    made = prt.precompute(
+        embedded(playable=True), refine=False, system=recipe, bounces=bounces, size=size, progress=False
+    )
     lights = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     server = view.serve(made, environments=lights)
     page = Page(server.url)

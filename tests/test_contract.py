@@ -73,6 +73,14 @@ HOST = {
     "systems.ranges": "cuts objects",
     "visibility.stored.precompute": "traces rays",
     "systems.lobe.relight.blur": "makes numbers",
+    "sphere.hats.count": "a number",
+    "sphere.hats.table": "SciPy tables",
+    "sphere.hats.inverse_gram": "a table, on the light's device",
+    "systems.lobe.diffuse.cells": "a number",
+    "systems.lobe.diffuse.count": "the same",
+    "systems.lobe.diffuse.vectors": "gives bytes",
+    "systems.lobe.diffuse.harmonics_of": "takes bytes alone",
+    "systems.lobe.matte.matte_transport": "takes arrays apart",
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",
     "systems.lobe.pyramid.bits": "cuts bytes",
@@ -559,6 +567,8 @@ EXAMPLES = {
     ),
     "sphere.rotation.matrix": example(lambda draw: call(draw.rotation()), gradient=(), degree=2),
     "sphere.rotation.low_matrix": example(lambda draw: call(draw.rotation(3)), degree=2),
+    "sphere.hats.integrals": example(lambda draw: call(draw.normal(6, 4, 4, 2)), cells=2),
+    "sphere.hats.project": example(lambda draw: call(draw.normal(6, 4, 4, 2)), cells=2),
     "sphere.haar.forward": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.inverse": example(lambda draw: call(draw.normal(3, 4, 4, 2))),
     "sphere.haar.area": example(nothing, size=4),
@@ -889,6 +899,8 @@ EXAMPLES = {
             draw.uniform(4, low=0.01, high=0.5),
         )
     ),
+    "systems.lobe.diffuse.coefficients": example(lambda draw: call(draw.normal(6, 8, 8, 3))),
+    "systems.lobe.diffuse.irradiance": example(lambda draw: call(draw.normal(8, 3), draw.normal(8, 5))),
     "systems.lobe.relight.prefilter": example(lambda draw: call(draw.light(8))),
     "systems.lobe.relight.combine": example(
         lambda draw: call(

@@ -117,7 +117,7 @@ def scene(lamp: bool = False) -> prt.Scene:
 
 @functools.cache
 def relit(system: str) -> prt.RelitScene:
-    return prt.precompute(scene(), system=system, size=SIZE, progress=False)
+    return prt.precompute(scene(), refine=False, system=system, size=SIZE, progress=False)
 
 
 def methods(relit: prt.RelitScene, name: str) -> dict[str, Verb]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import numpy as np
 
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.cli.report import View
+from jaxprt.relit import refinement
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
@@ -64,7 +66,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
 
     Args:
-        options: Object with `files`, `outside`, `up`, `ground`, `brdf` and `material`.
+        options: Object with `files`, `outside`, `up`, `ground`, `brdf`, `material` and `refine`.
         playable: Whether to make materials changeable for the viewer. Parts without a material become plastic.
 
     Raises:
@@ -78,7 +80,11 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     for name, material in options.material:
         number = _number([part.name for part in parts], name)
         parts[number] = dataclasses.replace(parts[number], material=material)
-    return dataclasses.replace(made, parts=parts)
+    made = dataclasses.replace(made, parts=parts)
+    if not paths:  # The embedded scene has as many vertices as it needs.
+        return made
+    options_ = {"vertices": None, "environments": None, "folder": None, "progress": sys.stderr.isatty()}
+    return refinement.divided(made, options.refine, **options_)[0]
 
 
 def embedded(*, brdf: Any = None, playable: bool = False) -> Scene:

@@ -82,7 +82,8 @@ def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNa
     more: dict[str, Any] = {"system": recipe, "size": next(iter(lights.values())).radiance.shape[-2]}
     if recipe is None:
         more = {"error": chosen.error, "environments": list(lights.values())}
-    return precompute(scene, bounces=chosen.bounces, path=path, progress=sys.stderr.isatty(), **more)
+    more |= {"bounces": chosen.bounces, "path": path, "progress": sys.stderr.isatty()}
+    return precompute(scene, refine=False, **more)
 
 
 def described(found: Report, lights: list[str]) -> dict[str, Any]:

@@ -149,6 +149,28 @@ class Bounces(click.ParamType):
         return value if value == "all" else int(value)
 
 
+class Refinement(click.ParamType):
+    """The error to which meshes are divided, or "off"."""
+
+    name = "E|off"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | bool:
+        """Parses the error; "off" gives False.
+
+        Raises:
+            click.UsageError: The value is neither.
+        """
+        if isinstance(value, bool) or value == "off":
+            return bool(value) and value != "off"
+        try:
+            error = float(value)
+        except ValueError:
+            error = float("nan")
+        if not 0 <= error < float("inf"):
+            self.fail(f'must be an error of at least 0, such as 0.02, or "off", got {value!r}', param, ctx)
+        return error
+
+
 class Material(click.ParamType):
     """A material, given by a model and its parameters, or by a file."""
 
@@ -231,6 +253,14 @@ scene = together(
         help="Axis of the meshes that points up.",
     ),
     option("--ground", group="Scene", is_flag=True, help="Stand the meshes on a diffuse ground plane."),
+    option(
+        "--refine",
+        group="Scene",
+        type=Refinement(),
+        default=True,
+        metavar="E|off",
+        help="Divide the meshes of files until interpolated visibility errs by E in pictures.  [default: 0.015]",
+    ),
     outside,
     option(
         "--brdf",

@@ -66,7 +66,7 @@ def _plan(chosen: SimpleNamespace) -> Plan:
             raise ValueError(f"{kept} was made for another scene, lights, error or rate: name another --output")
     candidates = None if chosen.output is None else chosen.output / "candidates"
     options_ = {"error": chosen.error, "rate": chosen.rate, "path": candidates, "progress": sys.stderr.isatty()}
-    made = plan(scene, environments=lights, **options_)
+    made = plan(scene, refine=False, environments=lights, **options_)
     if kept is not None:
         objects.save(kept, made)
     return made

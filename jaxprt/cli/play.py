@@ -157,6 +157,7 @@ def prepared(
         scene,
         system=recipe,
         bounces=bounces,
+        refine=False,
         size=next(iter(lights.values())).radiance.shape[-2],
         path=path,
         progress=sys.stderr.isatty(),

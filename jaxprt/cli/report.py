@@ -158,7 +158,7 @@ def make(
 def _made(view: View, output: Path, **options: Any) -> Made:
     start, found = timeit.default_timer(), output.exists()
     try:
-        ready = relit.precompute(view.scene, path=output, **options)
+        ready = relit.precompute(view.scene, refine=False, path=output, **options)
     except ValueError as error:
         raise ValueError(f"{error}; on the command line, name another --output" if found else str(error)) from error
     direct = ready.direct

@@ -152,7 +152,9 @@ def _factor(attributes: dict[str, typing.Any], name: str) -> np.ndarray:
 def _matrix(attributes: dict[str, typing.Any], name: str) -> np.ndarray | None:
     if "PRIMARIES" not in attributes:
         return None
-    return color_spaces.to_rec709(_numbers(attributes["PRIMARIES"], 8, f"PRIMARIES of {name}"), f"PRIMARIES of {name}")
+    primaries = _numbers(attributes["PRIMARIES"], 8, f"PRIMARIES of {name}")
+    # Photoshop writes zeros for colors that it does not state.
+    return color_spaces.to_rec709(primaries, f"PRIMARIES of {name}") if any(primaries) else None
 
 
 def _read_components(content: bytes, header: _Header, name: str) -> Float32[np.ndarray, "h w 3"]:

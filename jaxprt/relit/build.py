@@ -210,7 +210,7 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
             )
         if options["error"] is None or found.error * MARGIN <= asked:
             return found
-    made = plan(scene, path=folder and folder / "candidates", **options)
+    made = plan(scene, refine=False, path=folder and folder / "candidates", **options)
     if options["progress"]:
         tqdm.tqdm.write(str(made))
     if kept is not None:

@@ -21,7 +21,7 @@ from jaxprt import require
 from jaxprt.brdf import Lambert
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import channels, groups, reflection
+from jaxprt.relit import channels, groups, refinement, reflection
 from jaxprt.relit.measuring import checked, lights_of, views_around
 from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
 from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
@@ -143,6 +143,7 @@ def plan(
     environments: Sequence[Environment] | None = None,
     error: float | None = None,
     rate: float = 30.0,
+    refine: bool | float = True,
     path: str | os.PathLike | None = None,
     progress: bool = True,
 ) -> Plan:
@@ -164,6 +165,7 @@ def plan(
             part where a system reaches that. For other parts the system with the smallest error is chosen, with a
             warning.
         rate: Frames per second for the whole scene, each with a new light and a new view, without rasterization.
+        refine: Whether meshes are divided first, and to which error, as in `jaxprt.precompute`.
         path: Folder in which measurements are stored. A call that was interrupted resumes from there.
         progress: Whether to show a progress bar.
 
@@ -179,15 +181,15 @@ def plan(
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if path is not None:
         require.path("path", path)
-    scene = centered(sides.two_sided(scene))
     environments = lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
-    size = checked(environments, asked, rate)
+    size, key = checked(environments, asked, rate), key_of(centered(scene), environments)
+    options = {"vertices": None, "environments": None, "folder": None, "progress": progress}
+    scene = centered(refinement.divided(sides.two_sided(scene), refine, **options)[0])
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, plans = len(mesh.position), []
     looks = channels.looks(scene.parts)
     shadings = [channels.of_part(part, look=look) for part, look in zip(scene.parts, looks, strict=True)]
-    key = key_of(scene, environments)
     parts = groups.kinds(shadings, [_LOBES[0]] * len(shadings))
     for number, own in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
         members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)

@@ -12,9 +12,11 @@ from jaxtyping import Int
 from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.files import objects
+from jaxprt.relit import shadows
 from jaxprt.scene import Environment, Scene, subdivision
 from jaxprt.scene.subdivision import Division
 from jaxprt.visibility import blocks, refinement, shown
+from jaxprt.visibility.occluder import check
 
 ERROR = 0.015  # of pictures, by default
 _ROOM = 10_000  # vertices that division may add to a scene of few, by default
@@ -101,7 +103,7 @@ def divided(
         scene: The scene.
         wanted: Largest relative L2 error; True for the default, False to keep the meshes.
         vertices: Largest number of vertices; None for the default.
-        environments: Lights, as in `refine`.
+        environments: Lights, as in `refine`. Their brightest texels do not count, because pictures trace their shadows.
         folder: Folder in which the division is stored.
         progress: Whether to show a progress bar.
 
@@ -121,7 +123,8 @@ def divided(
         len(part.mesh.face) for part in scene.parts
     ):
         return scene, None
-    options = {"error": float(wanted), "vertices": most, "environments": environments, "progress": progress}
+    lights = None if environments is None else [shadows.untraced(light) for light in environments]
+    options = {"error": float(wanted), "vertices": most, "environments": lights, "progress": progress}
     division = _stored(scene, folder, options)
     return (subdivision.subdivide_scene(scene, division.steps), division) if division.face else (scene, None)
 
@@ -167,5 +170,6 @@ def _made(scene: Scene, key: str, options: dict) -> MeshDivision:
 
 def _divisions(scene: Scene, **options) -> tuple[list[Division], float]:
     mesh = scene.mesh
+    check(mesh, "mesh of the scene")
     views = shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
     return refinement.divisions(mesh, mesh, views=views, **options)

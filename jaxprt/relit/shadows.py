@@ -104,6 +104,11 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     return TracedLight(rest, excess, TexelShares(texel, share))
 
 
+def untraced(environment: Environment) -> Environment:
+    """A light without what pictures trace of it."""
+    return bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)[2]
+
+
 def fixed(environment: Environment, shares: TexelShares) -> TracedLight:
     """A light, known or traced by JAX, with texels that were traced before."""
     excess, rest = bright_texels.without(environment, shares.texel, rank=_RANK, least=_LEAST)

@@ -48,6 +48,9 @@ _SHINY = sum(width for _, width in _FACTORS)  # column that is 1 for `BlinnPhong
 _LAYERS = ("clearcoat", "clearcoat_roughness", "transmission")  # columns after it, in scenes that have them
 ROW = 1 << 12  # number of points that are evaluated together
 SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
+# Edge of what is averaged, in pixels: mip maps and interpolation within and between them average about as much again.
+# Against the mean over the pixel: 1 leaves 5.2, 3.5 and 2.2 % of three textures, this 2.9, 1.5 and 1.0 %.
+_SHARPER = 0.64
 _LEVELS = 16  # of a mip map at most: images of up to 32,768 texels along an edge
 _PROBES = 4  # lookups along an elongated footprint
 _SMALL = 1 << 16  # values of all textures up to which padding to coarser sizes is not worth avoiding
@@ -232,8 +235,9 @@ def _looked_up(
     slope: Float[Array, "2 p 2"],
     wrap: Int[Array, "p 2"],
 ) -> Float[Array, "p 3"]:
-    """`jaxprt.scene.mipmap.lookup` for points that each read an image of their own."""
+    """Values of images at points that each read an image of their own, averaged over the pixel."""
     shape = texels.shape[image]
+    slope = _SHARPER * slope
     scaled = jax.lax.stop_gradient(slope) * shape[:, ::-1].astype(slope.dtype)
     length = jnp.sqrt(jnp.sum(scaled**2, -1))
     long, short = jnp.maximum(length[0], length[1]), jnp.minimum(length[0], length[1])

@@ -8,6 +8,7 @@ they are local: a bright light does not ring on the other side of the sphere.
 
 import functools
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +50,7 @@ def integrals(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h
     faces = jnp.einsum("fitc,tj->fijc", faces, profile)
     padded = jnp.concatenate([faces.reshape(-1, faces.shape[-1]), jnp.zeros_like(faces[0, 0, :1])])
     index = jnp.asarray(_members(cells))
-    return sum(padded[index[:, k]] for k in range(_SHARED)).reshape(-1, *channels)
+    return jnp.sum(padded[index], 1).reshape(-1, *channels)
 
 
 def project(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h *c"]:
@@ -86,7 +87,7 @@ def inverse_gram(value: Float[Array | np.ndarray, "6 n n *c"], *, cells: int) ->
 
 
 @functools.lru_cache(maxsize=8)
-def _placed(size: int, cells: int, dtype: str, device: jax.Device) -> Array:
+def _placed(size: int, cells: int, dtype: str, device: Any) -> Array:
     with jax.default_device(device):
         return jax.device_put(_inverse_gram(size, cells, dtype))
 

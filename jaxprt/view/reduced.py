@@ -42,7 +42,8 @@ class CoarseTransport(lobe.LobeTransport):
 
     def lobe_visibility(self, face, s, t, spread, points=None):
         """Visible fraction of each vertex's lobes, from the remaining scales."""
-        whole = lobe.LobeTransport(self.pyramid, self.vector, self.position, self.frame, self.edge)
+        none = jnp.zeros((0, len(self.position)), jnp.uint8)
+        whole = lobe.LobeTransport(self.pyramid, none, self.position, self.frame, self.edge)
         return whole.lobe_visibility(face, s, t, jnp.maximum(spread, self.spread), points)
 
 
@@ -178,8 +179,10 @@ def systems_of(scene: RelitScene) -> list[Exported]:
 def _exported(name: str, system: System) -> Exported:
     own = system.system if isinstance(system, bright_texels.BrightTexels) else system
     if isinstance(own, lobe.MatteSystem):
-        vector = lobe.diffuse.harmonics_of(own.transport.vector, size=own.transport.size, degree=_DEGREE)
-        own = harmonic.DiffuseSystem(harmonic.TransferVector(vector[:, None], own.transport.position), own.albedo)
+        matte = own.transport
+        vector = lobe.diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
+        transport = harmonic.TransferVector(vector[:, None], put(matte.position))
+        own = harmonic.DiffuseSystem(transport, put(own.albedo))
     if not isinstance(own, Exported):
         raise ValueError(
             f"part {name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got "

@@ -49,9 +49,10 @@ class DiffuseTracer:
         self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
         self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
 
-    def at_vertices(self, vertex: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "v l c"]:
-        """Reflected radiance at some vertices of the surface, before subdivision; 0 at others."""
+    def at_vertices(self, vertex: Int[np.ndarray, " n"] | None = None) -> Float32[np.ndarray, "v l c"]:
+        """Reflected radiance at some or all vertices of the surface, before subdivision; 0 at others."""
         result = np.zeros((len(self._mesh.position), *self._samples.weight.shape[1:]), np.float32)
+        vertex = np.arange(len(result)) if vertex is None else vertex
         start = start_points(self._mesh, self._rays)
         result[vertex] = self._light(start[vertex], np.asarray(self._mesh.normal, np.float64)[vertex])
         return result

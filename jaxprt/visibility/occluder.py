@@ -201,6 +201,28 @@ class Occluder:
             raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
         packed.shares(surface, points, texels, part, share)
 
+    def lit(
+        self,
+        surface: tuple,
+        points: tuple,
+        fields: tuple,
+        lamps: tuple,
+        part: slice,
+        result: Float32[np.ndarray, "m 4 p"],
+    ) -> None:
+        """What some points of a picture see of lamps; `lamp_rays.moments` calls it.
+
+        Raises:
+            RuntimeError: The Embree library that embreex ships has no packets of rays.
+        """
+        from jaxprt.visibility import lamp_packets  # numba takes half a second to import
+
+        with self._building:
+            packed = self._packed
+        if packed is None:
+            raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
+        lamp_packets.trace(packed.embree, surface, points, fields, lamps, part.start, part.stop, result)
+
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.
 

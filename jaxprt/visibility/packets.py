@@ -72,6 +72,11 @@ class Packets:
         # RTCOccludedArguments: flags and features, 32 bits each; context; filter; callback.
         self._arguments = np.array([COHERENT | EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
 
+    @property
+    def embree(self) -> tuple[int, int, int]:
+        """Addresses of `rtcOccluded16`, of the scene, and of the arguments."""
+        return self._occluded, self._scene, self._arguments.ctypes.data
+
     def blocked(
         self,
         origin: Float32[np.ndarray, "m 3"],
@@ -234,12 +239,12 @@ def callback(signature: Any, function: Callable) -> Any:
         return numba.cfunc(signature)(function)
 
 
-def compiled(function: Callable) -> Callable:
+def compiled(function: Callable, **options: Any) -> Callable:
     """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
     try:
-        return numba.njit(nogil=True, cache=True)(function)
+        return numba.njit(nogil=True, cache=True, **options)(function)
     except RuntimeError:
-        return numba.njit(nogil=True)(function)
+        return numba.njit(nogil=True, **options)(function)
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
@@ -258,7 +263,7 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
             for axis in range(3):
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
-        _whole_ray(ray)
+        whole_ray(ray)
         call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
             found[packet + lane] = ray[8, lane] < 0
@@ -266,7 +271,7 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
 
 @no_type_check
 @compiled
-def _start(surface, points, point, lane, origin, facing):
+def start(surface, points, point, lane, origin, facing):
     """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
 
     The normal is zero in padding and for triangles without an area, which have no side to start from.
@@ -315,7 +320,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
     for packet in range(first, last, 16):
         lanes = min(16, last - packet)
         for lane in range(lanes):
-            _start(surface, points, packet + lane, lane, origin, facing)
+            start(surface, points, packet + lane, lane, origin, facing)
         for texel in range(len(count)):
             visible[:] = 0
             for lane in range(16):
@@ -332,7 +337,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
                     for axis in range(3):
                         ray[axis, lane] = origin[place, axis, here]
                         ray[4 + axis, lane] = direction[texel, stratum, axis]
-                _whole_ray(ray)
+                whole_ray(ray)
                 passed[:] = 1.0
                 call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
                 for lane in range(lanes):
@@ -343,7 +348,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
 
 @no_type_check
 @compiled
-def _whole_ray(ray):
+def whole_ray(ray):
     """Fills in the fields of sixteen rays that are always the same."""
     number = ray.view(np.uint32)
     for lane in range(16):

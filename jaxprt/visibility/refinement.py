@@ -26,6 +26,7 @@ from jaxprt.scene.subdivision import Division, Edges
 from jaxprt.visibility import blocks, shown
 from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.diffuse import DiffuseTracer
+from jaxprt.visibility.occluder import check
 
 ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
 
@@ -84,6 +85,7 @@ def refine(
     compare the endpoints of each edge instead.
     """
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
+    check(mesh, "mesh")
     shadowing = mesh if occluder is None else relative(occluder, mesh.origin)
     return subdivision.subdivide(mesh, divisions(mesh, shadowing, views=shown.cameras(mesh, (), ()), **options)[0])
 

@@ -69,8 +69,7 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
     position = np.asarray(mesh.position, np.float32)
     face = np.ascontiguousarray(mesh.face, np.int32)
     surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
-    pattern = _BAYER[points.row % 8, points.column % 8]
-    fields = np.asarray(points.triangle, np.int64), *(np.asarray(x, np.float32) for x in points[1:3]), pattern
+    drawn = *fields(points), pattern(points)
     middle = rays.direction.mean(1)
     # Texels start at different places, so that their dither patterns do not add up.
     first = (np.arange(len(rays.count)) * 37) % PLACES
@@ -78,5 +77,16 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
     share = np.empty((len(rays.count), len(points.triangle)), np.uint8)
     parts = [slice(i, min(i + _PART, share.shape[1])) for i in range(0, share.shape[1], _PART)]
     with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(lambda part: occluder.shares(surface, fields, texels, part, share), parts))
+        list(pool.map(lambda part: occluder.shares(surface, drawn, texels, part, share), parts))
     return share
+
+
+def fields(points: PicturePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, barycentric coordinates and slopes of points, as the loops over packets take them."""
+    barycentric, slope = (np.ascontiguousarray(each, np.float32) for each in points[1:3])
+    return np.ascontiguousarray(points.triangle, np.int64), barycentric, slope
+
+
+def pattern(points: PicturePoints) -> Int[np.ndarray, " p"]:
+    """Number in the dither pattern of each point's pixel, from 0 to 63."""
+    return _BAYER[points.row % 8, points.column % 8]

@@ -201,7 +201,9 @@ def test_primaries_become_rec709():
     np.testing.assert_allclose(read(bytes([128, 128, 128, 129]), 1, head=HEAD + equal_energy)[0, 0], 1, rtol=1e-6)
     rec709 = b"PRIMARIES=.64 .33 .30 .60 .15 .06 .3127 .3290\n"
     np.testing.assert_array_equal(read(RED + SKY, 2, head=HEAD + rec709)[0], values(RED, SKY))
-    for wrong in (b"1 2 3", b"0 0 0 0 0 0 0 0", b"a b c d e f g h"):
+    unstated = b"PRIMARIES=0 0 0 0 0 0 0 0\n"
+    np.testing.assert_array_equal(read(RED + SKY, 2, head=HEAD + unstated)[0], values(RED, SKY))
+    for wrong in (b"1 2 3", b"0 0 0 0 0 0 0 1", b"a b c d e f g h"):
         with pytest.raises(ValueError, match=r"PRIMARIES of sky\.hdr must"):
             read(RED, 1, head=HEAD + b"PRIMARIES=" + wrong + b"\n")
 

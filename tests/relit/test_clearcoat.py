@@ -120,7 +120,7 @@ def test_textures_of_layers_multiply_their_factors():
 def test_relit_scenes_with_coats_are_the_exact_sum():
     light = builtin.studio(size=16)
     scene = spheres(COATED, TexturedMaterial([0.2, 0.5, 0.3], 0.0, 0.5))
-    relit = prt.precompute(scene, system="lobe", size=16, progress=False)
+    relit = prt.precompute(scene, refine=False, system="lobe", size=16, progress=False)
     eye = np.array([1.5, 1.0, 6.0])
     ours = np.asarray(relit.radiance(light, eye=eye))
     count = len(scene.parts[0].mesh.position)
@@ -146,7 +146,7 @@ def test_relit_scenes_with_coats_are_the_exact_sum():
 
 
 def test_pages_show_the_base_with_a_warning():
-    relit = prt.precompute(spheres(COATED), system="lobe", size=16, progress=False)
+    relit = prt.precompute(spheres(COATED), refine=False, system="lobe", size=16, progress=False)
     with pytest.warns(UserWarning, match="shows these parts without their clear coats: 'ball 0'"):
         bare = without_coats(relit)
     alone = channels.of_part(spheres(dataclasses.replace(COATED, clearcoat=0.0)).parts[0])

@@ -34,7 +34,7 @@ def scene():
 @pytest.mark.long
 @pytest.mark.usefixtures("strict", "coarse", "unchecked")
 def test_verbs_of_scenes_take_every_float_type_under_strict_promotion(close):
-    relit = prt.precompute(scene(), system="harmonic", size=SIZE, bounces=1, progress=False)
+    relit = prt.precompute(scene(), refine=False, system="harmonic", size=SIZE, bounces=1, progress=False)
     radiance = np.random.default_rng(0).uniform(0.2, 1.0, (6, SIZE, SIZE, 3)).astype(jnp.bfloat16)
     exact = relit.radiance(prt.Environment(jnp.asarray(radiance, "float64")), eye=EYE)
     for dtype in ("bfloat16", "float32"):

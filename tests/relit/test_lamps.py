@@ -44,7 +44,7 @@ def scene() -> Scene:
 
 @functools.cache
 def relit() -> RelitScene:
-    return prt.precompute(scene(), system=Harmonics(degree=2), size=8, progress=False)
+    return prt.precompute(scene(), refine=False, system=Harmonics(degree=2), size=8, progress=False)
 
 
 def test_parts_that_emit_light_others_and_shine_themselves(close):

@@ -64,13 +64,13 @@ def light(seed: int = 1) -> Environment:
 @functools.cache
 def relit(system=None, bounces: int = 0) -> RelitScene:
     system = Lobes(lobes=4, texels=0) if system is None else system
-    return prt.precompute(scene(), system=system, size=SIZE, bounces=bounces, progress=False)
+    return prt.precompute(scene(), refine=False, system=system, size=SIZE, bounces=bounces, progress=False)
 
 
 @pytest.mark.parametrize("system", [Lobes(4, 8), Harmonics(degree=3), Terms(terms=4, keep=384, resolution=16)], ids=str)
 def test_a_white_scene_in_a_white_light_is_white_to_its_edges(system):
     white = scene(floor=Lambert(1.0), ball=Lambert(1.0))
-    ready = prt.precompute(Scene([white["ball"]]), system=system, size=SIZE, progress=False)
+    ready = prt.precompute(Scene([white["ball"]]), refine=False, system=system, size=SIZE, progress=False)
     picture = np.asarray(ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), CAMERA))
     np.testing.assert_allclose(picture, 1, atol=0.03)
 
@@ -94,7 +94,9 @@ def test_pixels_are_nearer_to_the_exact_ones_than_vertices_are():
 def test_textures_are_read_at_the_pixels():
     # Two triangles in a light that is the same from everywhere: the picture is the texture.
     square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS)
-    ready = prt.precompute(Scene([Part("square", square, matte())]), system="lobe", size=SIZE, progress=False)
+    ready = prt.precompute(
+        Scene([Part("square", square, matte())]), refine=False, system="lobe", size=SIZE, progress=False
+    )
     above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 16, 16)
     picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above, samples=1)
     row = (np.arange(16) + 0.5) / 16
@@ -106,7 +108,9 @@ def test_far_textures_are_averaged():
     square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=8 * CORNERS)
     checks = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((4, 4)))[..., None] * np.ones(3)
     material = TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(checks))
-    ready = prt.precompute(Scene([Part("square", square, material)]), system="lobe", size=SIZE, progress=False)
+    ready = prt.precompute(
+        Scene([Part("square", square, material)]), refine=False, system="lobe", size=SIZE, progress=False
+    )
     above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 8, 8)
     picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above)
     np.testing.assert_allclose(picture, 0.5, atol=0.02)
@@ -194,7 +198,7 @@ def test_scenes_laid_over_devices_give_the_same_pictures(close):
 
 def test_exact_pixels_of_a_bare_square_are_closed_forms():
     square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]])), Lambert(0.5))
-    ready = prt.precompute(Scene([square]), system="harmonic", size=SIZE, progress=False)
+    ready = prt.precompute(Scene([square]), refine=False, system="harmonic", size=SIZE, progress=False)
     white = [Environment(jnp.full((6, SIZE, SIZE, 3), each)) for each in (1.0, 3.0)]
     exact = exact_pixels(ready.scene, ready.shading, white, CAMERA, pixels=40)
     inside = np.isclose(exact.color[0, :, 0], 0.5, atol=1e-3)
@@ -365,7 +369,7 @@ def balls(parts: int = 2, *, seed: int = 0) -> Scene:
 
 
 def made(scene: Scene) -> RelitScene:
-    return prt.precompute(scene, system=Lobes(texels=8), size=SIZE, progress=False)
+    return prt.precompute(scene, refine=False, system=Lobes(texels=8), size=SIZE, progress=False)
 
 
 def test_new_cameras_lights_materials_and_scenes_of_the_same_sizes_compile_nothing():

@@ -64,12 +64,12 @@ def sky():
 
 @pytest.fixture(scope="module")
 def planned(scene, sky):
-    return prt.plan(scene, environments=[sky], error=ASKED, rate=1e-3, progress=False)
+    return prt.plan(scene, refine=False, environments=[sky], error=ASKED, rate=1e-3, progress=False)
 
 
 @pytest.fixture(scope="module")
 def ready(scene, planned):
-    return prt.precompute(scene, system=planned.recipes, size=8, progress=False)
+    return prt.precompute(scene, refine=False, system=planned.recipes, size=8, progress=False)
 
 
 def test_the_error_asked_for_holds_from_other_views_and_under_another_light(scene, sky, planned, ready):
@@ -128,7 +128,7 @@ def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_pa
 
 def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
     part = prt.Scene([scene["ground"]])
-    found = prt.plan(part, environments=[sky], error=ASKED, rate=1e9, progress=False)
+    found = prt.plan(part, refine=False, environments=[sky], error=ASKED, rate=1e9, progress=False)
     good = [each for each in found.group[0].considered if each.error * planning.MARGIN <= ASKED]
     assert found.group[0].chosen.seconds == min(each.seconds for each in good)
     assert "slower than the 1e+09 frames per second asked for" in str(found)
@@ -136,7 +136,7 @@ def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
 
 def test_an_error_that_nothing_reaches_is_refused_with_the_best(scene, sky):
     with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for part 'ball', which .* reaches; got 1e-05"):
-        prt.plan(prt.Scene([scene["ball"]]), environments=[sky], error=1e-5, progress=False)
+        prt.plan(prt.Scene([scene["ball"]]), refine=False, environments=[sky], error=1e-5, progress=False)
 
 
 def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky, tmp_path, monkeypatch):
@@ -147,16 +147,16 @@ def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky,
     with pytest.warns(
         UserWarning, match=r"no system reaches an error of 0.0001 % for part 'ground': Harmonics.* is chosen"
     ):
-        ready = prt.precompute(part, **options)
+        ready = prt.precompute(part, refine=False, **options)
     found = prt.files.load(tmp_path / "plan")
     assert found.asked == 1e-6
     assert found.group[0].chosen.error == min(each.error for each in found.group[0].considered)
     assert ready.part_system(0).vertices == len(scene["ground"].mesh.position)
     with pytest.raises(ValueError, match=r"part must be the index of one of \d+ parts, got -1"):
         ready.part_system(-1)
-    prt.precompute(part, **options)  # The kept plan serves again,
+    prt.precompute(part, refine=False, **options)  # The kept plan serves again,
     with pytest.raises(ValueError, match="error must be at least"):  # but not one who insists.
-        prt.precompute(part, error=1e-6, **options)
+        prt.precompute(part, refine=False, error=1e-6, **options)
 
 
 def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monkeypatch):
@@ -164,17 +164,17 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
     ground = dataclasses.replace(scene["ground"], mesh=dataclasses.replace(scene["ground"].mesh, origin=far))
     part, eye = prt.Scene([ground]), np.add(VIEWS[0], far)
     options = {"environments": [sky], "path": tmp_path / "kept", "progress": False}
-    first = prt.precompute(part, error=ASKED, **options)
+    first = prt.precompute(part, refine=False, error=ASKED, **options)
     monkeypatch.setattr(planning, "_considered", None)  # Nothing is measured again.
-    again = prt.precompute(part, error=ASKED, **options)
+    again = prt.precompute(part, refine=False, error=ASKED, **options)
     np.testing.assert_array_equal(first.radiance(sky, eye=eye), again.radiance(sky, eye=eye))
     with pytest.raises(ValueError, match=r"was made for an error of 0\.3 .*, got 0\.2 .*: name another path"):
-        prt.precompute(part, error=0.2, **options)
+        prt.precompute(part, refine=False, error=0.2, **options)
     darker = Environment(0.5 * sky.radiance)
     painted = prt.Scene([prt.Part("ground", part.parts[0].mesh, Lambert(0.4))])
     for other, lights in ((part, [darker]), (painted, [sky])):
         with pytest.raises(ValueError, match="made for another scene, other materials or other lights"):
-            prt.precompute(other, error=ASKED, **options | {"environments": lights})
+            prt.precompute(other, refine=False, error=ASKED, **options | {"environments": lights})
 
 
 class Masked(eqx.Module):
@@ -244,14 +244,14 @@ def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_
 
     monkeypatch.setattr(sampling.Sample, "measure", stopped)
     with pytest.raises(InterruptedError):
-        prt.plan(ground, **options)
+        prt.plan(ground, refine=False, **options)
     monkeypatch.setattr(sampling.Sample, "measure", counted)
-    found = prt.plan(ground, **options)
+    found = prt.plan(ground, refine=False, **options)
     assert [each.recipe for each in found.group[0].considered] == measured
     assert len(measured) > 1
-    assert str(prt.plan(ground, **options)) == str(found)
+    assert str(prt.plan(ground, refine=False, **options)) == str(found)
     assert len(measured) == len(found.group[0].considered)
-    prt.plan(ground, **options | {"environments": [Environment(2 * sky.radiance)]})
+    prt.plan(ground, refine=False, **options | {"environments": [Environment(2 * sky.radiance)]})
     assert len(measured) == 2 * len(found.group[0].considered)
 
 
@@ -282,28 +282,28 @@ def test_a_scenes_own_lights_are_planned_for(scene, sky):
 def test_impossible_plans_are_refused(scene, lights, options, message):
     lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
     with pytest.raises(ValueError, match=message):
-        prt.plan(scene, environments=lights, progress=False, **options)
+        prt.plan(scene, refine=False, environments=lights, progress=False, **options)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_plans_are_for_scenes_and_lights(scene, sky):
     with pytest.raises(TypeError, match="scene must be of class Scene, which jaxprt"):
-        prt.plan(scene.mesh, environments=[sky])
+        prt.plan(scene.mesh, refine=False, environments=[sky])
     with pytest.raises(TypeError, match="environment 1 must be of class Environment"):
-        prt.plan(scene, environments=[sky, 3])
+        prt.plan(scene, refine=False, environments=[sky, 3])
 
 
 def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(scene):
     whole = Environment(jnp.ones((6, 8, 8, 3)))
     damaged = jax.tree.map(lambda each: each.at[2, 3, 4, 1].set(jnp.nan), whole)  # as a wrong computation makes it
     with pytest.raises(ValueError, match=r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)"):
-        prt.plan(scene, environments=[whole, damaged], progress=False)
+        prt.plan(scene, refine=False, environments=[whole, damaged], progress=False)
 
 
 def test_a_brdf_that_is_not_finite_has_no_plan(scene, sky):
     broken = prt.Scene([prt.Part("broken", scene["ball"].mesh, lambda wi, wo: jnp.nan * wi[..., :1])])
     with pytest.raises(ValueError, match=r"the radiance that the BRDF reflects, .* must be finite, got"):
-        prt.plan(broken, environments=[sky], progress=False)
+        prt.plan(broken, refine=False, environments=[sky], progress=False)
 
 
 def test_lobes_are_left_out_where_less_than_they_need_is_enough(planned):

@@ -52,14 +52,14 @@ def test_parts_cast_shadows_on_each_other_and_are_divided_alike_at_their_border(
 def test_a_refined_scene_can_be_relit_as_any_other(scene, light):
     fine = prt.refine(scene, error=0.1, environments=[light], progress=False)
     recipe = prt.relit.Harmonics(degree=1)
-    relit = prt.precompute(fine, system=recipe, size=8, progress=False)
+    relit = prt.precompute(fine, refine=False, system=recipe, size=8, progress=False)
     color = relit.radiance(light, eye=relit.camera.eye)
     assert len(color) == len(fine.mesh.position) > len(scene.mesh.position)
     assert np.isfinite(np.asarray(color)).all()
 
 
 def test_without_lights_any_light_counts(scene):
-    fine = prt.refine(scene, error=0.02, vertices=1000, progress=False)
+    fine = prt.refine(scene, error=0.03, vertices=2000, progress=False)
     assert len(fine.mesh.position) > len(scene.mesh.position) + 10
 
 
@@ -78,3 +78,40 @@ def test_what_is_no_scene_is_refused(scene, light, unchecked):
     )
     with pytest.raises(TypeError, match="part 'varying' must be one BRDF for all vertices"):
         prt.refine(Scene([varying]), error=1.0, progress=False)
+
+
+def test_precompute_divides_stores_the_division_and_says_which_vertices_are_the_files(scene, tmp_path):
+    options = {"system": prt.relit.Harmonics(degree=1), "size": 8, "path": tmp_path / "kept", "progress": False}
+    relit = prt.precompute(scene, refine=0.05, **options)
+    assert len(relit.mesh.position) > len(scene.mesh.position) + 10
+    np.testing.assert_array_equal(np.asarray(relit.mesh.position)[relit.file_vertex], scene.mesh.position)
+    np.testing.assert_array_equal(np.asarray(relit.mesh.region)[relit.file_vertex], scene.mesh.region)
+    again = prt.precompute(scene, refine=0.05, **options)
+    np.testing.assert_array_equal(again.mesh.face, relit.mesh.face)
+    with pytest.raises(ValueError, match="divides another scene, or for other cameras"):
+        prt.precompute(scene, refine=0.04, **options)
+    # Weights at the vertices of the file are interpolated like its colors.
+    blend = relit.appearances({"left": scene["left"].material})["left"].blend
+    count = len(scene["left"].mesh.position)
+    of_file = type(blend)(blend.weight[:count], tuple(row[:count] for row in blend.parameter))
+    light = prt.scene.builtin.daylight(size=8)
+    color = relit.radiance(light, eye=relit.camera.eye, materials={"left": of_file})
+    np.testing.assert_allclose(color, relit.radiance(light, eye=relit.camera.eye), rtol=1e-4, atol=1e-6)
+
+
+def test_meshes_stay_as_they_are_on_demand_and_where_nothing_is_gained(scene):
+    recipe = prt.relit.Harmonics(degree=1)
+    kept = prt.precompute(scene, refine=False, system=recipe, size=8, progress=False)
+    assert len(kept.mesh.position) == len(scene.mesh.position)
+    np.testing.assert_array_equal(kept.file_vertex, np.arange(len(scene.mesh.position)))
+    for wrong, error in (("fine", TypeError), (-0.1, ValueError), (float("nan"), ValueError)):
+        with pytest.raises(error, match="refine"):
+            prt.precompute(scene, refine=wrong, system=recipe, size=8, progress=False)
+
+
+def test_a_limit_of_vertices_is_told(scene):
+    with pytest.warns(UserWarning, match="at most 40 were allowed"):
+        relit = prt.precompute(
+            scene, refine=0.001, vertices=40, system=prt.relit.Harmonics(degree=1), size=8, progress=False
+        )
+    assert len(scene.mesh.position) < len(relit.mesh.position) <= 40

@@ -73,7 +73,7 @@ def relit(coarse, bound):
     sizes = {"system": Lobes(texels=0), "bounces": 2, "size": 16}
     with pytest.MonkeyPatch.context() as patch:
         bound(patch, bounces.precompute, edge=4, size=16, components=24, modes=32, patches=16)
-        return prt.precompute(scene(), **sizes, progress=False)
+        return prt.precompute(scene(), refine=False, **sizes, progress=False)
 
 
 @pytest.mark.parametrize("roughness", RANGE)

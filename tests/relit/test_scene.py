@@ -96,7 +96,7 @@ RECIPES = {
 
 @functools.cache
 def relit(name: str, *, rough: bool = True) -> RelitScene:
-    return prt.precompute(scene(wood(rough=rough)), system=RECIPES[name], size=SIZE, progress=False)
+    return prt.precompute(scene(wood(rough=rough)), refine=False, system=RECIPES[name], size=SIZE, progress=False)
 
 
 @functools.cache
@@ -152,7 +152,7 @@ def own_calls(name: str) -> prt.System:
 @pytest.mark.parametrize("name", ["lobe", "harmonic", "separable"])
 def test_a_scene_of_one_mesh_is_the_systems_own_bit_for_bit(name):
     alone = Scene([Part("ball", mesh("ball"), GLOSSY)])
-    ready = prt.precompute(alone, system=RECIPES[name], size=SIZE, progress=False)
+    ready = prt.precompute(alone, refine=False, system=RECIPES[name], size=SIZE, progress=False)
     expected = prt.radiance(own_calls(name), light(), eye=EYE)
     np.testing.assert_array_equal(ready.radiance(light(), eye=EYE), expected)
     np.testing.assert_array_equal(ready.mesh.position, mesh("ball").position)
@@ -161,7 +161,7 @@ def test_a_scene_of_one_mesh_is_the_systems_own_bit_for_bit(name):
 
 def test_parts_shadow_each_other():
     whole = relit("lobe").radiance(light(), eye=EYE)[BOUNDS[1] :]
-    alone = prt.precompute(Scene(scene().parts[2:]), system=RECIPES["lobe"], size=SIZE, progress=False)
+    alone = prt.precompute(Scene(scene().parts[2:]), refine=False, system=RECIPES["lobe"], size=SIZE, progress=False)
     open_wall = alone.radiance(light(), eye=EYE)
     assert np.all(whole < open_wall + 1e-4)
     assert np.mean(whole) < 0.95 * np.mean(open_wall)
@@ -169,7 +169,7 @@ def test_parts_shadow_each_other():
 
 def test_each_part_may_have_a_system_of_its_own_and_vertices_stay_in_the_meshs_order():
     systems = {"wall": RECIPES["separable"], "ball": RECIPES["harmonic"], "floor": RECIPES["lobe"]}
-    mixed = prt.precompute(scene(), system=systems, size=SIZE, progress=False)
+    mixed = prt.precompute(scene(), refine=False, system=systems, size=SIZE, progress=False)
     color = np.split(np.asarray(mixed.radiance(light(), eye=EYE)), BOUNDS)
     same = relit("lobe"), relit("harmonic"), relit("separable", rough=False)
     for number, (got, other) in enumerate(zip(color, same, strict=True)):
@@ -206,7 +206,7 @@ def test_a_batch_of_lights_is_each_light_by_itself():
 @pytest.mark.parametrize("name", ["harmonic", "lobe"])
 def test_another_material_is_the_scene_precomputed_with_it(name, close):
     new = wood(seed=1, base_color=(0.9, 0.6, 0.3), specular_color=(0.4, 0.8, 1.0), ior=1.8)
-    again = prt.precompute(scene(new), system=RECIPES[name], size=SIZE, progress=False)
+    again = prt.precompute(scene(new), refine=False, system=RECIPES[name], size=SIZE, progress=False)
     got, expected = (
         np.asarray(ready.radiance(light(), eye=EYE, materials=materials))
         for ready, materials in ((relit(name), {"floor": new}), (again, None))
@@ -256,7 +256,7 @@ def test_gradients_in_materials_are_differences():
 @pytest.fixture(scope="module")
 def reflecting():
     """The scene with one bounce."""
-    return prt.precompute(scene(), system=RECIPES["harmonic"], bounces=1, size=SIZE, progress=False)
+    return prt.precompute(scene(), refine=False, system=RECIPES["harmonic"], bounces=1, size=SIZE, progress=False)
 
 
 def test_bounces_are_added_to_direct_light(reflecting):
@@ -273,7 +273,7 @@ def test_lights_of_small_faces_have_bounces(monkeypatch):
     coarser = functools.partial(bounces.precompute.__wrapped__, size=8, components=8, modes=8)
     monkeypatch.setattr(reflection.bounces, "precompute", coarser)
     parts = [Part("floor", mesh("floor"), Lambert(0.7)), Part("wall", mesh("wall"), Lambert(0.5))]
-    ready = prt.precompute(Scene(parts), system=RECIPES["harmonic"], bounces=1, size=4, progress=False)
+    ready = prt.precompute(Scene(parts), refine=False, system=RECIPES["harmonic"], bounces=1, size=4, progress=False)
     sky = Environment(jnp.ones((6, 4, 4, 3)))
     whole, direct = (np.asarray(prt.radiance(each, sky, eye=EYE)) for each in (ready, ready.direct))
     assert np.isfinite(whole).all()
@@ -296,7 +296,7 @@ def test_a_second_bounce_off_a_material_of_channels_is_kept():
     red = TexturedMaterial(base_color=(0.8, 0.1, 0.1), metallic=0.0, roughness=0.8)
     parts = [Part("floor", mesh("floor"), Lambert(0.7)), Part("wall", mesh("wall"), red)]
     once, twice = (
-        prt.precompute(Scene(parts), system=RECIPES["harmonic"], bounces=count, size=SIZE, progress=False)
+        prt.precompute(Scene(parts), refine=False, system=RECIPES["harmonic"], bounces=count, size=SIZE, progress=False)
         for count in (1, 2)
     )
     assert twice.bounces.tensor.second is not None
@@ -316,7 +316,7 @@ def test_parts_beyond_the_number_of_regions_send_light_together_if_they_are_alik
     for count in (2, 16):
         monkeypatch.setattr(reflection, "_REGIONS", count)
         options = {"system": RECIPES["harmonic"], "bounces": 1, "size": SIZE, "progress": False}
-        scenes[count] = prt.precompute(Scene([*parts[::2], *other, *parts[1::2]]), **options)
+        scenes[count] = prt.precompute(Scene([*parts[::2], *other, *parts[1::2]]), refine=False, **options)
     few, many = (scene.bounces.tensor for scene in scenes.values())
     assert (len(few.factor), len(many.factor)) == (3, 5)
     few, many, direct = (
@@ -329,7 +329,7 @@ def test_parts_beyond_the_number_of_regions_send_light_together_if_they_are_alik
 def test_two_bounces_go_on_from_the_store_of_one(tmp_path, monkeypatch):
     def reflected(count):
         options = {"system": RECIPES["harmonic"], "size": SIZE, "path": tmp_path / "store", "progress": False}
-        ready = prt.precompute(scene(), bounces=count, **options)
+        ready = prt.precompute(scene(), refine=False, bounces=count, **options)
         return ready.radiance(light(), eye=EYE) - ready.direct.radiance(light(), eye=EYE)
 
     once = reflected(1)
@@ -418,7 +418,7 @@ def test_the_camera_is_the_scenes_first_or_one_that_sees_all():
 
 def test_a_function_as_brdf_passes_through_programs():
     part = Part("ball", mesh("ball"), lambda wi, wo: GLOSSY(wi, wo))
-    ready = prt.precompute(Scene([part]), system=RECIPES["harmonic"], size=SIZE, progress=False)
+    ready = prt.precompute(Scene([part]), refine=False, system=RECIPES["harmonic"], size=SIZE, progress=False)
     color = jax.jit(lambda ready: ready.radiance(light(), eye=EYE))(ready)
     np.testing.assert_allclose(color, ready.radiance(light(), eye=EYE), rtol=1e-4)
 
@@ -426,19 +426,19 @@ def test_a_function_as_brdf_passes_through_programs():
 def test_a_second_call_with_the_same_folder_traces_nothing(tmp_path, monkeypatch):
     options = {"system": {"floor": "lobe", "ball": "harmonic", "wall": "harmonic"}, "size": SIZE, "progress": False}
     options["system"] |= {"floor": RECIPES["lobe"], "ball": RECIPES["harmonic"]}
-    first = prt.precompute(scene(), path=tmp_path / "kept" / "scene", **options)
+    first = prt.precompute(scene(), refine=False, path=tmp_path / "kept" / "scene", **options)
 
     def refuse(*_, **__):
         raise AssertionError("rays were traced")
 
     monkeypatch.setattr(visibility.rays, "fractional", refuse)
-    second = prt.precompute(scene(), path=tmp_path / "kept" / "scene", **options)
+    second = prt.precompute(scene(), refine=False, path=tmp_path / "kept" / "scene", **options)
     np.testing.assert_array_equal(second.radiance(light(), eye=EYE), first.radiance(light(), eye=EYE))
     monkeypatch.undo()
     moved = eqx.tree_at(lambda each: each.parts[1].mesh.position, scene(), mesh("ball").position + 0.1)
     message = r"0_floor_lobe\.prt holds arrays that were computed from other inputs .* name another path or delete it"
     with pytest.raises(ValueError, match=message):
-        prt.precompute(moved, path=tmp_path / "kept" / "scene", **options)
+        prt.precompute(moved, refine=False, path=tmp_path / "kept" / "scene", **options)
 
 
 def test_names_of_systems_are_sizes_of_them():
@@ -470,23 +470,23 @@ def test_systems_that_a_scene_cannot_have_are_refused_before_rays_are_traced(nam
     system, error, message = BAD[name]
     monkeypatch.setattr(visibility.rays, "fractional", None)
     with pytest.raises(error, match=re.escape(message)):
-        prt.precompute(scene(), system=system, size=SIZE, progress=False)
+        prt.precompute(scene(), refine=False, system=system, size=SIZE, progress=False)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_sizes_bounces_and_scenes_of_another_kind_are_refused():
     for size in (0, 12, -8):
         with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
-            prt.precompute(scene(), system="harmonic", size=size)
+            prt.precompute(scene(), refine=False, system="harmonic", size=size)
     with pytest.raises(ValueError, match=r"bounces must be at least 0, .* got -1"):
-        prt.precompute(scene(), system="harmonic", bounces=-1)
+        prt.precompute(scene(), refine=False, system="harmonic", bounces=-1)
     for count, error in ((1.5, TypeError), (True, TypeError), ("2", ValueError)):
         with pytest.raises(error, match=f"bounces must be a whole number or 'all', got {count!r}"):
-            prt.precompute(scene(), system="harmonic", bounces=count)
+            prt.precompute(scene(), refine=False, system="harmonic", bounces=count)
     with pytest.raises(
         TypeError, match=r"the scene must be of class Scene, which jaxprt\.load_scene makes, got one of"
     ):
-        prt.precompute(mesh("ball"), system="harmonic")
+        prt.precompute(mesh("ball"), refine=False, system="harmonic")
 
 
 MATERIALS = {
@@ -519,7 +519,7 @@ def test_materials_that_a_scene_cannot_have_are_refused(name):
 def test_a_part_takes_any_metallic_roughness_material(name, close):
     """Other terms and roughness than the part was precomputed with; the system is that of the new material."""
     for new in (wood(roughness=1.0), wood(rough=False, roughness=0.2, specular=0.3), TexturedMaterial(0.8)):
-        again = prt.precompute(scene(new), system=RECIPES[name], size=SIZE, progress=False)
+        again = prt.precompute(scene(new), refine=False, system=RECIPES[name], size=SIZE, progress=False)
         color = relit(name).radiance(light(), eye=EYE, materials={"floor": new})
         close(color, again.radiance(light(), eye=EYE), tolerance=1e-5)
 

@@ -45,7 +45,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def relit(scene, coarse):
-    return prt.precompute(scene, system=Harmonics(degree=4), size=16, progress=False)
+    return prt.precompute(scene, refine=False, system=Harmonics(degree=4), size=16, progress=False)
 
 
 @pytest.fixture(scope="module")

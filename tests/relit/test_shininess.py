@@ -34,7 +34,7 @@ def light():
 def pair(request):
     """The first material, free to change, and the other one alone."""
     options = {"system": request.param, "size": SIZE, "progress": False}
-    return prt.precompute(scene(FIRST), **options), prt.precompute(scene(OTHER), **options)
+    return prt.precompute(scene(FIRST), refine=False, **options), prt.precompute(scene(OTHER), refine=False, **options)
 
 
 def off(found, true):
@@ -82,7 +82,7 @@ def test_an_exponent_sharper_than_the_standard_tables_has_a_table_of_its_own():
 
 def test_a_bounce_carries_the_changed_colors(light):
     system = prt.relit.Lobes(texels=2)
-    made = prt.precompute(scene(FIRST), system=system, bounces=1, size=SIZE, progress=False)
+    made = prt.precompute(scene(FIRST), refine=False, system=system, bounces=1, size=SIZE, progress=False)
     bare = made.direct
     first = len(made.scene["ball"].mesh.position)
     eye = made.camera.eye

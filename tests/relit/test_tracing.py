@@ -62,7 +62,7 @@ def relit() -> RelitScene:
         Part("floor", mesh("floor"), mirror(base_color=0.9 * jnp.ones(3))),
         Part("wall", mesh("wall"), wall(emissive=GLOW)),
     ]
-    return prt.precompute(Scene(parts), system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
+    return prt.precompute(Scene(parts), refine=False, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
 
 
 def light(seed: int = 1) -> Environment:
@@ -184,7 +184,7 @@ def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(clos
 def test_what_reflects_nothing_but_the_sky_shows_no_rays(close):
     ball = builtin.sphere(rings=7, sectors=10)
     alone = Scene([Part("ball", ball, mirror())])
-    ready = prt.precompute(alone, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
+    ready = prt.precompute(alone, refine=False, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
     view = ready.view(EYE)
     assert view.reflected is not None
     assert view.reflected.hit == ()
@@ -204,7 +204,7 @@ def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
         relit().with_rays(-1)
     assert relit().with_rays(0).view(EYE).reflected is None
     with pytest.raises(ValueError, match="rays must be a whole number of at least 0, at most 4096, got -2"):
-        prt.precompute(relit().scene, system="lobe", bounces=1, rays=-2)
+        prt.precompute(relit().scene, refine=False, system="lobe", bounces=1, rays=-2)
 
 
 def test_embree_holds_the_triangles_of_the_last_scenes():

@@ -128,7 +128,7 @@ def test_brdfs_that_create_light_are_named(brdf, gain):
 def test_precompute_warns_of_both():
     scene = Scene([Part("ball", inside_out(BALL), Lambert(1.5))])
     with pytest.warns(UserWarning, match="from behind"), pytest.warns(UserWarning, match=r"reflects 1\.5 times"):
-        prt.precompute(scene, system="harmonic", size=2, progress=False)
+        prt.precompute(scene, refine=False, system="harmonic", size=2, progress=False)
 
 
 @pytest.mark.parametrize("system", ["harmonic", "lobe", "separable"])
@@ -142,4 +142,4 @@ def test_precompute_warns_of_both():
 )
 def test_brdfs_of_wrong_values_are_refused_by_every_system(system, brdf, message):
     with pytest.raises(ValueError, match=f"part 'ball': the BRDF {message}"):
-        prt.precompute(Scene([Part("ball", BALL, brdf)]), system=system, size=4, progress=False)
+        prt.precompute(Scene([Part("ball", BALL, brdf)]), refine=False, system=system, size=4, progress=False)

@@ -67,7 +67,10 @@ def test_texels_are_kept_where_there_are_no_new_images():
 
 
 def test_textures_are_averaged_over_the_pixel_of_a_point(close):
-    """Four texels read the level of half that size, all texels their mean, and a thin pixel four probes."""
+    """Four texels read the level of half that size, all texels their mean, and a thin pixel four probes.
+
+    A pixel counts as smaller than it is, because levels are blurred themselves.
+    """
     texels = image(16, 16, 3, seed=4)
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
     square = make_mesh(corner, np.array([[0, 2, 1]]), texture=corner[:, [0, 2]])
@@ -77,7 +80,8 @@ def test_textures_are_averaged_over_the_pixel_of_a_point(close):
 
     def read(across, down):
         weight = np.stack([1 - place.sum(1), *place.T])
-        slope = np.broadcast_to(np.array([[-sum(way), *way] for way in (across, down)])[..., None], (2, 3, 3))
+        wide = np.array([[-sum(way), *way] for way in (across, down)]) / material_table._SHARPER
+        slope = np.broadcast_to(wide[..., None], (2, 3, 3))
         points = Points(np.repeat([[0], [1], [2]], 3, 1).astype(np.int32), weight, slope.astype(np.float32))
         return table.at(points).values.base_color
 

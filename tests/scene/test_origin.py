@@ -134,7 +134,7 @@ def scene(shift):
 @pytest.fixture(scope="module")
 def relit():
     return [
-        prt.precompute(scene(shift), system=prt.relit.Harmonics(degree=2), size=8, progress=False)
+        prt.precompute(scene(shift), refine=False, system=prt.relit.Harmonics(degree=2), size=8, progress=False)
         for shift in (np.zeros(3), FAR)
     ]
 

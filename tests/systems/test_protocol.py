@@ -197,7 +197,7 @@ def of_parts(name: str, model: str, **options) -> tuple[prt.System, Any]:
     """A scene whose parts are the regions of a mesh, all with one BRDF."""
     parts = [prt.Part(str(n), part, MODELS[model]) for n, part in enumerate(split(mesh(name)))]
     recipe = prt.relit.Lobes(lobes=6, texels=0)
-    return prt.precompute(prt.Scene(parts), system=recipe, size=SIZE, progress=False, **options), None
+    return prt.precompute(prt.Scene(parts), refine=False, system=recipe, size=SIZE, progress=False, **options), None
 
 
 def between_parts(name: str, model: str) -> tuple[prt.System, Any]:
@@ -259,12 +259,13 @@ def test_a_white_surface_in_a_white_furnace_is_white(name):
 
 # Root mean square and largest error of white metals in a white furnace, by roughness, from all views. Lobes of .05 are
 # narrower than the `coarse` directions: the package's own leave .004 and .06. Lobes of tables of 8 x 8 are off near the
-# horizon; maps of 16 x 16, whose texels are wider than narrow lobes, hold wide ones alone.
+# horizon; lobes of .3 are narrower than splines over 8 x 8 texels, which read some of what is below it. Maps of 16 x 16
+# have texels wider than narrow lobes and hold wide ones alone.
 METALS = {
     "harmonic": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
     "harmonic, clustered": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
-    "lobe": {0.05: (0.15, 0.6), 0.3: (0.02, 0.06), 1.0: (0.01, 0.04)},
-    "lobe, bright texels": {0.05: (0.15, 0.6), 0.3: (0.02, 0.06), 1.0: (0.01, 0.04)},
+    "lobe": {0.05: (0.15, 0.6), 0.3: (0.022, 0.09), 1.0: (0.01, 0.04)},
+    "lobe, bright texels": {0.05: (0.15, 0.6), 0.3: (0.022, 0.09), 1.0: (0.01, 0.04)},
     "separable": {1.0: (0.02, 0.04)},
     "separable, clustered": {1.0: (0.02, 0.04)},
 }
@@ -422,7 +423,8 @@ def hold_to_differences(function, start, directions) -> None:
     for step, most in SLOPE.items():
         ends = [[float(value(start + sign * step * direction)) for sign in (1, -1)] for direction in directions]
         found = np.array([(high - low) / (2 * step) for high, low in ends])
-        assert np.linalg.norm(found - expected) <= most * np.linalg.norm(expected), (step, found, expected)
+        rounding = 4 * np.finfo(np.float32).eps * abs(float(value(start))) / step
+        assert np.linalg.norm(found - expected) <= most * np.linalg.norm(expected) + rounding, (step, found, expected)
 
 
 @each_system

@@ -87,7 +87,7 @@ def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
 def test_ranges_of_a_part_of_a_scene_are_rows_of_the_part(close):
     ball, floor = builtin.sphere(rings=8, sectors=12), builtin.plane(cells=8)
     parts = [prt.Part("ball", ball, prt.brdf.Lambert(0.5)), prt.Part("floor", floor, prt.brdf.Lambert(0.5))]
-    relit = prt.precompute(prt.Scene(parts), system="harmonic", size=SIZE, progress=False)
+    relit = prt.precompute(prt.Scene(parts), refine=False, system="harmonic", size=SIZE, progress=False)
     light = builtin.daylight(size=SIZE)
     whole, system = relit.radiance(light, eye=EYE), relit.part_system(1)
     assert system.vertices == len(floor.position)
@@ -111,7 +111,7 @@ def test_what_is_no_system_of_one_mesh_has_no_ranges(sparse, brdf):
     system = separable.SeparableSystem(sparse, brdf)
     points = prt.scene.points.on_triangles(mesh.face, np.array([0, 1]), np.full((2, 3), 1 / 3, np.float32))
     part = prt.Part("ball", mesh, prt.brdf.Lambert(0.5))
-    scene = prt.precompute(prt.Scene([part]), system="harmonic", size=SIZE, progress=False)
+    scene = prt.precompute(prt.Scene([part]), refine=False, system="harmonic", size=SIZE, progress=False)
     for value in (mesh, scene, prt.total(system, system), system.at(points)):
         with pytest.raises(TypeError, match="value must be a"):
             ranges.take(value, 0, 2)

@@ -42,8 +42,8 @@ def systems():
     scene = Scene(parts, cameras=[eye])
     options = {"size": SIZE, "progress": False}
     return {
-        "lobes": prt.precompute(scene, system=prt.relit.Lobes(8, texels=2), bounces=1, **options),
-        "harmonics": prt.precompute(scene, system=prt.relit.Harmonics(2), **options),
+        "lobes": prt.precompute(scene, refine=False, system=prt.relit.Lobes(8, texels=2), bounces=1, **options),
+        "harmonics": prt.precompute(scene, refine=False, system=prt.relit.Harmonics(2), **options),
     }
 
 

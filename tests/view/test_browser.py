@@ -435,7 +435,7 @@ def test_a_far_kernel_sends_bytes_of_what_is_seen_first(hand, session, monkeypat
 
 def test_the_plane_of_blinn_phong_changes_exponent_and_reflectance(browser, lights):
     ball = prt.Part("ball", prt.scene.builtin.sphere(rings=8, sectors=16), prt.brdf.BlinnPhong(0.3, 0.2, 20.0))
-    made = prt.precompute(prt.Scene([ball]), system=prt.relit.Lobes(), size=8, progress=False)
+    made = prt.precompute(prt.Scene([ball]), refine=False, system=prt.relit.Lobes(), size=8, progress=False)
     server = Server(Session(made, environments=lights))
     hand = Hand(browser, server.url)
     plane = hand.page.locator("canvas.plane")

@@ -132,7 +132,7 @@ def mixed(lights, tmp_path_factory):
     ]
     lobes = prt.relit.Lobes(12, texels=2)
     recipes = {"shiny": lobes, "soft": prt.relit.Harmonics(2, laplacian=0.4), "ground": lobes}
-    made = prt.precompute(Scene(parts), system=recipes, size=8, progress=False)
+    made = prt.precompute(Scene(parts), refine=False, system=recipes, size=8, progress=False)
     return made, view.export(made, tmp_path_factory.mktemp("mixed") / "mixed.html", environments=lights)
 
 
@@ -251,7 +251,7 @@ def test_parts_with_one_kind_of_material_share_a_table(recipe):
     ]
     pairs = zip(meshes, materials.items(), strict=True)
     scene = Scene([Part(name, mesh, material) for mesh, (name, material) in pairs])
-    made = prt.precompute(scene, system=recipe, size=8, progress=False)
+    made = prt.precompute(scene, refine=False, system=recipe, size=8, progress=False)
     content, arrays = parts.content(coarse(made, 2, texels=False), 2)
     first, shiny, second, matte = content["parts"]
     assert first["tableStart"] == second["tableStart"] == 0
@@ -263,7 +263,7 @@ def test_parts_with_one_kind_of_material_share_a_table(recipe):
 def test_matte_scene_needs_no_visibility(browser, lights, look, tmp_path):
     matte = TexturedMaterial(base_color=(0.4, 0.5, 0.4), metallic=0.0, specular=0.0)
     scene = Scene([Part("ball", builtin.sphere(rings=8, sectors=16), matte)])
-    made = prt.precompute(scene, system=prt.relit.Harmonics(3), size=8, progress=False)
+    made = prt.precompute(scene, refine=False, system=prt.relit.Harmonics(3), size=8, progress=False)
     piece = view.export(made, tmp_path / "matte.html", environments=lights)
     assert piece.edge == 0
     assert piece.error < 0.01

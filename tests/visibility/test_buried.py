@@ -32,7 +32,7 @@ def moved(mesh, scene, monkeypatch):
     occluder = Occluder(scene)
     found = starts.start_points(mesh, occluder)
     with monkeypatch.context() as patch:
-        patch.setattr(starts, "out_of_solids", lambda mesh, occluder, start, *more: start)
+        patch.setattr(starts, "out_of_solids", lambda mesh, occluder, start, *more: (start, np.zeros(len(start), bool)))
         before = starts.start_points(mesh, occluder)
     return found, np.any(found != before, axis=1)
 

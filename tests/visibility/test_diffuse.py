@@ -64,7 +64,7 @@ def test_light_in_the_middle_of_edges_is_what_a_vertex_there_gets(mesh, light, p
     position = np.asarray(divided.position)
     normal = np.concatenate([mesh.normal, subdivision.middle_normal(np.asarray(mesh.normal), division.parent)])
     offset = tracer.offset[division.origin]
-    found = tracer.at(position, normal, division.face, offset, division.face, np.arange(count, len(position)))
+    found, _ = tracer.at(position, normal, division.face, offset, division.face, np.arange(count, len(position)))
     close(found, DiffuseTracer(divided, divided, samples, pool).at_vertices()[count:], tolerance=1e-3)
 
 
@@ -86,4 +86,5 @@ def test_an_occluder_may_have_the_surface_or_not_or_a_part_of_it(light, pool):
 def test_no_points_have_no_light(light, pool):
     tracer = DiffuseTracer(plane(0), plane(0), light_samples.importance([light, light], count=8), pool)
     none = np.zeros((0, 3), int)
-    assert tracer.at(np.zeros((0, 3)), np.zeros((0, 3)), none, tracer.offset[:0], none, none[:, 0]).shape == (0, 2, 3)
+    found, buried = tracer.at(np.zeros((0, 3)), np.zeros((0, 3)), none, tracer.offset[:0], none, none[:, 0])
+    assert (found.shape, buried.shape) == ((0, 2, 3), (0,))

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -173,7 +173,9 @@ def _decoded(
             value = [
                 _seen(corner[_TAPS * i + j], place, number, bits=scale.bits).astype(spread.dtype) for corner in own
             ]
-            return value[0] if corner_weight is None else sum(x * w for x, w in zip(value, corner_weight, strict=True))
+            if corner_weight is None:
+                return value[0]
+            return reduce(jnp.add, (x * w for x, w in zip(value, corner_weight, strict=True)))
 
         sums = _smooth(seen, edge, s, t, rim=number + step >= scale.bits)
         result = [total + value * part for total, value in zip(result, sums, strict=True)]
@@ -199,7 +201,7 @@ def _smooth(seen: Callable[[int, int], Array], edge: Array, s: Array, t: Array, 
     total, by_s, by_t = [jnp.zeros_like(s)] * 3
     for j in range(_TAPS):
         column = [seen(i, j) for i in range(_TAPS)]
-        mean = sum(x * w for x, w in zip(column, down, strict=True))
+        mean = reduce(jnp.add, (x * w for x, w in zip(column, down, strict=True)))
         parts = [x * w for x, w in zip(column, by_down, strict=True)]
         slope = parts[0] + parts[1] + parts[2]
         outside = parts[0] * outside_down[0] + parts[2] * outside_down[1]

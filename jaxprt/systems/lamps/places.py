@@ -1,0 +1,101 @@
+"""Places on lamps for rays from the points of a picture, and the transport at these points."""
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Float32, Int
+
+from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.scene import PointLight
+from jaxprt.systems.lamps.transport import LampTransport, sampled
+from jaxprt.visibility.lamp_rays import LampPlaces
+
+_PLACES = 4096  # places on a surface to which rays may go
+_LEVELS = (64, 256, 1024, _PLACES)  # places whose light is added up, from far lamps to close ones
+_PIECES = 4  # pieces of each surface, as `transport.precompute` has by default
+_FLAT = 0.99  # smallest length of the sum of normals around a place, relative to their number
+_RAYS = 16  # first rays from each point, which all lamps share
+_FEWEST, _MOST = 4, 8  # of these for each lamp
+
+
+def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"]) -> LampPlaces:
+    """Places on lamps.
+
+    Args:
+        lamps: Emitting surfaces and point lights, in the coordinates of the points that they light.
+        power: The power of each lamp, in any unit. Stronger lamps get more rays, if there are many.
+
+    Raises:
+        ValueError: A surface has no area, or its positions are not finite.
+    """
+    rows, first, count, total = [], [], [], 0
+    for lamp in lamps:
+        levels = _levels(lamp)
+        size = np.array([len(place) for place, _ in levels])
+        first.append(total + np.cumsum(size) - size)
+        count.append(size // (_PIECES if isinstance(lamp, Mesh) else 1))
+        rows += levels
+        total += int(size.sum())
+    place, area = (np.concatenate(each).astype(np.float32) for each in zip(*rows, strict=True))
+    pieces = np.array([_PIECES if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
+    share = np.asarray(power, np.float64) / max(float(np.sum(power)), np.finfo(float).tiny)
+    wanted = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
+    strata = np.where(pieces == 1, _FEWEST, np.clip(wanted, _FEWEST, _MOST)).astype(np.int64)
+    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), pieces, strata)
+
+
+def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Places and areas at each level. Levels too coarse for the curvature of a lamp are empty."""
+    empty = np.zeros((0, 3))
+    if isinstance(lamp, PointLight):
+        alone = np.asarray(lamp.position, np.float64)[None], np.zeros((1, 3))
+        return [(empty, empty)] * (len(_LEVELS) - 1) + [alone]
+    place, area = sampled(lamp, count=_PLACES)
+    order = _order(place)
+    place, area = place[order], area[order]
+    whole, levels = np.linalg.norm(area, axis=1).sum(), []
+    for count in _LEVELS[:-1]:
+        middle, total = place.reshape(count, -1, 3).mean(1), area.reshape(count, -1, 3).sum(1)
+        flat = np.linalg.norm(total, axis=1).sum() >= _FLAT * whole
+        levels.append((middle, total) if flat else (empty, empty))
+    return [*levels, (place, area)]
+
+
+def _order(place: Float[np.ndarray, "s 3"]) -> Int[np.ndarray, " s"]:
+    """Order of places, a power of two of them, by repeated halving across the longest extent."""
+    order = np.arange(len(place))[None]
+    while order.shape[1] > 1:
+        axis = np.argmax(np.ptp(place[order], axis=1), 1)
+        along = np.take_along_axis(place[order], axis[:, None, None], 2)[..., 0]
+        order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), 1).reshape(2 * len(order), -1)
+    return order[:, 0]
+
+
+def at_points(
+    moment: Float32[np.ndarray, "m 4 p"],
+    position: Float[Array, "p 3"],
+    frame: Float[Array, "p 3 3"],
+    lamps: Sequence[Mesh | PointLight],
+) -> LampTransport:
+    """The transport of lamps to the points of a picture.
+
+    Args:
+        moment: The result of `jaxprt.visibility.lamp_rays.moments`.
+        position: Positions of the points.
+        frame: Their shading frames; rows are tangent, bitangent, normal.
+        lamps: The lamps, in the order of their places.
+    """
+    moment, where = moment.copy(), np.asarray(position)
+    sizes = [_PIECES if isinstance(lamp, Mesh) else 1 for lamp in lamps]
+    for row, lamp in zip(np.cumsum(sizes) - sizes, lamps, strict=True):
+        if isinstance(lamp, PointLight) and lamp.axis is not None:
+            way = where - np.asarray(lamp.position, where.dtype)
+            way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), np.finfo(where.dtype).tiny)
+            moment[row] *= lamp.share(way)
+    solid, direction = moment[:, 0], moment[:, 1:]
+    # All of it lies above the horizon, where the cosine is linear in the direction.
+    cosine = np.maximum(np.einsum("mcp,pc->mp", direction, np.asarray(frame)[:, 2]), 0)
+    arrays = (np.ascontiguousarray(each, where.dtype) for each in (solid, cosine, direction))
+    number = tuple(lamp for lamp, size in enumerate(sizes) for _ in range(size))
+    return LampTransport(*jax.device_put(tuple(arrays)), position, frame, number)

@@ -1,0 +1,93 @@
+"""Shadows of bright texels by rays from the points of pictures, beside closed forms."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxprt as prt
+from jaxprt.relit import Lobes, shadows
+from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial
+from jaxprt.scene.mesh import make_mesh
+from jaxprt.sphere import cubemap
+
+SIZE = 8
+CAMERA = Camera([0.0, 4.0, 0.001], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 0.9, 64, 64)
+SQUARE = np.array([[-1.0, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]])
+FACE = np.array([[0, 1, 2], [0, 2, 3]])
+SUN = 2 * SIZE**2 + (SIZE // 2) * SIZE + SIZE - 1  # a texel near +y
+HEIGHT = 0.6  # of the lid
+
+
+def sunny(strength: float = 50.0, texel: int = SUN) -> Environment:
+    radiance = jnp.full((6 * SIZE**2, 3), 0.2).at[texel].set(strength)
+    return Environment(radiance.reshape(6, SIZE, SIZE, 3))
+
+
+@pytest.fixture(scope="module")
+def relit():
+    """A floor of four vertices, all of them in the sun, and a small lid above its middle."""
+    floor = Part("floor", make_mesh(1.5 * SQUARE, FACE), TexturedMaterial(metallic=0.0, specular=0.0))
+    lid = make_mesh(0.4 * SQUARE + [0, HEIGHT, 0], FACE)
+    scene = Scene([floor, Part("lid", lid, TexturedMaterial(metallic=0.0, specular=0.0))], [CAMERA])
+    return prt.precompute(scene, refine=False, system=Lobes(lobes=12, texels=4), size=SIZE, progress=False)
+
+
+def test_the_shadow_of_a_sun_is_where_it_belongs_on_a_floor_of_four_vertices(relit):
+    traced = np.asarray(relit.picture(sunny(), samples=1))[..., 0]
+    without = np.asarray(relit.picture(sunny(), samples=1, shadows="vertices"))[..., 0]
+    ray = np.asarray(prt.image.raster.ray_direction(CAMERA), float)
+    place = np.asarray(CAMERA.eye) - ray * (np.asarray(CAMERA.eye)[1] / ray[..., 1])[..., None]
+    way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)[SUN]
+    high = (place + HEIGHT / way[1] * way)[..., [0, 2]]  # where the ray to the sun's middle passes the lid
+    blur = HEIGHT * 2 / SIZE  # penumbra of the texel
+    shown = np.any(np.abs(place[..., [0, 2]]) > 0.4 * 4 / (4 - HEIGHT) + 0.06, -1)  # not behind the lid
+    dark = np.all(np.abs(high) < 0.4 - blur, -1) & shown
+    bright = np.any(np.abs(high) > 0.4 + blur, -1) & shown & np.all(np.abs(place[..., [0, 2]]) < 1.4, -1)
+    assert bright.sum() > 200
+    sun = 50.0 * np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)[SUN, 1] / np.pi
+    assert np.all(traced[bright] > 0.95 * sun)
+    assert np.all(without[bright] > 0.95 * sun)
+    assert dark.sum() >= 4
+    assert np.all(traced[dark] < 0.4)
+    assert np.all(without[dark] > 0.9 * sun)  # Interpolation between the corners knows nothing of the lid.
+
+
+def test_lights_without_bright_texels_trace_nothing(relit):
+    even = Environment(jnp.full((6, SIZE, SIZE, 3), 0.7))
+    view = relit.picture_view()
+    assert shadows.trace(relit.mesh, view.pixels, CAMERA.width, even, keep=False) is None
+    np.testing.assert_array_equal(view.picture(even), relit.picture_view(shadows="vertices").picture(even))
+
+
+def test_the_light_keeps_its_flux():
+    lit = shadows.untraced(sunny())
+    taken = np.asarray(sunny().radiance - lit.radiance).reshape(-1, 3)
+    np.testing.assert_allclose(taken[SUN], 49.8, atol=0.2)
+    assert np.all(np.delete(taken, SUN, 0) == 0)
+
+
+def test_a_kept_view_traces_new_texels_alone(relit, monkeypatch):
+    view, cast = relit.picture_view(), shadows._cast
+    traced = []
+    monkeypatch.setattr(shadows, "_cast", lambda *given: traced.append(len(given[3].count)) or cast(*given))
+    for light, count in ((sunny(), 1), (sunny(80.0), None), (sunny(texel=SUN + 3), 1)):
+        color = view.picture(light)
+        assert traced == ([] if count is None else [count])
+        traced.clear()
+        np.testing.assert_allclose(color, relit.picture(light), atol=2e-2 * float(jnp.max(color)))
+        traced.clear()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_other_words_are_refused(relit):
+    with pytest.raises(ValueError, match='shadows must be "rays", "vertices" or an Environment, got \'soft\''):
+        relit.picture(sunny(), shadows="soft")
+    with pytest.raises(TypeError, match='shadows must be "rays" or "vertices"'):
+        relit.picture(sunny(), shadows=sunny())
+
+
+def test_the_size_of_a_picture_and_nan_free_edges(relit):
+    wide = dataclasses.replace(CAMERA, width=33, height=17)
+    assert np.isfinite(np.asarray(relit.picture(sunny(), wide))).all()
