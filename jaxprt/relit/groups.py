@@ -19,7 +19,7 @@ from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
-from jaxprt.scene import Environment, Mesh
+from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
 from jaxprt.scene.mesh import frames, join
@@ -241,6 +241,8 @@ class Stage(eqx.Module):
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
+        point_lights: The point lights, in the coordinates of the mesh.
+        power: Power of each lamp as precomputed, by which lamps share rays; None without lamps.
     """
 
     whole: Mesh
@@ -254,6 +256,8 @@ class Stage(eqx.Module):
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
+    point_lights: tuple[PointLight, ...] = ()
+    power: Float[Array | np.ndarray, " n"] | None = None
 
     @property
     def face(self) -> Int[Array | np.ndarray, "f 3"]:

@@ -316,6 +316,7 @@ class RelitScene(System):
             samples,
             sharp,
             lamp,
+            *(((), None) if self.lamps is None else self.lamps.sources(self._all({}), self.mesh.origin)),
         )
 
     def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:

@@ -140,7 +140,13 @@ class Occluder:
         packed.shares(surface, points, texels, part, share)
 
     def lit(
-        self, surface: tuple, points: tuple, fields: tuple, lamps: tuple, part: slice, result: Float32[np.ndarray, "m 4 p"]
+        self,
+        surface: tuple,
+        points: tuple,
+        fields: tuple,
+        lamps: tuple,
+        part: slice,
+        result: Float32[np.ndarray, "m 4 p"],
     ) -> None:
         """What some points of a picture see of lamps; `lamp_rays.moments` calls it.
 
