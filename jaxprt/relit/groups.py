@@ -19,7 +19,7 @@ from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
-from jaxprt.scene import Environment, Mesh
+from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
 from jaxprt.scene.mesh import frames, join
@@ -242,6 +242,8 @@ class Stage(eqx.Module):
         sharp: Whether narrow lobes of each part are traced by rays.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
         hidden: Whether cameras see through the backs of each part.
+        point_lights: The point lights, in the coordinates of the mesh.
+        power: Power of each lamp as precomputed, by which lamps share rays; None without lamps.
     """
 
     whole: Mesh
@@ -256,6 +258,8 @@ class Stage(eqx.Module):
     sharp: tuple[bool, ...] = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
     hidden: tuple[bool, ...] = eqx.field(static=True)
+    point_lights: tuple[PointLight, ...] = ()
+    power: Float[Array | np.ndarray, " n"] | None = None
 
     @property
     def hidden_faces(self) -> Bool[Array | np.ndarray, " f"] | None:

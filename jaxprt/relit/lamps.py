@@ -1,5 +1,6 @@
 """Lamps of a scene: parts that emit light, and point lights."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, lobe_table
 from jaxprt.scene import PointLight, Scene
+from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import areas
 from jaxprt.systems import axes, bright_texels, lamps, lobe
 from jaxprt.systems.lamps import LitByLamps
@@ -53,6 +55,24 @@ class SceneLamps(eqx.Module):
         ]
         rows += [changed.get(each.name, each).intensity for each in self.point_lights]
         return jax.device_put(np.stack(rows)) if known(rows) else jnp.stack(rows)
+
+    def sources(
+        self, appearances: Sequence[Appearance], origin: origins.Origin
+    ) -> tuple[tuple[PointLight, ...], Float[Array | np.ndarray, " n"]]:
+        """The point lights relative to an origin, and the power of each lamp.
+
+        Args:
+            appearances: Materials of all parts at their vertices.
+            origin: The origin.
+        """
+        lights = tuple(
+            dataclasses.replace(each, position=origins.local(f"point light {each.name!r}", each.position, origin))
+            for each in self.point_lights
+        )
+        radiance = self.radiance(appearances, {})
+        xp = np if known(radiance, self.area) else jnp
+        surface = [np.pi * xp.sum(xp.asarray(own)) for own in self.area]
+        return lights, xp.asarray([*surface, *(4 * np.pi for _ in lights)]) * xp.mean(xp.asarray(radiance), -1)
 
 
 def _mean(area: Any, emitted: Any) -> Any:

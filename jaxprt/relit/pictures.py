@@ -18,15 +18,17 @@ from jaxprt.compile import Between, compile_time, finished, jit, known, promoted
 from jaxprt.image import raster
 from jaxprt.image.layers import visible_points
 from jaxprt.image.pixels import Pixels
-from jaxprt.relit import canvas, interpolation, shadows, tracing
+from jaxprt.relit import canvas, interpolation, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
+from jaxprt.relit.lamplight import LampLight
 from jaxprt.relit.shadows import TexelShares, TracedLight
 from jaxprt.relit.surface import Interpolated, Viewed, between, carried, from_texels, lit, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.material_table import Look
 from jaxprt.scene.points import Points
+from jaxprt.systems.lamps import LampTransport
 
 # Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
 SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
@@ -43,6 +45,7 @@ class Row(eqx.Module):
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
         kept: What does not depend on the light; None if it is computed anew for each light.
+        lamps: The transport of the lamps to the points, where reflection rays need it too; None elsewhere.
     """
 
     number: int = eqx.field(static=True)
@@ -50,6 +53,7 @@ class Row(eqx.Module):
     interpolated: bool = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
     kept: Viewed | Interpolated | None
+    lamps: LampTransport | None = None
 
 
 class VertexRow(eqx.Module):
@@ -87,6 +91,7 @@ class PictureView(eqx.Module):
         shadows: "rays" to trace the brightest texels of each light; "vertices" to interpolate them.
         keep: Whether what does not depend on the light is kept.
         shares: The texels that were traced when the view was made; None to choose them by each light.
+        lamp_rays: Whether rays from the points are traced to lamps; otherwise their light is interpolated.
     """
 
     stage: Stage
@@ -101,6 +106,7 @@ class PictureView(eqx.Module):
     shadows: str = eqx.field(static=True, default="vertices")
     keep: bool = eqx.field(static=True, default=False)
     shares: TexelShares | None = None
+    lamp_rays: bool = eqx.field(static=True, default=False)
 
     @promoted
     def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
@@ -118,13 +124,14 @@ class PictureView(eqx.Module):
             raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
         light = _traced_light(self, environment)
         arriving = finished(self.arriving(environment, None if light is None else light.rest), between)
-        vertices = _vertices(self, arriving, between)
+        lamps = lamplight.of(self.stage, self.pixels, self.camera.width) if self.lamp_rays else None
+        vertices = _vertices(self, arriving, lamps, between)
         reflected = iter(()) if self.reflected is None else iter(_reflections(self, environment, arriving, light))
         colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
         recompute = not known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = _color(self, row, arriving, light, vertices, recompute=recompute)
+            color = _color(self, row, arriving, light, lamps, vertices, recompute=recompute)
             if row.number in sharp:
                 color = color + next(reflected)
             rows.append((row.index, finished(color, between)))
@@ -158,6 +165,7 @@ def _color(
     row: Row,
     arriving: Arriving,
     light: TracedLight | None,
+    lamps: LampLight | None,
     vertices: dict[int, Array],
     *,
     recompute: bool,
@@ -169,6 +177,7 @@ def _color(
         row: The points.
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         light: The light with its traced texels; None without.
+        lamps: The lamps, if rays are traced to them.
         vertices: Radiance of each channel at the vertices of groups that are interpolated.
         recompute: Whether derivatives compute again what depends on the view, which needs less memory.
     """
@@ -176,20 +185,27 @@ def _color(
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return _color_of_some(picture, row, arriving, light)
     if row.interpolated:
-        seen = _between(picture.stage, row, picture.pixels, picture.camera) if row.kept is None else row.kept
-        color = carried(vertices[row.number], seen)
+        seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if row.kept is None else row.kept
+        color = carried(vertices[row.number], seen, None if seen.lamps is None else arriving.lamp)
         return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
     if row.kept is not None:
         return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
-    shade = partial(_shaded, picture, surface, row, row.index)
+    shade = partial(_shaded, picture, surface, row, row.index, lamps)
     return (jax.checkpoint(shade) if recompute else shade)(arriving, light)
 
 
 def _shaded(
-    picture: PictureView, surface: Surface, row: Row, index: Any, arriving: Arriving, light: TracedLight | None
+    picture: PictureView,
+    surface: Surface,
+    row: Row,
+    index: Any,
+    lamps: LampLight | None,
+    arriving: Arriving,
+    light: TracedLight | None,
 ) -> Float[Array, "p c"]:
     points, on_group = _points(picture, index)
-    seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera)
+    transport = _lamps_at(lamps, row, index, on_group)
+    seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera, lamps=transport)
     return _lit(surface, row.samples, arriving.at(row.number), light, index, seen)
 
 
@@ -214,34 +230,47 @@ def _color_of_some(
 ) -> Float[Array, "m p c"]:
     """`_color` inside of `jax.jit`, where most rows may be padding alone."""
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
-    shape = jax.eval_shape(lambda: _shaded(picture, surface, row, row.index[0], arriving, light))
+    shape = jax.eval_shape(lambda: _shaded(picture, surface, row, row.index[0], None, arriving, light))
     none = jnp.zeros(shape.shape, shape.dtype)
 
     def some(index: Array) -> Array:
-        shade = jax.checkpoint(partial(_shaded, picture, surface, row, index))
+        shade = jax.checkpoint(partial(_shaded, picture, surface, row, index, None))
         return jax.lax.cond(jnp.any(index >= 0), shade, lambda *_: none, arriving, light)
 
     return jax.lax.map(some, row.index)
 
 
-def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera) -> Interpolated:
+def _lamps_at(lamps: LampLight | None, row: Row, index: Any, on_group: Points) -> LampTransport | None:
+    """The transport of the lamps to points of a row; None to interpolate it."""
+    if row.lamps is not None or lamps is None:
+        return row.lamps
+    return lamps.row(row.number, np.asarray(index), on_group)
+
+
+def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera, lamps: LampLight | None) -> Interpolated:
     """What does not depend on the light, for a row of points to which radiance is interpolated."""
     points, on_group = canvas.points_of(pixels, stage.face, stage.shift, row.index)
     look = look_at(stage.table, stage.rough, points)
-    return between(stage.surfaces[row.number], on_group, look, jnp.asarray(camera.eye), stage.given[row.number])
+    transport, eye = _lamps_at(lamps, row, row.index, on_group), jnp.asarray(camera.eye)
+    sharp = None if transport is None else stage.sharp_at(row.number, points)
+    return between(stage.surfaces[row.number], on_group, look, eye, stage.given[row.number], sharp, transport)
 
 
 def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
     return canvas.points_of(picture.pixels, picture.stage.face, picture.stage.shift, index)
 
 
-def _vertices(picture: PictureView, arriving: Arriving, between: Between) -> dict[int, Float[Array, "k v c"]]:
+def _vertices(
+    picture: PictureView, arriving: Arriving, lamps: LampLight | None, between: Between
+) -> dict[int, Float[Array, "k v c"]]:
     """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
     stage, lit_rows = picture.stage, []
     for row in picture.vertices:
-        surface = stage.surfaces[row.number]
-        seen = _seen_alone(stage, row, picture.camera) if row.kept is None else row.kept
-        lit_rows.append(finished(lit(surface, arriving.at(row.number), seen), between))
+        seen = _seen_alone(stage, row, picture.camera, lamps) if row.kept is None else row.kept
+        surface, (direct, reflected, lamp) = stage.surfaces[row.number], arriving.at(row.number)
+        if seen.seen[2] is None:  # The lamps light the points of the picture.
+            surface, lamp = dataclasses.replace(surface, lit=None), None
+        lit_rows.append(finished(lit(surface, (direct, reflected, lamp), seen), between))
     host = known(lit_rows)  # How many vertices are shaded depends on the view.
     colors: dict[int, Any] = {}
     for row, color in zip(picture.vertices, map(np.asarray, lit_rows) if host else lit_rows, strict=True):
@@ -287,60 +316,78 @@ def make(
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows, between_vertices = _placed(stage, camera, samples, between)
+    rays = isinstance(shadow, Environment) or shadow == "rays"
+    lamps = lamplight.of(stage, pixels, camera.width) if rays else None
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
         surface = sampled(stage.surfaces[row.number], row.samples)
         stores = keep and not isinstance(row.index, Tracer)
         if stores and row.interpolated:
-            row = dataclasses.replace(row, kept=_between(stage, row, pixels, camera))
+            row = dataclasses.replace(row, kept=_between(stage, row, pixels, camera, lamps))
             stores = False
         if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
+            transport = _lamps_at(lamps, row, index, on_group)
             if stores:
-                row = dataclasses.replace(row, kept=_seen(stage, surface, row.number, points, on_group, camera))
+                seen = _seen(stage, surface, row.number, points, on_group, camera, lamps=transport)
+                row = dataclasses.replace(row, kept=seen)
+            elif row.kept is None:
+                row = dataclasses.replace(row, lamps=transport)
             if row.number in sharp:
-                blend = stage.blend(row.number, points, on_group)
-                origins.append(tracing.Asked(row.number, points, on_group, blend, stage.sharp_at(row.number, points)))
+                blend, narrow = stage.blend(row.number, points, on_group), stage.sharp_at(row.number, points)
+                origins.append(tracing.Asked(row.number, points, on_group, blend, narrow, transport))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
-    vertices = tuple(_vertex_rows(stage, between_vertices, camera, keep=keep))
+    vertices = tuple(_vertex_rows(stage, between_vertices, camera, lamps, keep=keep))
     shares, way = None, shadow
     if isinstance(shadow, Environment):
         traced, way = shadows.trace(stage.whole, pixels, camera.width, shadow, keep=False), "vertices"
         shares = None if traced is None else put(traced.shares)
     return PictureView(
-        stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold, way, keep, shares
+        stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold, way, keep, shares, rays
     )
 
 
 def _vertex_rows(
-    stage: Stage, interpolated: Sequence[Sequence[int]], camera: Camera, *, keep: bool
+    stage: Stage, interpolated: Sequence[Sequence[int]], camera: Camera, lamps: LampLight | None, *, keep: bool
 ) -> Iterator[VertexRow]:
     """The vertices of the parts of each group that are interpolated, in rows, once for each channel."""
     for number, parts in enumerate(interpolated):
         for vertex, points, own in stage.vertices(parts) if parts else ():
             for channel in range(stage.surfaces[number].channels):
                 row = VertexRow(number, channel, vertex, (points, own), None)
-                yield dataclasses.replace(row, kept=_seen_alone(stage, row, camera)) if keep else row
+                yield dataclasses.replace(row, kept=_seen_alone(stage, row, camera, lamps)) if keep else row
 
 
-def _seen_alone(stage: Stage, row: VertexRow, camera: Camera) -> Viewed:
-    """What does not depend on the light, at vertices with one channel of the BRDF alone."""
+def _seen_alone(stage: Stage, row: VertexRow, camera: Camera, lamps: LampLight | None) -> Viewed:
+    """What does not depend on the light, at vertices with one channel of the BRDF alone.
+
+    Lamps are left out if rays from the points are traced to them.
+    """
     points, own = row.points
     alone = stage.alone(row.number, look_at(stage.table, stage.rough, points), row.channel)
-    return _seen(stage, stage.surfaces[row.number], row.number, points, own, camera, alone)
+    surface = stage.surfaces[row.number]
+    surface = surface if lamps is None else dataclasses.replace(surface, lit=None)
+    return _seen(stage, surface, row.number, points, own, camera, alone)
 
 
 def _seen(
-    stage: Stage, surface: Surface, number: int, points: Points, own: Points, camera: Camera, look: Look | None = None
+    stage: Stage,
+    surface: Surface,
+    number: int,
+    points: Points,
+    own: Points,
+    camera: Camera,
+    look: Look | None = None,
+    lamps: LampTransport | None = None,
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials, or others."""
     look = look_at(stage.table, stage.rough, points) if look is None else look
     given, sharp = stage.given[number], stage.sharp_at(number, points)
     # The view does not depend on the samples of bright texels.
-    return view(sampled(surface, 1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp)
+    return view(sampled(surface, 1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp, lamps=lamps)
 
 
 @partial(jit, static_argnames="fold")

@@ -350,6 +350,7 @@ class RelitScene(System):
             sharp,
             lamp,
             tuple(sides.hidden_backs(self.scene).tolist()),
+            *(((), None) if self.lamps is None else self.lamps.sources(self._all({}), self.mesh.origin)),
         )
 
     def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:

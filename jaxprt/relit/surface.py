@@ -16,6 +16,8 @@ from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems import bright_texels
 from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lamps import LampTransport
+from jaxprt.systems.lamps.relight import summed
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
 from jaxprt.visibility import texel_rays
@@ -58,11 +60,14 @@ class Interpolated(eqx.Module):
         points: The points on the group.
         emitted: Radiance that the points emit.
         sight: Weights of the channels, and what single texels of the light need.
+        lamps: Radiance from each lamp of radiance 1, if rays from the points are traced to lamps. None if it is
+            interpolated from vertices too, or there are no lamps.
     """
 
     points: Points
     emitted: Float[Array, "p 3"]
     sight: Sight
+    lamps: Float[Array, "n p c"] | None = None
 
 
 @partial(kept, static=("glows",))
@@ -76,6 +81,7 @@ def view(
     sharp: Float[Array, " p"] | None = None,
     variance: Float[Array, " p"] | None = None,
     glows: bool = True,
+    lamps: LampTransport | None = None,
 ) -> Viewed:
     """All of the points' radiance that does not depend on the light.
 
@@ -89,9 +95,10 @@ def view(
         variance: Variance in squared radians by which lobes are widened, at points that reflection rays hit; see
             `jaxprt.systems.lobe.widened`.
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
+        lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
     blend, emitted = material(surface, points, look, given)
-    seen = view_of(surface, eye, blend, points, sharp, variance=variance)
+    seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps)
     sight = _sight(surface, points, eye, blend)
     return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)
 
@@ -109,20 +116,40 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
 
 
 @kept
-def between(surface: Surface, points: Points, look: Look, eye: Float[Array, "3"], given: Given | None) -> Interpolated:
+def between(
+    surface: Surface,
+    points: Points,
+    look: Look,
+    eye: Float[Array, "3"],
+    given: Given | None,
+    sharp: Float[Array, " p"] | None = None,
+    lamps: LampTransport | None = None,
+) -> Interpolated:
     """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
     blend, emitted = material(surface, points, look, given)
-    return Interpolated(points, emitted, _sight(surface, points, eye, blend))
+    lit = None if lamps is None or surface.lit is None else surface.lit.at(lamps).view(eye, blend, None, sharp)
+    return Interpolated(points, emitted, _sight(surface, points, eye, blend), lit)
 
 
 @kept
-def carried(vertices: Float[Array, "k v c"], points: Interpolated) -> Float[Array, "p c"]:
-    """Colors of some points, interpolated from the radiance of each channel at the vertices."""
+def carried(
+    vertices: Float[Array, "k v c"], points: Interpolated, lamp: Float[Array, "n 3"] | None = None
+) -> Float[Array, "p c"]:
+    """Colors of some points, interpolated from the radiance of each channel at the vertices.
+
+    Args:
+        vertices: Radiance of each channel at the vertices.
+        points: The points.
+        lamp: Radiance of each lamp, if `points` has lamps.
+    """
     radiance = [points.points.carry(channel) for channel in vertices]
+    rest = points.emitted
+    if lamp is not None and points.lamps is not None:
+        rest = rest + summed(lamp, points.lamps)
     if points.sight.blend is None:
-        return radiance[0] + points.emitted
+        return radiance[0] + rest
     weight = jnp.moveaxis(points.sight.blend.weight, 1, 0)
-    return reduce(jnp.add, (color * own for color, own in zip(radiance, weight, strict=True))) + points.emitted
+    return reduce(jnp.add, (color * own for color, own in zip(radiance, weight, strict=True))) + rest
 
 
 @partial(kept, static=("size", "samples"))
@@ -166,6 +193,7 @@ def view_of(
     sharp: Array | None,
     *,
     variance: Array | None = None,
+    lamps: LampTransport | None = None,
 ) -> tuple[PyTree, PyTree, PyTree]:
     """The view of all systems of a group at its vertices, or at points on it.
 
@@ -176,6 +204,7 @@ def view_of(
         points: The points; None for the vertices.
         sharp: 1 where narrow lobes are traced by rays, 0 elsewhere; None for a group without rays.
         variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
+        lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
     system, reflecting = surface.system if points is None else surface.system.at(points), surface.reflecting
     reflected = None
@@ -183,7 +212,9 @@ def view_of(
         reflected = reflecting.view(eye, blend, points, sharp)
     elif reflecting is not None:
         reflected = reflecting.view(eye, blend, points)
-    lit = None if surface.lit is None else surface.lit.view(eye, blend, points, sharp)
+    lit = surface.lit
+    if lit is not None:
+        lit = lit.view(eye, blend, points, sharp) if lamps is None else lit.at(lamps).view(eye, blend, None, sharp)
     if variance is not None and widened.can_widen(system):
         return widened.view(system, eye, blend, variance), reflected, lit
     return system.view(eye, blend), reflected, lit

@@ -30,6 +30,7 @@ from jaxprt.relit.surface import Viewed, lit, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
 
@@ -45,6 +46,7 @@ class Asked(eqx.Module):
         own: The points on the group; None for all its vertices.
         blend: Material weights of the vertices or points.
         seen: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
+        lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
 
     number: int = eqx.field(static=True)
@@ -52,6 +54,7 @@ class Asked(eqx.Module):
     own: Points | None
     blend: Blend | None
     seen: Float[Array, " v"] | None
+    lamps: LampTransport | None = None
 
 
 class Carried(eqx.Module):
@@ -170,7 +173,8 @@ def _lamps(
         return None
     lamp = np.where(part >= 0, np.asarray(stage.lamp)[part], -1)
     met = lamp == np.arange(lit.transport.lamps)[:, None, None]
-    return _seen_lamps(lit.chord(asked.own), put(met), weight, concentration)
+    chord = lit.chord(asked.own) if asked.lamps is None else lit.at(asked.lamps).chord()
+    return _seen_lamps(chord, put(met), weight, concentration)
 
 
 @jit

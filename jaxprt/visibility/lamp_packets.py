@@ -72,42 +72,44 @@ def _lit(lamp, lamps, center, normal, least, total, room):
 
 
 @no_type_check
-@compiled
+@partial(compiled, error_model="numpy")
 def _cast(embree, memory, lamps, number, spot, origin, sight, weight, free):
     """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones.
 
     Adds the irradiance from each place to `weight`, and to `free` that from visible places.
     """
     address, scene, arguments = embree
-    ray, valid, cosine = memory
+    ray, valid, cosine, goal = memory
     center, normal, facing, least = sight
     place, area = lamps[0], lamps[1]
-    rays, open_ = 0, 0
     whole_ray(ray)
     for lane in range(16):
         at, begin = number[lane], spot[lane]
-        square, height, toward, above = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
         for axis in range(3):
-            way = place[at, axis] - center[axis, lane]
-            square += way * way
-            height += way * normal[axis, lane]
-            toward -= way * area[at, axis]
+            goal[axis, lane], goal[3 + axis, lane] = place[at, axis], area[at, axis]
             ray[axis, lane] = origin[begin, axis, lane]
-            ray[4 + axis, lane] = place[at, axis] - origin[begin, axis, lane]
-            above += ray[4 + axis, lane] * facing[axis, lane]
-        ray[8, lane] = 1 - _NEAR
-        square = max(square, least[lane])
-        if area[at, 0] == 0 and area[at, 1] == 0 and area[at, 2] == 0:
-            toward = np.sqrt(square)
-        cosine[lane] = toward * height / (square * square) if toward > 0 and height > 0 else 0
-        valid[lane] = -1 if cosine[lane] > 0 and above > 0 else 0
+    zero = np.float32(0)
+    for lane in range(16):  # vectorized
+        x, y, z = goal[0, lane] - center[0, lane], goal[1, lane] - center[1, lane], goal[2, lane] - center[2, lane]
+        square = max(x * x + y * y + z * z, least[lane])
+        a, b, c = goal[3, lane], goal[4, lane], goal[5, lane]
+        toward = -(x * a + y * b + z * c)
+        toward = np.sqrt(square) if a * a + b * b + c * c == zero else toward
+        height = x * normal[0, lane] + y * normal[1, lane] + z * normal[2, lane]
+        cosine[lane] = max(toward, zero) * max(height, zero) / (square * square)
+        x, y, z = goal[0, lane] - ray[0, lane], goal[1, lane] - ray[1, lane], goal[2, lane] - ray[2, lane]
+        ray[4, lane], ray[5, lane], ray[6, lane] = x, y, z
+        ray[8, lane] = np.float32(1 - _NEAR)
+        above = x * facing[0, lane] + y * facing[1, lane] + z * facing[2, lane]
+        valid[lane] = -1 if cosine[lane] > zero and above > zero else 0
     call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+    rays, open_ = 0, 0
     for lane in range(16):
+        seen = valid[lane] != 0 and ray[8, lane] > zero
         weight[lane] += cosine[lane]
-        rays += cosine[lane] > 0
-        if valid[lane] != 0 and ray[8, lane] > 0:
-            free[lane] += cosine[lane]
-            open_ += 1
+        free[lane] += cosine[lane] if seen else zero
+        rays += 1 if cosine[lane] > zero else 0
+        open_ += 1 if seen else 0
     return rays, open_
 
 
@@ -128,13 +130,14 @@ def _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free):
         if turn > 0 and (width == 0 or open_ == 0 or open_ == rays):
             break
         for stratum in range(strata):
+            corner = lamp + stratum * 4 // strata
             for lane in range(16):
                 base = pattern[lane]
-                own = stratum * _QUARTERS + (base // 16 + stratum + turn) % _QUARTERS
+                own = stratum * _QUARTERS + ((base >> 4) + stratum + turn & 3)
                 # With other places in the next part, edges of shadows meet all places one after another.
-                within = (2 * ((base + _STEP * own + 37 * lamp) % 64) + 1) * width // 128
+                within = (2 * (base + _STEP * own + 37 * lamp & 63) + 1) * width >> 7
                 number[lane] = first + own * width + within
-                spot[lane] = (base // 4 + base + lamp + stratum * 4 // strata + turn) % 4
+                spot[lane] = (base >> 2) + base + corner + turn & 3
             piece = stratum * pieces // strata
             new = _cast(embree, memory, lamps, number, spot, origin, sight, weight[piece], free[piece])
             rays, open_ = rays + new[0], open_ + new[1]
@@ -149,7 +152,7 @@ def _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free):
 @no_type_check
 @compiled
 def _placed(surface, points, fields, packet, lanes, origin, sight, pattern):
-    """Sets what does not depend on lamps for sixteen points; padding has no normal, so nothing is above its horizon."""
+    """Sets what does not depend on lamps for sixteen points. Padding has no normal, and nothing above its horizon."""
     position, normals = fields
     center, normal, facing, least = sight
     for lane in range(16):
@@ -183,7 +186,7 @@ def trace(embree, surface, points, fields, lamps, first, last, result):
     begin = (-aligned.ctypes.data // 4) % 16
     ray = aligned[begin : begin + 12 * 16].reshape(12, 16)
     valid = aligned[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
-    memory = ray, valid, np.zeros(16, np.float32)
+    memory = ray, valid, np.zeros(16, np.float32), np.zeros((6, 16), np.float32)
     origin, pattern = np.zeros((4, 3, 16), np.float32), np.zeros(16, np.int64)
     center, normal = np.zeros((3, 16), np.float32), np.zeros((3, 16), np.float32)
     facing = np.zeros((3, 16), np.float32)

@@ -279,24 +279,43 @@ def start(surface, points, point, lane, origin, facing):
     position, normal, face, offset = surface
     triangle, barycentric, slope, _ = points
     number = max(triangle[point], 0)
-    a, b, c = face[number]
-    first = position[a].astype(np.float64)
-    across = np.cross(position[b].astype(np.float64) - first, position[c].astype(np.float64) - first)
-    length = np.sqrt(across @ across)
-    side = across @ (normal[a] + normal[b] + normal[c]).astype(np.float64)
+    a, b, c = face[number, 0], face[number, 1], face[number, 2]
+    # Arrays would be allocated for each point, which takes longer than the rays.
+    along = _between(position, a, b)
+    other = _between(position, a, c)
+    across = (
+        along[1] * other[2] - along[2] * other[1],
+        along[2] * other[0] - along[0] * other[2],
+        along[0] * other[1] - along[1] * other[0],
+    )
+    square, side = 0.0, 0.0
+    for axis in range(3):
+        square += across[axis] * across[axis]
+        side += across[axis] * (normal[a, axis] + normal[b, axis] + normal[c, axis])
+    length = np.sqrt(square)
     scale = 0.0 if length == 0 or triangle[point] < 0 else (-1 / length if side < 0 else 1 / length)
-    weight = np.empty(3)
     for axis in range(3):
         facing[axis, lane] = scale * across[axis]
     for place in range(4):
-        for corner in range(3):
-            moved = barycentric[point, corner]
-            moved += _ORIGINS[place, 0] * slope[point, 0, corner] + _ORIGINS[place, 1] * slope[point, 1, corner]
-            weight[corner] = max(moved, 0.0)
-        weight /= max(weight.sum(), 1e-30)
+        right, down = _ORIGINS[place, 0], _ORIGINS[place, 1]
+        first = max(barycentric[point, 0] + right * slope[point, 0, 0] + down * slope[point, 1, 0], 0.0)
+        second = max(barycentric[point, 1] + right * slope[point, 0, 1] + down * slope[point, 1, 1], 0.0)
+        third = max(barycentric[point, 2] + right * slope[point, 0, 2] + down * slope[point, 1, 2], 0.0)
+        whole = max(first + second + third, 1e-30)
         for axis in range(3):
-            on_triangle = weight[0] * position[a, axis] + weight[1] * position[b, axis] + weight[2] * position[c, axis]
+            on_triangle = (first * position[a, axis] + second * position[b, axis] + third * position[c, axis]) / whole
             origin[place, axis, lane] = on_triangle + offset[number] * facing[axis, lane]
+
+
+@no_type_check
+@compiled
+def _between(position, first, last):
+    """The vector from one vertex to another in float64."""
+    return (
+        np.float64(position[last, 0]) - np.float64(position[first, 0]),
+        np.float64(position[last, 1]) - np.float64(position[first, 1]),
+        np.float64(position[last, 2]) - np.float64(position[first, 2]),
+    )
 
 
 @no_type_check

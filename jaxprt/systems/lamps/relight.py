@@ -17,6 +17,7 @@ true shapes. The share of a lobe that is narrow relative to the lamp is then lef
 here.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial, reduce
 
@@ -94,6 +95,14 @@ class LitByLamps(eqx.Module):
             blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))
         return _view(self, eye, blend, points, traced)
 
+    def at(self, transport: LampTransport) -> "LitByLamps":
+        """The same surface at points that have a transport of their own: its vertices are these points.
+
+        Args:
+            transport: Transport from `jaxprt.systems.lamps.places.at_points`.
+        """
+        return dataclasses.replace(self, transport=transport)
+
     def chord(self, points: Points | None = None) -> Float[Array, "n _"]:
         """Squared chord, from center to rim, of the disk that approximates each lamp at each vertex or point."""
         return _chord(self.transport, points)
@@ -109,11 +118,12 @@ class LitByLamps(eqx.Module):
             ValueError: The number of rows of `radiance` differs from the number of lamps.
         """
         require.length("rows of the lamps' radiance", radiance, self.transport.lamps)
-        return _combine(radiance, view)
+        return summed(radiance, view)
 
 
 @jit
-def _combine(radiance: Array, view: Array) -> Array:
+def summed(radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
+    """`LitByLamps.combine`, of views of any surface."""
     return reduce(jnp.add, (own * each for own, each in zip(radiance, view, strict=True)))
 
 

@@ -1,0 +1,85 @@
+"""Light of lamps at the points of a picture, by rays from the points.
+
+Soft shadows and highlights of lamps are then right at pixels, on any mesh. Like the transport at vertices it does not
+depend on the colors of lamps. Rays are cast on the host. They are constants of all derivatives.
+"""
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxprt.compile import compile_time, known
+from jaxprt.image.pixels import Pixels
+from jaxprt.relit.casting import Caster, caster
+from jaxprt.relit.groups import Stage
+from jaxprt.scene import Mesh, PointLight
+from jaxprt.scene.mesh import split
+from jaxprt.scene.points import Points, placed
+from jaxprt.systems.lamps import LampTransport
+from jaxprt.systems.lamps.places import at_points, places
+from jaxprt.visibility import lamp_rays, texel_rays
+from jaxprt.visibility.lamp_rays import LampPlaces
+
+
+@dataclasses.dataclass(frozen=True)
+class LampLight:
+    """The lamps of a scene, and the points of a picture.
+
+    Attributes:
+        stage: The scene.
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+    """
+
+    stage: Stage
+    pixels: Pixels
+    width: int
+
+    @cached_property
+    def _caster(self) -> Caster:
+        return caster(self.stage.whole)
+
+    @cached_property
+    def _sources(self) -> list[Mesh | PointLight]:
+        """The lamps in their order: emitting parts first, then point lights."""
+        part = np.argsort(self.stage.lamp, kind="stable")[self.stage.lamp.count(-1) :]
+        meshes = split(self.stage.whole) if len(part) else []
+        return [*(meshes[number] for number in part), *self.stage.point_lights]
+
+    @cached_property
+    def _places(self) -> LampPlaces:
+        return places(self._sources, np.asarray(self.stage.power))
+
+    def row(self, number: int, index: Int[np.ndarray, " p"], on_group: Points) -> LampTransport:
+        """The transport of the lamps to some points.
+
+        Args:
+            number: Index of the group of the points.
+            index: Indices of the points among those of the picture; -1 in padding.
+            on_group: The same points on the group.
+        """
+        surface, own = self.stage.surfaces[number], np.maximum(index, 0)
+        with compile_time(surface.position, surface.frame, on_group):
+            position, frame = placed(surface.position, surface.frame, on_group)
+        pixel = np.asarray(self.pixels.pixel)[own]
+        triangle = np.where(index < 0, -1, np.asarray(self.pixels.triangle)[own])
+        barycentric, slope = (np.asarray(each)[own] for each in (self.pixels.barycentric, self.pixels.slope))
+        points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
+        fields = np.asarray(position), np.asarray(frame)[:, 2]
+        moment = lamp_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, self._places)
+        return at_points(moment, position, frame, self._sources)
+
+
+def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:
+    """The lamps of a scene for a picture; None without lamps, or if JAX traces the scene or the points.
+
+    Args:
+        stage: The scene.
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+    """
+    if stage.power is None or not known(stage.whole, stage.power, stage.point_lights, pixels):
+        return None
+    return LampLight(stage, pixels, width) if known([each.position for each in stage.surfaces]) else None
