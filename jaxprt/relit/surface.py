@@ -28,11 +28,14 @@ class Sight(eqx.Module):
         frame: Shading frames of the points; rows are tangent, bitangent, normal.
         wo: Unit directions to the viewer in these frames.
         blend: Weights and parameters of the BRDF's channels; None for a BRDF that cannot change.
+        above: Normals of the smooth surface, below whose horizon no light arrives; None where they are those of the
+            frames.
     """
 
     frame: Float[Array, "p 3 3"]
     wo: Float[Array, "p 3"]
     blend: Blend | None
+    above: Float[Array, "p 3"] | None = None
 
 
 class Viewed(eqx.Module):
@@ -90,6 +93,7 @@ def view(
             `jaxprt.systems.lobe.widened`.
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
     """
+    points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, given)
     seen = view_of(surface, eye, blend, points, sharp, variance=variance)
     sight = _sight(surface, points, eye, blend)
@@ -111,6 +115,7 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
 @kept
 def between(surface: Surface, points: Points, look: Look, eye: Float[Array, "3"], given: Given | None) -> Interpolated:
     """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
+    points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, given)
     return Interpolated(points, emitted, _sight(surface, points, eye, blend))
 
@@ -149,12 +154,15 @@ def from_texels(
     """
     light = texel, excess / texel_rays.FULL, share
     options = {"size": size, "samples": samples}
-    return bright_texels.sent(surface.brdf, sight.frame, sight.wo, light, None, sight.blend, **options)
+    return bright_texels.sent(
+        surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options
+    )
 
 
 def _sight(surface: Surface, points: Points, eye: Array, blend: Blend | None) -> Sight:
     position, frame = placed(surface.position, surface.frame, points)
-    return Sight(frame, directions.view(frame, position, eye), blend)
+    above = None if points.normal is None else points.tilted(None).frame(surface.frame)[:, 2]
+    return Sight(frame, directions.view(frame, position, eye), blend, above)
 
 
 @jit
