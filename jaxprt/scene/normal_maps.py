@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Num
 from jaxprt.sphere import directions
 
 _LOWEST = 0.1  # least ratio of a normal's height to its slope: lower normals are raised to it
+_FLAT = 1e-3  # Below this, slopes may be rounding errors: a normal without height is then that of the surface.
 
 
 def of_unit_length(image: Any) -> Any:
@@ -58,10 +59,10 @@ def tilted(
     """
     x, y = mean[:, 0] * scale, mean[:, 1] * scale * handedness
     square = x**2 + y**2
-    flat = square < jnp.finfo(mean.dtype).tiny
+    flat = square < _FLAT**2
     slope = jnp.where(flat, 0, jnp.sqrt(jnp.where(flat, 1, square)))
     height = jnp.maximum(mean[:, 2], _LOWEST * slope)
-    height = jnp.where(flat & (height <= 0), 1, height)
+    height = jnp.where(flat & (height < _FLAT), 1, height)
     local = jnp.stack([x, y, height], -1)
     return directions.normalize(sum(local[:, i, None] * frame[:, i] for i in range(3)))
 

@@ -23,9 +23,9 @@ CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 TILT = np.array([0.3, 0.25, 0.92])  # along u, which is x, along v, which is -z, and up
 MATTE = {"base_color": 0.8, "metallic": 0.0, "specular": 0.0}
 GLOSSY = {"base_color": 0.8, "metallic": 1.0, "roughness": 0.6}
-# Of hat functions with one direction each, and of four lobes with 8 texels along an edge, where the flat surface is .2
-# and .3 off.
-MATTE_ERROR, GLOSSY_ERROR = 0.03, 0.1
+# Of hat functions with one direction each, and of four lobes with 8 texels along an edge. Flat surfaces are .19 and
+# .13 off.
+MATTE_ERROR, GLOSSY_ERROR = 0.03, 0.03
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -74,7 +74,7 @@ def test_matte_surfaces_reflect_by_the_normal_of_the_map(hand):
     ready = prt.precompute(square(hand, normal_texture=tilted(), **MATTE), system="lobe", size=SIZE, progress=False)
     normal = np.array([TILT[0], TILT[2], -hand * TILT[1]])
     expected = 0.8 * irradiance(normal / np.linalg.norm(normal))
-    assert np.linalg.norm(0.8 * irradiance(np.array([0, 1.0, 0])) / expected - 1) > 0.2
+    assert np.linalg.norm(0.8 * irradiance(np.array([0, 1.0, 0])) / expected - 1) > 0.15
     picture = np.asarray(ready.picture(light(), CAMERA, samples=1)).reshape(-1, 3)
     np.testing.assert_allclose(picture, np.broadcast_to(expected, picture.shape), rtol=MATTE_ERROR)
     vertices = ready.radiance(light(), eye=CAMERA.eye)
@@ -88,11 +88,11 @@ def test_lobes_are_turned_by_the_map_as_exact_pixels_are():
     exact = exact_pixels(ready.scene, ready.shading, [light()], CAMERA, points=1)
     flat = prt.precompute(square(**GLOSSY), system=Lobes(lobes=4, texels=8), size=SIZE, progress=False)
     assert exact.relative_l2(ready.picture(light(), CAMERA, samples=1))[0] < GLOSSY_ERROR
-    assert exact.relative_l2(flat.picture(light(), CAMERA, samples=1))[0] > 2 * GLOSSY_ERROR
+    assert exact.relative_l2(flat.picture(light(), CAMERA, samples=1))[0] > 3 * GLOSSY_ERROR
 
 
 def test_another_map_is_a_new_material_and_its_scale_has_gradients(close):
-    ready, weight = glossy(), np.random.default_rng(1).normal(size=(8, 8, 3)).astype(np.float32)
+    ready, weight = glossy(), np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)).astype(np.float32)
 
     def picture(scale, normal=(-0.2, 0.1, 0.9)):
         new = TexturedMaterial(normal_texture=tilted(normal), normal_scale=scale, **GLOSSY)
@@ -121,5 +121,5 @@ def test_a_scene_without_normal_maps_has_none_at_its_points():
     assert flat.table.frame is None
     view = flat.picture_view(CAMERA, samples=1)
     assert all(row.kept.points.normal is row.kept.sight.above is None for row in view.rows)
-    with pytest.raises(ValueError, match="part 'square' was precomputed without a normal map"):
+    with pytest.raises(ValueError, match="normal maps only in scenes that were precomputed with one"):
         flat.picture(light(), CAMERA, materials={"square": TexturedMaterial(normal_texture=tilted(), **GLOSSY)})
