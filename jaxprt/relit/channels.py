@@ -42,7 +42,7 @@ class Shading(eqx.Module):
     """A part of a scene, or several parts of one kind, as input of the systems.
 
     Attributes:
-        mesh: The mesh, with normals from the normal map and tangents along the anisotropy.
+        mesh: The mesh, with tangents along the anisotropy. Normal maps tilt normals at points only.
         brdf: The BRDF, with one channel for each weight of `blend`. If `knot` is not empty, it is a function from the
             logarithm of roughness to a BRDF.
         exact: The BRDF at every vertex, for the exact sum over all texels.
@@ -205,7 +205,15 @@ def rough(material: Any) -> Any:
         roughness_texture=material.roughness_texture,
         clearcoat_roughness=material.clearcoat_roughness,
         clearcoat_roughness_texture=material.clearcoat_roughness_texture,
+        **_normal_map(material),
     )
+
+
+def _normal_map(material: TexturedMaterial) -> dict[str, Any]:
+    """The normal map of a material, whose variance adds roughness. Nothing if JAX traces it."""
+    if not known(material.normal_texture, material.normal_scale):
+        return {}
+    return {"normal_texture": material.normal_texture, "normal_scale": material.normal_scale}
 
 
 def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
@@ -333,16 +341,18 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
     return own, PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading)))
 
 
-def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None]:
-    """The BRDF at points of a part for the exact sum over all texels, and the radiance that the points emit.
+def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None, Points]:
+    """The BRDF at points of a part for the exact sum over all texels, the radiance that they emit, and the points.
 
     Textures are averaged over the pixel of each point. At points that do not belong to a picture they are sampled.
+    Normal maps tilt the normals of the points.
     """
     if not isinstance(part.material, TexturedMaterial):
-        return shading.exact, None
+        return shading.exact, None, points
     look = material_table.of_parts([part]).at(points)
     coated = shading.table is standard.COATED
-    return PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading))), look.emitted
+    brdf = PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading)))
+    return brdf, look.emitted, points.tilted(look.normal)
 
 
 def _fits(name: str, shading: Shading, look: Look) -> Any:
@@ -391,22 +401,26 @@ def _log_range(shading: Shading) -> tuple[float, float]:
 
 
 def _check_frames(part: Part, shading: Shading, new: Part) -> None:
-    """Refuses an anisotropy or normals that differ from the precomputed ones."""
-    before = _anisotropy(shading)
+    """Refuses an anisotropy that differs from the precomputed one, and normal maps where there was none."""
+    before, material = _anisotropy(shading), part.material
     mesh, now = _framed(new)
+    if getattr(new.material, "normal_texture", None) is not None and getattr(material, "normal_texture", None) is None:
+        raise ValueError(
+            f"part {part.name!r} was precomputed without a normal map, got a material with one: precompute it with a "
+            "normal map, of a normal_scale of 0 if it is to be flat at first"
+        )
     if abs(before - now) > _EQUAL and not shading.matte:
         raise ValueError(
             f"part {part.name!r} was precomputed for an anisotropy of {before:.3f}, got a material of {now:.3f}"
         )
-    if mesh is shading.mesh:
+    if mesh is shading.mesh or before <= _EQUAL or shading.matte:
         return
-    for field, matters in (("normal", True), ("tangent", before > _EQUAL and not shading.matte)):
-        first, second = (np.asarray(getattr(each, field)) for each in (shading.mesh, mesh))
-        if matters and np.abs(first - second).max() > _EQUAL:
-            what = {"normal": "normal map", "tangent": "direction of anisotropy"}[field]
-            raise ValueError(
-                f"part {part.name!r} was precomputed with another {what}, or with none: precompute it with the new one"
-            )
+    first, second = (np.asarray(each.tangent) for each in (shading.mesh, mesh))
+    if np.abs(first - second).max() > _EQUAL:
+        raise ValueError(
+            f"part {part.name!r} was precomputed with another direction of anisotropy, or with none: precompute it "
+            "with the new one"
+        )
 
 
 def _anisotropy(shading: Shading) -> float:
@@ -419,10 +433,10 @@ def _anisotropy(shading: Shading) -> float:
 
 
 def _framed(part: Part) -> tuple[Mesh, float]:
-    """The mesh with normals from the normal map and tangents along the anisotropy, and the mean anisotropy."""
+    """The mesh with tangents along the anisotropy, and the mean anisotropy."""
     material = part.material
     assert isinstance(material, TexturedMaterial)
-    if material.normal_texture is None and not float(material.anisotropy):
+    if not float(material.anisotropy):
         return part.mesh, 0.0
     surface = part.surface()
     strength = np.asarray(surface.anisotropy)
@@ -444,18 +458,15 @@ def _knots(log_roughness: Float[np.ndarray, " v"]) -> tuple[np.ndarray, ...]:
 
 
 def _turned(mesh: Mesh, surface: Surface) -> Mesh:
-    """The mesh with normals from the normal map, and tangents along the anisotropy."""
-    flat = bool(np.all(np.asarray(surface.normal) == [0, 0, 1]))
+    """The mesh with tangents along the anisotropy."""
     straight = bool(np.all(np.asarray(surface.direction) == [1, 0])) or not np.any(np.asarray(surface.anisotropy))
-    if flat and straight:
-        return mesh
-    normal, tangent = _frames(mesh.normal, mesh.tangent, surface)
-    return eqx.tree_at(lambda each: (each.normal, each.tangent), mesh, (normal, tangent))
+    return (
+        mesh if straight else eqx.tree_at(lambda each: each.tangent, mesh, _along(mesh.normal, mesh.tangent, surface))
+    )
 
 
 @jit
-def _frames(normal: Array, tangent: Array, surface: Surface) -> tuple[Array, Array]:
+def _along(normal: Array, tangent: Array, surface: Surface) -> Array:
     frame = directions.frame(normal, tangent)
-    turned = jnp.einsum("vi,vij->vj", surface.normal, frame, precision="highest")
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
-    return turned, directions.frame(turned, along)[:, 0]
+    return directions.frame(normal, along)[:, 0]

@@ -128,7 +128,7 @@ def exact_pixels(
         if not len(row):
             continue
         where = on_triangles(face, triangle[row, place], barycentric[row, place])
-        brdf, emitted = exact_at(part, shading, where)
+        brdf, emitted, where = exact_at(part, shading, where)
         options = {"eye": camera.eye, "occluder": mesh, "progress": progress, "between": between}
         value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
         value = value if emitted is None else value + np.asarray(emitted)
@@ -175,7 +175,8 @@ def exact_picture(
         raise ValueError(f"most must be at least 1 point, got {most}")
     asked, (scene, camera) = camera, _near(scene, camera)
     shown = finished(_Shown.of(scene, camera), between)
-    smooth = [_is_smooth(each, shown, number) for number, each in enumerate(shadings)]
+    tilted = [getattr(part.material, "normal_texture", None) is not None for part in scene.parts]
+    smooth = [_is_smooth(each, shown, number) and not tilted[number] for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
     if count > most:
         step = math.ceil(math.sqrt(count / most))
@@ -198,7 +199,7 @@ def exact_picture(
             value, emitted = points.carry(jnp.asarray(every), axis=1), look.emitted
             value = value if look.blend is None else value * look.blend.weight[:, 0]
         else:
-            brdf, emitted = exact_at(part, shading, points)
+            brdf, emitted, points = exact_at(part, shading, points)
             value = _sum(shading.mesh, brdf, lights, points, **options)
         color[:, index] = value if emitted is None else value + emitted
     behind = [skies.sky(each, camera) for each in environments]

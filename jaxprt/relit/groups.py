@@ -300,11 +300,14 @@ class Stage(eqx.Module):
             return put(flag[np.asarray(points.corner)[0]])
         return jnp.asarray(flag)[points.corner[0]]
 
-    def blend(self, number: int, points: Points, own: Points) -> Blend | None:
-        """Weights of the channels of a group's BRDF at points of the scene, which are `own` on the group."""
+    def blend(self, number: int, points: Points, own: Points) -> tuple[Blend | None, Points]:
+        """Weights of the channels of a group's BRDF at points of the scene, which are `own` on the group.
+
+        The second result is `own` with the normals of normal maps.
+        """
         look = look_at(self.table, self.rough, points)
         with compile_time(look, own, self.given[number], self.surfaces[number].scale):
-            return material(self.surfaces[number], own, look, self.given[number])[0]
+            return material(self.surfaces[number], own, look, self.given[number])[0], own.tilted(look.normal)
 
     def vertices(self, parts: Sequence[int]) -> Iterator[tuple[Int[np.ndarray, " p"], Points, Points]]:
         """Vertices of some parts of one group in rows: their indices in the group, and as points of scene and group.

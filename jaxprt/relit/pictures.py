@@ -335,8 +335,9 @@ def make(
             elif row.kept is None:
                 row = dataclasses.replace(row, lamps=transport)
             if row.number in sharp:
-                blend, narrow = stage.blend(row.number, points, on_group), stage.sharp_at(row.number, points)
-                origins.append(tracing.Asked(row.number, points, on_group, blend, narrow, transport))
+                blend, own = stage.blend(row.number, points, on_group)
+                narrow = stage.sharp_at(row.number, points)
+                origins.append(tracing.Asked(row.number, points, own, blend, narrow, transport))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
@@ -439,7 +440,7 @@ def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera:
     """Parts of each group whose radiance is interpolated between vertices: where that is accurate, and less work.
 
     Ideally diffuse groups count as accurate: their radiance is linear in the light that arrives at the vertices. Not
-    where users give materials at vertices, nor inside of `jax.jit`.
+    where users give materials at vertices or where there are normal maps, nor inside of `jax.jit`.
     """
     nothing = ((),) * len(stage.surfaces)
     if not known(camera, stage.bend):
@@ -456,7 +457,7 @@ def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera:
     wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
     square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
     matte = np.asarray([stage.surfaces[group].matte for group in place.group])
-    good = np.asarray(may) & (matte | (square <= _ERROR**2 * seen))
+    good = np.asarray(may) & (matte | (square <= _ERROR**2 * seen)) & ~stage.table.tilted[: len(may)]
     result = []
     for number, parts in zip(channels, place.parts, strict=True):
         accurate = tuple(part for part in parts if good[part])

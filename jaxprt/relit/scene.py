@@ -48,12 +48,14 @@ class SceneView(eqx.Module):
     Attributes:
         group: For each group, the view of direct light, of reflected light and of lamps.
         emitted: Radiance that each vertex of each group emits; None for a group that does not emit.
+        points: Points on each group at which radiance is evaluated; None for its vertices.
         stage: The scene and its materials.
         reflected: Reflections that sharp parts show by ray tracing; None without.
     """
 
     group: tuple[tuple[PyTree, PyTree, PyTree], ...]
     emitted: tuple[Float[Array | np.ndarray, "_ 3"] | None, ...]
+    points: tuple[Points | None, ...]
     stage: Stage
     reflected: Reflections | None = None
 
@@ -231,6 +233,9 @@ class RelitScene(System):
         blends = [each.blend for each in self._gathered(appearances)]
         pairs = zip(self.surfaces, light.direct, blends, strict=True)
         direct = tuple(own.system.shade(lit, blend) for own, lit, blend in pairs)
+        if self.table.frame is not None:
+            every = zip(self.surfaces, direct, strict=True)
+            direct = tuple(own.system.tilted(lit, own.frame[:, 2]) for own, lit in every)
         reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends)
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
         return Arriving(direct, reflected, lamp)
@@ -249,22 +254,23 @@ class RelitScene(System):
         given = scene_lamps.split(self.lamps, materials)[0]
         appearances = self.appearances(given)
         stage, every = self._stage(given, appearances), self._gathered(appearances)
-        views, emitted, asked = [], [], []
+        views, emitted, asked, places = [], [], [], []
         for number, (surface, own) in enumerate(zip(stage.surfaces, every, strict=True)):
-            points, place = self._points(number)
+            points, place = self._points(number, stage)
             blend = own.blend if place is None or own.blend is None else jax.tree.map(place.carry, own.blend)
             sharp = None
             if number in stage.sharp_groups:
                 sharp = stage.sharp_at(number, points)
-                if place is None:
+                if self.points is None:
                     with compile_time(self.mesh, eye):
                         sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)
-                asked.append(tracing.Asked(number, points, place, blend, sharp))
+                asked.append(tracing.Asked(number, points, place, blend, sharp, at_vertices=self.points is None))
             views.append(view_of(surface, eye, blend, place, sharp))
+            places.append(place)
             glow = own.emitted
             emitted.append(glow if glow is None or place is None else place.carry(glow))
         reflected = tracing.trace(stage, asked, eye, keep=True) if asked else None
-        return SceneView(tuple(views), tuple(emitted), stage, reflected)
+        return SceneView(tuple(views), tuple(emitted), tuple(places), stage, reflected)
 
     @promoted
     def combine(self, light: Arriving | SceneLight, view: SceneView) -> Float[Array, "v c"]:
@@ -276,14 +282,27 @@ class RelitScene(System):
         assert isinstance(light, Arriving)
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
-        for number, (surface, seen, emitted) in enumerate(zip(self.surfaces, view.group, view.emitted, strict=True)):
+        groups_of = zip(self.surfaces, view.group, view.emitted, view.points, strict=True)
+        for number, (surface, seen, emitted, points) in enumerate(groups_of):
             surface = groups.sampled(surface, max(view.stage.samples[part] for part in self.place.parts[number]))
-            color = combine(surface, light.at(number), seen, self._points(number)[1], emitted)
+            color = combine(surface, light.at(number), seen, points, emitted)
             colors.append(color + next(traced) if number in view.stage.sharp_groups else color)
         return groups.ordered(tuple(colors), self._order())
 
-    def _points(self, number: int) -> tuple[Points, Points | None]:
-        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group."""
+    def _points(self, number: int, stage: Stage) -> tuple[Points, Points | None]:
+        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group.
+
+        In scenes with normal maps, vertices are points on the group too, which have the normals of these maps.
+        """
+        points, place = self._untilted(number)
+        if stage.table.frame is None:
+            return points, place
+        if place is None:
+            place = material_table.at_vertices(np.arange(len(points), dtype=np.int32))
+        return points, place.tilted(groups.look_at(stage.table, stage.rough, points).normal)
+
+    def _untilted(self, number: int) -> tuple[Points, Points | None]:
+        """`_points` without normal maps."""
         parts = self.place.parts[number]
         if self.points is None:
             vertex = self.place.column(number, [self.place.vertices(number)])

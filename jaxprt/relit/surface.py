@@ -30,11 +30,14 @@ class Sight(eqx.Module):
         frame: Shading frames of the points; rows are tangent, bitangent, normal.
         wo: Unit directions to the viewer in these frames.
         blend: Weights and parameters of the BRDF's channels; None for a BRDF that cannot change.
+        above: Normals of the smooth surface, below whose horizon no light arrives; None where they are those of the
+            frames.
     """
 
     frame: Float[Array, "p 3 3"]
     wo: Float[Array, "p 3"]
     blend: Blend | None
+    above: Float[Array, "p 3"] | None = None
 
 
 class Viewed(eqx.Module):
@@ -97,6 +100,7 @@ def view(
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
+    points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, given)
     seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps)
     sight = _sight(surface, points, eye, blend)
@@ -126,6 +130,7 @@ def between(
     lamps: LampTransport | None = None,
 ) -> Interpolated:
     """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
+    points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, given)
     lit = None if lamps is None or surface.lit is None else surface.lit.at(lamps).view(eye, blend, None, sharp)
     return Interpolated(points, emitted, _sight(surface, points, eye, blend), lit)
@@ -176,12 +181,15 @@ def from_texels(
     """
     light = texel, excess / texel_rays.FULL, share
     options = {"size": size, "samples": samples}
-    return bright_texels.sent(surface.brdf, sight.frame, sight.wo, light, None, sight.blend, **options)
+    return bright_texels.sent(
+        surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options
+    )
 
 
 def _sight(surface: Surface, points: Points, eye: Array, blend: Blend | None) -> Sight:
     position, frame = placed(surface.position, surface.frame, points)
-    return Sight(frame, directions.view(frame, position, eye), blend)
+    above = None if points.normal is None else points.tilted(None).frame(surface.frame)[:, 2]
+    return Sight(frame, directions.view(frame, position, eye), blend, above)
 
 
 @jit

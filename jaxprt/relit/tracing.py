@@ -47,6 +47,7 @@ class Asked(eqx.Module):
         blend: Material weights of the vertices or points.
         seen: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
+        at_vertices: Whether the points are vertices, from which rays start elsewhere than from points of triangles.
     """
 
     number: int = eqx.field(static=True)
@@ -55,6 +56,7 @@ class Asked(eqx.Module):
     blend: Blend | None
     seen: Float[Array, " v"] | None
     lamps: LampTransport | None = None
+    at_vertices: bool = eqx.field(static=True, default=False)
 
 
 class Carried(eqx.Module):
@@ -151,7 +153,7 @@ def trace(stage: Stage, asked: Sequence[Asked], eye: Float[Array, "3"], *, keep:
         _check(stage.whole, each, sharp, eye)
         with jax.ensure_compile_time_eval():
             rays.append(sharp.rays(eye, parameter, each.own, each.seen))
-            met = cast.cast(rays[-1], each.points, at_vertices=each.own is None)
+            met = cast.cast(rays[-1], each.points, at_vertices=each.at_vertices)
             found.append((*met, cast.spread(rays[-1], *met)))
     slots, hit = _rows(stage, cast, found, keep=keep)
     own = []

@@ -4,7 +4,8 @@ The texels of all textures stand in one array. Which image a part reads, and how
 program depends on the number of points only, and not on the parts or their textures.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import BlinnPhong, MetallicRoughness
 from jaxprt.compile import kept, known, put, shared_size
-from jaxprt.scene import mipmap, texture
+from jaxprt.scene import mipmap, normal_maps, texture
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.points import Points
 from jaxprt.scene.scene import Part
+from jaxprt.sphere import directions
 
 # Textures, in the order of their columns.
 TEXTURES = (
@@ -34,7 +36,8 @@ TEXTURES = (
 )
 # Textures of materials with further layers, which only scenes with such materials have columns for.
 LAYER_TEXTURES = ("clearcoat_texture", "clearcoat_roughness_texture", "transmission_texture")
-COLORS = 6  # of these determine the colors and the roughness of points; the others turn the frames of vertices
+COLORS = 6  # of these determine the colors and the roughness of points; the others turn their frames
+_NORMAL = TEXTURES.index("normal_texture")
 _FACTORS = (
     ("base_color", 3),
     ("metallic", 1),
@@ -81,6 +84,8 @@ class Look(NamedTuple):
         emitted: Radiance that the surface emits.
         values: The parameters themselves.
         log_coat: Logarithm of the roughness of the clear coat; None in scenes without layers.
+        normal: Unit shading normals in world space, tilted by normal maps; None in scenes without such maps. Roughness
+            includes the variance of the map's normals over a pixel.
     """
 
     coefficient: Float[Array | np.ndarray, "p k 3"]
@@ -88,6 +93,7 @@ class Look(NamedTuple):
     emitted: Float[Array | np.ndarray, "p 3"]
     values: Values
     log_coat: Float[Array | np.ndarray, " p"] | None = None
+    normal: Float[Array | np.ndarray, "p 3"] | None = None
 
 
 class Texels(eqx.Module):
@@ -119,6 +125,8 @@ class MaterialTable(eqx.Module):
         part: Index of the material of each vertex.
         coordinate: Both sets of texture coordinates of each vertex.
         color: Color of each vertex, which multiplies the base color.
+        frame: Normal, tangent and handedness of each vertex; None in scenes without normal maps.
+        normal_scale: Factor of the slopes of each material's normal map; None in scenes without.
     """
 
     factor: Float[Array | np.ndarray, "m f"]
@@ -130,6 +138,13 @@ class MaterialTable(eqx.Module):
     part: Int[Array | np.ndarray, " v"]
     coordinate: Float[Array | np.ndarray, "v 4"]
     color: Float[Array | np.ndarray, "v 3"]
+    frame: Float[Array | np.ndarray, "v 7"] | None = None
+    normal_scale: Float[Array | np.ndarray, " m"] | None = None
+
+    @property
+    def tilted(self) -> Bool[np.ndarray, " m"]:
+        """Whether each material has a normal map."""
+        return np.asarray(self.image)[:, _NORMAL] >= 0
 
     @property
     def layered(self) -> bool:
@@ -167,13 +182,18 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 @kept
 def _looked(table: MaterialTable, points: Points) -> Look:
     values, layers = _values(table, points)
+    normal = None
+    if table.frame is not None:
+        normal, variance = _normals(table, points)
+        values = values._replace(roughness=normal_maps.rougher(values.roughness, variance))
+        layers = layers and (layers[0], normal_maps.rougher(layers[1], variance), layers[2])
     shiny = table.factor[:, _SHINY][table.part[points.corner[0]]] > 0
     none = jnp.zeros_like(values.base_color)
     colors = jnp.stack([values.base_color, values.specular_color, none, none], 1)
     material = MetallicRoughness(**{name: value for name, value in values._asdict().items() if name != "emissive"})
     coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
     least = jnp.where(shiny, 0, SMOOTHEST)
-    look = Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values)
+    look = Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values, normal=normal)
     return look if layers is None else _layered(look, *layers)
 
 
@@ -188,26 +208,8 @@ def _layered(look: Look, coat: Array, roughness: Array, transmission: Array) -> 
 
 def _values(table: MaterialTable, points: Points) -> tuple[Values, tuple[Array, ...] | None]:
     """The parameters at points, and those of their layers; None in scenes without."""
-    part = table.part[points.corner[0]]
-    factor = table.factor[part]
-    place = points.carry(table.coordinate)
-    slope = jnp.zeros((2, *place.shape), place.dtype) if points.slope is None else points.slopes(table.coordinate)
-
-    def read(texture: Array) -> Float[Array, "p 3"]:
-        image = table.image[part, texture]
-
-        def found() -> Array:
-            second = table.set[part, texture][:, None] > 0
-            turn = table.transform[part, texture]
-            own = jnp.where(second, place[:, 2:], place[:, :2])
-            change = jnp.where(second, slope[..., 2:], slope[..., :2])
-            moved = jnp.einsum("pij,pj->pi", turn[..., :2], own, precision="highest") + turn[..., 2]
-            moving = jnp.einsum("pij,kpj->kpi", turn[..., :2], change, precision="highest")
-            value = _looked_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
-            return jnp.where(image[:, None] >= 0, value, 1)
-
-        return jax.lax.cond(jnp.any(image >= 0), found, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
-
+    factor = table.factor[table.part[points.corner[0]]]
+    read = partial(_read, table, points, _coordinates(table, points))
     base, metallic, roughness, emissive, specular, tint = jax.lax.map(read, jnp.arange(COLORS))
     layers = None
     if table.layered:
@@ -226,6 +228,63 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, tuple[Array, 
         each["ior"][:, 0],
     )
     return values, layers
+
+
+def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
+    """Shading normals at points, and the variance of the normals that a pixel averages; see `normal_maps`."""
+    assert table.frame is not None
+    assert table.normal_scale is not None
+    part, base = table.part[points.corner[0]], points.carry(table.frame)
+    has, scale = table.image[part, _NORMAL] >= 0, table.normal_scale[part]
+    frame = directions.frame(directions.normalize(base[:, :3]), base[:, 3:6])
+    place = _coordinates(table, points)
+    mean = 2 * _read(table, points, place, _NORMAL) - 1
+    normal = normal_maps.tilted(frame, jnp.where(base[:, 6] < 0, -1, 1), mean, scale)
+    _, moving = _in_image(table, part, place, _NORMAL)
+    shape = table.texels.shape[jnp.maximum(table.image[part, _NORMAL], 0)]
+    footprint = jnp.sqrt(jnp.max(jnp.sum((moving * shape[:, ::-1]) ** 2, -1), 0))
+    variance = normal_maps.variance(mean, scale, jax.lax.stop_gradient(footprint))
+    return jnp.where(has[:, None], normal, frame[:, 2]), jnp.where(has, variance, 0)
+
+
+def _coordinates(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 4"], Float[Array, "2 p 4"]]:
+    """Both sets of texture coordinates at points, and their change from pixel to pixel."""
+    place = points.carry(table.coordinate)
+    still = points.slope is None
+    return place, jnp.zeros((2, *place.shape), place.dtype) if still else points.slopes(table.coordinate)
+
+
+def _in_image(
+    table: MaterialTable, part: Array, place: tuple[Array, Array], texture: Array | int
+) -> tuple[Float[Array, "p 2"], Float[Array, "2 p 2"]]:
+    """Coordinates of points in the image of a texture, and their change from pixel to pixel."""
+    second = table.set[part, texture][:, None] > 0
+    turn = table.transform[part, texture]
+    own, change = (jnp.where(second, each[..., 2:], each[..., :2]) for each in place)
+    moved = jnp.einsum("pij,pj->pi", turn[..., :2], own, precision="highest") + turn[..., 2]
+    return moved, jnp.einsum("pij,kpj->kpi", turn[..., :2], change, precision="highest")
+
+
+def _read(
+    table: MaterialTable, points: Points, place: tuple[Array, Array], texture: Array | int
+) -> Float[Array, "p 3"]:
+    """Values of a texture at points; 1 at points whose material has none.
+
+    Args:
+        table: The materials.
+        points: The points.
+        place: Their texture coordinates, from `_coordinates`.
+        texture: Index of the texture.
+    """
+    part = table.part[points.corner[0]]
+    image = table.image[part, texture]
+
+    def found() -> Array:
+        moved, moving = _in_image(table, part, place, texture)
+        value = _looked_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
+        return jnp.where(image[:, None] >= 0, value, 1)
+
+    return jax.lax.cond(jnp.any(image >= 0), found, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
 
 
 def _looked_up(
@@ -327,7 +386,17 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     columns = np.pad(part, (0, room)), both, column([each.color for each in parts], 1.0, 3)
     held: dict[str, Any] = dict(zip(("part", "coordinate", "color"), columns, strict=True))
     layered = any(has_layers(material) for material in materials)
-    return MaterialTable(**_rows(materials, dtype, layered=layered), **held)
+    if any(_has_map(material) for material in materials):
+        hand = column(
+            [each.handedness if each.handedness is None else each.handedness[:, None] for each in parts], 1.0, 1
+        )
+        rows = [column([getattr(each.mesh, name) for each in parts], 1.0, 3) for name in ("normal", "tangent")]
+        held["frame"] = (np if known(rows, hand) else jnp).concatenate([*rows, hand], 1)
+    return MaterialTable(**_rows(materials, dtype, layered=layered, tilted="frame" in held), **held)
+
+
+def _has_map(material: Any) -> bool:
+    return isinstance(material, TexturedMaterial) and material.normal_texture is not None
 
 
 def with_materials(
@@ -344,11 +413,20 @@ def with_materials(
         table: The table.
         materials: The new materials.
         before: Those of the table.
+
+    Raises:
+        ValueError: A material has a normal map, but no material of the table had one.
     """
-    held: dict[str, Any] = {"part": table.part, "coordinate": table.coordinate, "color": table.color}
+    if table.frame is None and any(_has_map(material) for material in materials):
+        raise ValueError(
+            "materials may have normal maps only in scenes that were precomputed with one, got a new map: precompute "
+            "the scene with it"
+        )
+    held: dict[str, Any] = {name: getattr(table, name) for name in ("part", "coordinate", "color", "frame")}
     old = _images(before)
     layered = table.layered or any(has_layers(material) for material in materials)
-    rows = _rows(materials, table.factor.dtype, layered=layered, old=old, texels=table.texels)
+    tilted = table.frame is not None
+    rows = _rows(materials, table.factor.dtype, layered=layered, tilted=tilted, old=old, texels=table.texels)
     return MaterialTable(**rows, **held)
 
 
@@ -360,10 +438,16 @@ def has_layers(material: Any) -> bool:
     return any(isinstance(each, Tracer) or bool(np.asarray(each) != 0) for each in layers)
 
 
-def _images(materials: Sequence[TexturedMaterial | Callable]) -> list[Any]:
+def _key(name: str, each: Texture) -> tuple[int, bool]:
+    """Key of the image of a texture of some name. An image that is a normal map and another texture has two."""
+    return id(each.image), name == TEXTURES[_NORMAL]
+
+
+def _images(materials: Sequence[TexturedMaterial | Callable]) -> dict[tuple[int, bool], Any]:
     """The images of the textures of some materials, each once."""
-    own = (getattr(material, name, None) for material in materials for name in (*TEXTURES, *LAYER_TEXTURES))
-    return list({id(each.image): each.image for each in own if each is not None}.values())
+    names = (*TEXTURES, *LAYER_TEXTURES)
+    pairs = [(name, getattr(material, name, None)) for material in materials for name in names]
+    return {_key(name, each): each.image for name, each in pairs if each is not None}
 
 
 def _rows(
@@ -371,7 +455,8 @@ def _rows(
     dtype: Any,
     *,
     layered: bool,
-    old: Sequence[Any] = (),
+    tilted: bool,
+    old: Mapping[tuple[int, bool], Any] | None = None,
     texels: Texels | None = None,
 ) -> dict[str, Any]:
     """Factors, textures and images of some materials, padded to a number of materials that scenes share.
@@ -379,12 +464,12 @@ def _rows(
     `texels` holds the images `old` already, and serves again if there are no others.
     """
     rows, images = shared_size(len(materials)), _images(materials)
-    if texels is None or {id(each) for each in images} - {id(each) for each in old}:
+    if texels is None or old is None or set(images) - set(old):
         texels = _texels(images, dtype, texels)
     else:
         images = old
     names = (*TEXTURES, *LAYER_TEXTURES) if layered else TEXTURES
-    number, image = {id(each): n for n, each in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
+    number, image = {each: n for n, each in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
     transform: Any = np.zeros((*image.shape, 2, 3), dtype)
     sets, wrap = np.zeros(image.shape, np.int32), np.zeros((*image.shape, 2), np.int32)
     for row, material in enumerate(materials):
@@ -392,13 +477,16 @@ def _rows(
             own: Texture | None = getattr(material, name, None)
             if own is None:
                 continue
-            image[row, column] = number[id(own.image)]
+            image[row, column] = number[_key(name, own)]
             sets[row, column] = own.set
             wrap[row, column] = [texture.WRAPS.index(mode) for mode in own.wrap]
             transform = _placed(transform, (row, column), own.transform)
     factor = _concatenated([_factors(material, layered)[None] for material in materials], dtype)
     padding = np.zeros((rows - len(materials), factor.shape[1]), dtype)
     made = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
+    if tilted:
+        scale = [np.reshape(getattr(material, "normal_scale", 1.0), 1) for material in materials]
+        made["normal_scale"] = _concatenated([*scale, np.ones(rows - len(materials))], dtype)
     return {"factor": _concatenated([factor, padding], dtype), **made}
 
 
@@ -428,13 +516,14 @@ def _concatenated(rows: Sequence[Any], dtype: Any) -> Any:
     return jnp.concatenate(rows).astype(dtype) if not known(rows) else np.concatenate(rows).astype(dtype)
 
 
-def _texels(images: Sequence[Any], dtype: Any, least: Texels | None = None) -> Texels:
+def _texels(images: Mapping[tuple[int, bool], Any], dtype: Any, least: Texels | None = None) -> Texels:
     """The mip maps of some images in one array, padded to a size that scenes share, or to that of other texels."""
     rows, room = (1, 4) if least is None else (len(least.shape), len(least.value))
     rows = max(shared_size(len(images)), rows)
     start, shape, channels = np.full((rows, _LEVELS), -1), np.ones((rows, 2), np.int32), np.ones(rows, np.int32)
     start[:, 0], values, total = 0, [], 0
-    for row, image in enumerate(images):
+    for row, ((_, normals), image) in enumerate(images.items()):
+        image = normal_maps.of_unit_length(image) if normals else image
         for level, own in enumerate(mipmap.levels(image)):
             start[row, level] = total
             total += own.size

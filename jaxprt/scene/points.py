@@ -1,5 +1,6 @@
 """Points on the triangles of a mesh, for evaluation between vertices."""
 
+import dataclasses
 import functools
 from functools import partial
 
@@ -25,11 +26,14 @@ class Points(eqx.Module):
         weight: Barycentric coordinates, which sum to 1.
         slope: Change of the barycentric coordinates from one pixel to the next, to the right and down; None for points
             that do not belong to a picture.
+        normal: Unit shading normals in world space, where normal maps tilt them; None for those of the vertices,
+            interpolated.
     """
 
     corner: Int[Array | np.ndarray, "k p"]
     weight: Float[Array | np.ndarray, "k p"]
     slope: Float[Array | np.ndarray, "2 k p"] | None = None
+    normal: Float[Array | np.ndarray, "3 p"] | None = None
 
     def __len__(self) -> int:
         """Number of points."""
@@ -43,6 +47,10 @@ class Points(eqx.Module):
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
         assert self.slope is not None
         return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])
+
+    def tilted(self, normal: Float[Array | np.ndarray, "p 3"] | None) -> "Points":
+        """The same points with other shading normals; with the interpolated ones if `normal` is None."""
+        return dataclasses.replace(self, normal=None if normal is None else normal.T)
 
     def check(self, vertices: int) -> None:
         """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`.
@@ -64,10 +72,12 @@ class Points(eqx.Module):
     def frame(self, frame: Float[Array, "v 3 3"]) -> Float[Array, "p 3 3"]:
         """Shading frames at the points: normals are interpolated and normalized, tangents made orthogonal to them.
 
+        Points with normals of their own have these in place of the interpolated ones.
+
         Args:
             frame: Shading frames of the vertices; rows are tangent, bitangent, normal.
         """
-        return _frames(self.corner, self.weight, frame)
+        return _frames(self.corner, self.weight, frame, self.normal)
 
 
 @partial(jit, static_argnames="axis")
@@ -84,9 +94,9 @@ def _carried(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Ar
 
 
 @jit
-def _frames(corner: Array, weight: Array, frame: Array) -> Array:
+def _frames(corner: Array, weight: Array, frame: Array, normal: Array | None) -> Array:
     rows = _carried(corner, weight, frame[:, ::2].reshape(len(frame), 6), axis=0)
-    return directions.frame(directions.normalize(rows[:, 3:]), rows[:, :3])
+    return directions.frame(directions.normalize(rows[:, 3:]) if normal is None else normal.T, rows[:, :3])
 
 
 def placed(

@@ -115,6 +115,13 @@ def table(*, size: int, cells: int) -> scipy.sparse.csr_matrix:
 
 
 @functools.lru_cache(maxsize=8)
+def centers(*, cells: int) -> Float[np.ndarray, "h 3"]:
+    """Unit directions of the corners at which the hat functions are 1."""
+    point = np.unique(_corners(cells), axis=0)
+    return point / np.linalg.norm(point, axis=1, keepdims=True)
+
+
+@functools.lru_cache(maxsize=8)
 def _profile(size: int, cells: int) -> Float[np.ndarray, "n k"]:
     """Mean of each one-dimensional hat function over the texels along an edge of a face."""
     if cells < 1 or size % cells:
@@ -126,12 +133,16 @@ def _profile(size: int, cells: int) -> Float[np.ndarray, "n k"]:
 @functools.lru_cache(maxsize=8)
 def _nodes(cells: int) -> Int[np.ndarray, "6 k k"]:
     """Number of the hat function at each corner of the cells of each face."""
+    _, node = np.unique(_corners(cells), axis=0, return_inverse=True)
+    return node.reshape(6, cells + 1, cells + 1)
+
+
+def _corners(cells: int) -> Int[np.ndarray, "n 3"]:
+    """Places of the corners of the cells of all faces."""
     along = 2 * np.arange(cells + 1) - cells  # on the surface of the cube [-cells, cells]^3
     t, s = np.meshgrid(along, along, indexing="ij")
     local = np.stack([s, t, np.full_like(s, cells)], -1)
-    point = np.einsum("ija,fac->fijc", local, np.rint(cubemap.axes()).astype(int))
-    _, node = np.unique(point.reshape(-1, 3), axis=0, return_inverse=True)
-    return node.reshape(6, cells + 1, cells + 1)
+    return np.einsum("ija,fac->fijc", local, np.rint(cubemap.axes()).astype(int)).reshape(-1, 3)
 
 
 @functools.lru_cache(maxsize=8)

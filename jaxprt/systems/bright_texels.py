@@ -1,5 +1,6 @@
 """Exact light from the brightest texels of an environment: stored visibility times the BRDF itself."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from functools import partial
@@ -117,6 +118,10 @@ class BrightTexels(VertexSystem):
         """Light of the rest that arrives at the vertices, and the visibility of each bright texel."""
         rest = self.system.shade(light.rest, materials)
         return BrightLight(rest, light.texel, light.excess, _seen(self.visibility, light.texel))
+
+    def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
+        """The light, whose rest is that of the underlying system: `System.tilted`."""
+        return dataclasses.replace(light, rest=self.system.tilted(light.rest, normal))
 
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
@@ -293,6 +298,7 @@ def sent(
     *,
     size: int,
     samples: int,
+    above: Float[Array, "p 3"] | None = None,
 ) -> Float[Array, "p e"]:
     """Radiance that vertices or points send: the sum over texels of light x BRDF x cosine x visibility.
 
@@ -306,6 +312,7 @@ def sent(
         blend: Weights of the BRDF's channels, and parameters; None for the BRDF as it is.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
+        above: Normals below whose horizon no light arrives, in addition to those of the frames; None without.
     """
     texel, excess, visible = light
     protocol.check_colors(excess.shape[1], 1 if blend is None else blend.weight.shape[2])
@@ -330,7 +337,10 @@ def sent(
     def point(argument):
         direction, area = argument
         wi = jnp.stack([_along(axis, direction) for axis in frame])
-        return value(wi, wo, *parameter) * jnp.maximum(_along(frame[2], area), 0)
+        cosine = jnp.maximum(_along(frame[2], area), 0)
+        if above is not None:
+            cosine = jnp.where(_along(above.T, direction) > 0, cosine, 0)
+        return value(wi, wo, *parameter) * cosine
 
     direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples))
     # Texels are processed one by one, so that intermediate arrays stay in the processor's cache.

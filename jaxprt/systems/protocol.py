@@ -53,6 +53,15 @@ class System(eqx.Module):
         """Light that arrives at the vertices. With bounces it depends on the materials; otherwise it is `light`."""
         return light
 
+    def tilted(self, light: PyTree, normal: Float[Array, "v 3"]) -> PyTree:
+        """The light with what points need whose normals are tilted by normal maps; by default as it is.
+
+        Args:
+            light: The result of `shade`.
+            normal: Unit normals of the vertices.
+        """
+        return light
+
     @abc.abstractmethod
     def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> PyTree:
         """Evaluates the view and the materials in the form that this system uses. Call it again when either changes.

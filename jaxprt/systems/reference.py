@@ -94,6 +94,8 @@ def radiance(
         vertex = np.arange(len(points))
         position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
     position, frame = np.asarray(position), np.asarray(frame)
+    # Light arrives from above the smooth surface, whatever a normal map does to its normals.
+    above = frame[:, 2] if points is None or points.normal is None else _smooth(mesh, points)
     size = light.radiance.shape[-2]
     if isinstance(brdf, PerVertex) and brdf.vertices != len(position):
         raise ValueError(f"the BRDF must have parameters for the mesh's {len(position)} vertices, got {brdf.vertices}")
@@ -102,11 +104,17 @@ def radiance(
     result = []
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
-        seen, _ = visibility.fractional(rays, start[part], np.asarray(frame[part, 2], np.float32), size=size)
+        seen, _ = visibility.fractional(rays, start[part], np.asarray(above[part], np.float32), size=size)
         own = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
         block = finished(integrate(seen, position[part], frame[part], own, light, eye, error=error), between)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
+
+
+def _smooth(mesh: Mesh, points: Points) -> Float[np.ndarray, "p 3"]:
+    """Interpolated normals of points, without normal maps."""
+    frame = directions.frame(mesh.normal, mesh.tangent)
+    return np.asarray(points.tilted(None).frame(frame))[:, 2]
 
 
 @jit

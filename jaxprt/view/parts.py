@@ -41,7 +41,7 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
-    tables = _Tables()
+    tables, tilted = _Tables(), reduced.table.at_vertices().normal
     parts, stride = [], 0
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
@@ -57,7 +57,9 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
         weight = weight[:1] if described else weight
         stride = max(stride, seen.shape[1])
         rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
-        normal = np.round(32767 * np.asarray(shading.mesh.normal))
+        first = int(reduced.place.first[number])
+        own = shading.mesh.normal if tilted is None else tilted[first : first + len(shading.mesh.normal)]
+        normal = np.round(32767 * np.asarray(own))
         kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
         for kept, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
             kept.append(array.astype(kind).reshape(-1))

@@ -91,3 +91,51 @@ def test_textures_are_averaged_over_the_pixel_of_a_point(close):
     close(read([1, 0], [0, 1]), np.broadcast_to(np.mean(texels, (0, 1)), (3, 3)), tolerance=1e-5)
     probes = [texture.lookup(texels, place + np.float32([(n - 1.5) / 4 * 4 / 16, 0])) for n in range(4)]
     close(read([4 / 16, 0], [0, 0]), np.mean(probes, 0), tolerance=1e-5)
+
+
+def bumpy(mesh, texel, **more) -> material_table.MaterialTable:
+    """The table of one part with a normal map."""
+    material = TexturedMaterial(1.0, 0.0, 0.3, normal_texture=Texture(texel), **more)
+    return material_table.of_parts([prt.Part("bumpy", mesh, material)])
+
+
+def test_normals_of_a_map_are_averaged_over_a_pixel_and_their_spread_is_roughness(close):
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]])
+    tangent = np.broadcast_to([1.0, 0, 0], (3, 3))
+    square = make_mesh(corner, np.array([[0, 1, 2]]), tangent=tangent, texture=np.abs(corner[:, [0, 2]]))
+    side = np.where(np.arange(16) % 2, 0.6, -0.6)  # every second column of texels leans to the other side
+    normal = np.stack([side, 0 * side, np.full(16, 0.8)], -1)
+    table = bumpy(square, np.float32(np.broadcast_to((normal + 1) / 2, (16, 16, 3))))
+
+    def look(width):
+        weight = np.float32([[0.75 - 5.5 / 16], [5.5 / 16], [0.25]])
+        slope = np.float32([[[-width], [width], [0]], [[-width], [0], [width]]])
+        return table.at(Points(np.int32([[0], [1], [2]]), weight, slope))
+
+    near, far = look(1e-3 / 16), look(2 / 16)
+    close(near.normal, [[0.6, 0.8, 0.0]], tolerance=1e-4)
+    close(near.values.roughness, [0.3], tolerance=1e-4)
+    close(far.normal, [[0.0, 1.0, 0.0]], tolerance=1e-4)
+    # The variance of von Mises and Fisher's distribution whose mean has the length .8.
+    close(far.values.roughness, [(0.3**4 + 2 * 0.36 / (0.8 * (3 - 0.64))) ** 0.25], tolerance=1e-4)
+    close(far.log_roughness, np.log(far.values.roughness), tolerance=1e-5)
+
+
+def test_an_image_may_be_a_normal_map_and_a_color_at_once(close):
+    ball = part("a", TexturedMaterial(), 0)
+    texel = image(4, 4, 3)
+    both = TexturedMaterial(1.0, 0.0, 0.5, base_color_texture=Texture(texel), normal_texture=Texture(texel))
+    plain = dataclasses.replace(both, normal_texture=None)
+    pair = [dataclasses.replace(ball, material=each) for each in (both, plain)]
+    look, count = material_table.of_parts(pair).at_vertices(), len(ball.mesh.position)
+    close(look.values.base_color[:count], look.values.base_color[count : 2 * count])
+    close(look.normal[count : 2 * count], ball.mesh.normal, tolerance=1e-5)
+    assert material_table.of_parts(pair[1:]).at_vertices().normal is None
+
+
+def test_vertices_without_usable_tangents_have_finite_normals():
+    ball = part("a", TexturedMaterial(), 0).mesh
+    along = np.array(ball.normal) * np.arange(len(ball.normal))[:, None]  # zero at first, parallel to the normal then
+    mesh = dataclasses.replace(ball, tangent=jnp.asarray(along))
+    normal = bumpy(mesh, image(4, 4, 3), normal_scale=2.0).at_vertices().normal
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-5)

@@ -59,3 +59,12 @@ def test_projection_is_the_solution_of_least_squares(close):
 def test_cells_that_texels_cannot_resolve_are_refused(cells, message):
     with pytest.raises(ValueError, match=message):
         hats.project(jnp.ones((6, SIZE, SIZE)), cells=cells)
+
+
+def test_centers_are_where_the_hat_functions_are():
+    size, cells = 32, 4
+    moment = hats.table(size=size, cells=cells).T @ np.asarray(cubemap.vector_area(size=size)).reshape(-1, 3)
+    mean = moment / np.linalg.norm(moment, axis=1, keepdims=True)
+    center = hats.centers(cells=cells)
+    assert len(center) == hats.count(cells=cells)
+    assert np.min(np.sum(mean * center, 1)) > np.cos(np.radians(3))

@@ -154,6 +154,10 @@ def _carried(transport: LampTransport, points: Points | None) -> tuple[Array, Ar
     solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
     if points is not None:
         solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
+        if points.normal is not None:
+            # The integral of direction gives that of the cosine with the tilted normal.
+            tilt = points.normal - points.tilted(None).frame(transport.frame)[:, 2].T
+            cosine = jnp.maximum(cosine + jnp.sum(way * tilt, -2), 0)
     return solid, cosine, way
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, UInt8
 
 from jaxprt import visibility
 from jaxprt.compile import jit, total
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar, harmonics, hats
 
 _CELLS = 8  # cells along the edge of a face
@@ -67,6 +68,55 @@ def irradiance(coefficient: Float[Array, "h c"], vector: Array) -> Float[Array, 
         return jnp.zeros((coefficient.shape[1], vector.shape[1]), coefficient.dtype)
     # Row by row, so that no copy of all vectors in floating point is made.
     return total(lambda row: row[0][:, None] * row[1].astype(coefficient.dtype), (coefficient, vector))
+
+
+@functools.partial(jit, static_argnames="size")
+def flux(
+    coefficient: Float[Array, "h c"], vector: Array, normal: Float[Array, "v 3"], *, size: int
+) -> Float[Array, "c 3 v"]:
+    """Vector irradiance / pi of vertices: the integral of light times visibility times direction, above the horizon.
+
+    Its dot product with the normal is `irradiance`. With another normal it is the irradiance of a surface that is
+    tilted by a normal map, as far as the same light arrives at it.
+
+    A transfer vector holds the integral of visibility x hat function x cosine. The direction of the visible part of a
+    hat function is close to that of its center, raised above the horizon, so that dividing by the cosine of this
+    direction and multiplying by the direction gives the integral that is wanted.
+
+    Args:
+        coefficient: The light's `coefficients`.
+        vector: Transfer vectors [h, v] of the vertices.
+        normal: Unit normals of the vertices.
+        size: Edge of the cubemap faces in texels.
+    """
+    center = jnp.asarray(hats.centers(cells=cells(size)), normal.dtype)
+    width, axes = np.pi / 2 / cells(size), normal.T
+
+    def row(argument):
+        light, transfer, direction = argument
+        cosine = jnp.tensordot(direction, axes, 1)
+        # Mean cosine over the part of a tent of this width that lies above the horizon: a third of the width for a
+        # center on the horizon, and the cosine itself from one width above it.
+        over = jnp.clip(cosine + width, 1e-2 * width, 2 * width)
+        mean = jnp.where(cosine < width, over / 3 + over**2 / (12 * width), cosine)
+        weight = transfer.astype(normal.dtype) / mean
+        return light[:, None, None] * (weight * (direction[:, None] + (mean - cosine) * axes))
+
+    return total(row, (coefficient, vector, center))
+
+
+def at_points(
+    irradiance: Float[Array, "c v"], flux: Float[Array, "c 3 v"] | None, points: Points | None
+) -> Float[Array, "c _"]:
+    """Irradiance / pi at points, from `irradiance` and `flux` at the vertices; at the vertices if `points` is None.
+
+    Points with tilted normals have that of their normals if there is a flux.
+    """
+    if points is None:
+        return irradiance
+    if points.normal is None or flux is None:
+        return points.carry(irradiance, axis=1)
+    return jnp.sum(points.carry(flux, axis=2) * points.normal, 1)
 
 
 def harmonics_of(vector: UInt8[Array | np.ndarray, "h v"], *, size: int, degree: int) -> Float[Array, "lm v"]:

@@ -1,5 +1,7 @@
 """Ideally diffuse surfaces, lit by transfer vectors of hat functions."""
 
+import dataclasses
+
 import equinox as eqx
 from jaxtyping import Array, Float, UInt8
 
@@ -37,10 +39,13 @@ class MatteLight(eqx.Module):
     Attributes:
         coefficient: Coefficients of the light; see `jaxprt.systems.lobe.diffuse`.
         irradiance: Irradiance / pi of the vertices; None before `MatteSystem.shade`.
+        flux: Vector irradiance / pi of the vertices, for normals tilted by normal maps; None before
+            `MatteSystem.tilted`.
     """
 
     coefficient: Float[Array, "h c"]
     irradiance: Float[Array, "c v"] | None = None
+    flux: Float[Array, "c 3 v"] | None = None
 
 
 class MatteSystem(protocol.VertexSystem):
@@ -72,6 +77,11 @@ class MatteSystem(protocol.VertexSystem):
         require.kind("the light", light, MatteLight, source="MatteSystem.light")
         return MatteLight(light.coefficient, diffuse.irradiance(light.coefficient, self.transport.vector))
 
+    def tilted(self, light: MatteLight, normal: Float[Array, "v 3"]) -> MatteLight:
+        """The light with vector irradiance: `System.tilted`."""
+        flux = diffuse.flux(light.coefficient, self.transport.vector, normal, size=self.transport.size)
+        return dataclasses.replace(light, flux=flux)
+
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
         """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
         protocol.check_blend(materials)
@@ -90,7 +100,7 @@ class MatteSystem(protocol.VertexSystem):
         if irradiance is None:
             irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
         protocol.check_colors(len(irradiance), view.shape[1])
-        return self.carried(irradiance, axis=1).T * view
+        return diffuse.at_points(irradiance, light.flux, self.points).T * view
 
     @property
     def vertices(self) -> int:

@@ -57,12 +57,15 @@ class LobeLight(eqx.Module):
         coefficient: Coefficients of the unblurred light, for the diffuse part; see `jaxprt.systems.lobe.diffuse`.
         size: Edge of the environment's cubemap faces in texels.
         irradiance: Irradiance / pi of the vertices; None before `LobeSystem.shade`.
+        flux: Vector irradiance / pi of the vertices, for normals that normal maps tilt; None before
+            `LobeSystem.tilted`.
     """
 
     pyramid: Float[Array, "c t"]
     coefficient: Float[Array, "h c"]
     size: int = eqx.field(static=True)
     irradiance: Float[Array, "c v"] | None = None
+    flux: Float[Array, "c 3 v"] | None = None
 
 
 class LobeView(eqx.Module):
@@ -251,8 +254,7 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
     irradiance = light.irradiance
     if irradiance is None:
         irradiance = diffuse.irradiance(light.coefficient, view.vector)
-    if view.points is not None:
-        irradiance = view.points.carry(irradiance, axis=1)
+    irradiance = diffuse.at_points(irradiance, light.flux, view.points)
     # Colors are contiguous, so that one read gets all. Lobes are summed one by one, so that sums stay in the cache.
     rows = light.pyramid.T
 

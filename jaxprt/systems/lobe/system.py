@@ -1,5 +1,6 @@
 """The lobe system: `light`, `shade`, `view` and `combine` for BRDFs as lobes."""
 
+import dataclasses
 from functools import reduce
 
 import equinox as eqx
@@ -43,6 +44,11 @@ class LobeSystem(protocol.VertexSystem):
         require.kind("the light", light, LobeLight, source="LobeSystem.light")
         irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
         return LobeLight(light.pyramid, light.coefficient, light.size, irradiance)
+
+    def tilted(self, light: LobeLight, normal: Float[Array, "v 3"]) -> LobeLight:
+        """The light with vector irradiance, for the diffuse part: `System.tilted`."""
+        flux = diffuse.flux(light.coefficient, self.transport.vector, normal, size=self.transport.size)
+        return dataclasses.replace(light, flux=flux)
 
     def view(
         self,

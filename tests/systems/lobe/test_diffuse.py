@@ -84,3 +84,26 @@ def test_a_matte_system_has_the_irradiance_times_the_albedo(seen, visible, close
     arriving, view = system.light(light), system.view(jnp.array([0.0, 5.0, 0.0]))
     close(system.combine(arriving, view), expected)
     close(system.combine(system.shade(arriving), view), expected)
+
+
+def test_the_vector_irradiance_is_that_of_tilted_normals(seen, visible):
+    random = np.random.default_rng(4)
+    sky = np.maximum(cubemap.direction(size=SIZE) @ np.float32([0.5, 0.6, -0.3]), 0)[..., None]
+    radiance = jnp.asarray(0.2 + sky * [1.0, 0.8, 0.6], jnp.float32)
+    vector, normal = lobe.diffuse.vectors(jnp.asarray(seen), visible.frame), visible.frame[:, 2]
+    coefficient = lobe.diffuse.coefficients(radiance)
+    flux = np.asarray(lobe.diffuse.flux(coefficient, vector, normal, size=SIZE))
+    np.testing.assert_allclose(
+        np.einsum("cav,va->cv", flux, normal), lobe.diffuse.irradiance(coefficient, vector), atol=1e-5
+    )
+    # By the sum over all texels above the horizon of the vertices, with normals 20 degrees away.
+    way = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
+    axis = np.cross(normal, random.normal(size=normal.shape))
+    tilted = normal + np.tan(np.radians(20)) * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    tilted = np.asarray(tilted / np.linalg.norm(tilted, axis=1, keepdims=True), np.float64)
+    area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
+    share = np.where(np.asarray(normal) @ way.T > 0, seen, 0) / 16 * area / np.pi
+    expected = ((np.maximum(tilted @ way.T, 0) * share) @ np.asarray(radiance, np.float64).reshape(-1, COLORS)).T
+    found = np.einsum("cav,va->cv", flux, tilted)
+    flat = lobe.diffuse.irradiance(coefficient, vector)
+    assert error(found, expected) < 0.04 < 0.12 < error(flat, expected)
