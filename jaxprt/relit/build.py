@@ -75,7 +75,7 @@ def precompute(
             `RelitScene.file_vertex` says which of its vertices are those of the scene. What is known of the lights,
             `environments`, makes it sharper.
         vertices: Largest number of vertices after division, with a warning where it is met. If None, twice as many as
-            the scene has, plus 10,000.
+            the scene has, plus 5,000.
         size: Edge of the light's cubemap faces in texels, a power of two. If None, that of the plan's lights, or 64
             without a plan.
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.

@@ -19,7 +19,7 @@ from jaxprt.visibility import blocks, refinement, shown
 from jaxprt.visibility.occluder import check
 
 ERROR = 0.015  # of pictures, by default
-_ROOM = 10_000  # vertices that division may add to a scene of few, by default
+_ROOM = 5_000  # vertices that division may add to a scene of few, by default
 
 
 class MeshDivision(eqx.Module):
