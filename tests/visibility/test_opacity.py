@@ -26,8 +26,8 @@ def sheet(height, across=(-1.0, 1.0)):
 
 
 def scene(**field):
-    texture = Texture(RAMP, np.eye(2, 3, dtype=np.float32), 0, ("clamp", "clamp"))
-    material = TexturedMaterial(**{"alpha_texture": texture} | field)
+    field.setdefault("alpha_texture", Texture(RAMP, np.eye(2, 3, dtype=np.float32), 0, ("clamp", "clamp")))
+    material = TexturedMaterial(**field)
     return Scene([Part("ground", make_mesh(*GROUND), TexturedMaterial()), Part("leaf", sheet(0.7), material)])
 
 
