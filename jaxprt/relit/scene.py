@@ -261,6 +261,7 @@ class RelitScene(System):
             sharp = None
             if number in stage.sharp_groups:
                 sharp = stage.sharp_at(number, points)
+                assert sharp is not None
                 if self.points is None:
                     with compile_time(self.mesh, eye):
                         sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)

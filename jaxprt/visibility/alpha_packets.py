@@ -87,6 +87,14 @@ class AlphaPackets:
         share = self.passed(origin, direction, point, way)
         return _stopped(origin, direction, point, way, share)
 
+    @property
+    def query(self) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+        """What queries of shares need; see `packets.Packets.query`."""
+        passed, context, arguments = np.ones(packets.WIDTH, np.float32), np.empty(16, np.int64), np.empty(4, np.int64)
+        _empty_context(context, arguments, _PASSED)
+        context[_FIELD] = passed.ctypes.data
+        return self._occluded, self._scene, arguments, context, passed
+
     def shares(
         self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
     ) -> None:
@@ -94,11 +102,7 @@ class AlphaPackets:
 
         Of translucent surfaces, the share of light that passes counts.
         """
-        passed, context, arguments = np.ones(packets.WIDTH, np.float32), np.empty(16, np.int64), np.empty(4, np.int64)
-        _empty_context(context, arguments, _PASSED)
-        context[_FIELD] = passed.ctypes.data
-        query = self._occluded, self._scene, arguments.ctypes.data, passed
-        packets.trace_shares(query, surface, points, texels, part.start, part.stop, share)
+        packets.trace_shares(self.query, surface, points, texels, part.start, part.stop, share)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
         """The first triangle that stops each ray (-1 for none), its distance, and the barycentric coordinates.

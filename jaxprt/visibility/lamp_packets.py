@@ -73,12 +73,12 @@ def _lit(lamp, lamps, center, normal, least, total, room):
 
 @no_type_check
 @partial(compiled, error_model="numpy")
-def _cast(embree, memory, lamps, number, spot, origin, sight, weight, free):
+def _cast(query, memory, lamps, number, spot, origin, sight, weight, free):
     """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones.
 
     Adds the irradiance from each place to `weight`, and to `free` that from visible places.
     """
-    address, scene, arguments = embree
+    address, scene, arguments, _, passed = query
     ray, valid, cosine, goal = memory
     center, normal, facing, least = sight
     place, area = lamps[0], lamps[1]
@@ -102,12 +102,13 @@ def _cast(embree, memory, lamps, number, spot, origin, sight, weight, free):
         ray[8, lane] = np.float32(1 - _NEAR)
         above = x * facing[0, lane] + y * facing[1, lane] + z * facing[2, lane]
         valid[lane] = -1 if cosine[lane] > zero and above > zero else 0
-    call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+    passed[:] = 1
+    call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
     rays, open_ = 0, 0
     for lane in range(16):
         seen = valid[lane] != 0 and ray[8, lane] > zero
         weight[lane] += cosine[lane]
-        free[lane] += cosine[lane] if seen else zero
+        free[lane] += cosine[lane] * passed[lane] if seen else zero
         rays += 1 if cosine[lane] > zero else 0
         open_ += 1 if seen else 0
     return rays, open_
@@ -115,7 +116,7 @@ def _cast(embree, memory, lamps, number, spot, origin, sight, weight, free):
 
 @no_type_check
 @compiled
-def _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free):
+def _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free):
     """Replaces `free` by the visible share of each piece of a lamp at sixteen points.
 
     The first rays go to one quarter of each stratum of the lamp. If they differ in what they meet, rays to the other
@@ -139,7 +140,7 @@ def _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free):
                 number[lane] = first + own * width + within
                 spot[lane] = (base >> 2) + base + corner + turn & 3
             piece = stratum * pieces // strata
-            new = _cast(embree, memory, lamps, number, spot, origin, sight, weight[piece], free[piece])
+            new = _cast(query, memory, lamps, number, spot, origin, sight, weight[piece], free[piece])
             rays, open_ = rays + new[0], open_ + new[1]
     for lane in range(16):
         whole = weight[:, lane].sum()
@@ -168,11 +169,11 @@ def _placed(surface, points, fields, packet, lanes, origin, sight, pattern):
 
 @no_type_check
 @compiled
-def trace(embree, surface, points, fields, lamps, first, last, result):
+def trace(query, surface, points, fields, lamps, first, last, result):
     """Integrals of the visible parts of lamps at some points; see `jaxprt.visibility.lamp_rays.moments`.
 
     Args:
-        embree: Addresses of `rtcOccluded16`, of an Embree scene, and of the arguments.
+        query: What packets of rays need; see `packets.Packets.query`.
         surface: Positions and normals of vertices, triangles, and the distance from each at which rays start.
         points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
         fields: Position and shading normal of each point.
@@ -203,7 +204,7 @@ def trace(embree, surface, points, fields, lamps, first, last, result):
             _lit(lamp, lamps, center, normal, least, total, room)
             lit = total[:own, 0].max() > 0
             if lit:
-                _visible(embree, memory, lamp, lamps, pattern, origin, sight, weight, free)
+                _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free)
             for piece in range(own):
                 for moment in range(4):
                     for lane in range(lanes):

@@ -218,10 +218,10 @@ class Occluder:
         from jaxprt.visibility import lamp_packets  # numba takes half a second to import
 
         with self._building:
-            packed = self._packed
+            packed = self._packed if self.opacity is None else self._partial
         if packed is None:
             raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
-        lamp_packets.trace(packed.embree, surface, points, fields, lamps, part.start, part.stop, result)
+        lamp_packets.trace(packed.query, surface, points, fields, lamps, part.start, part.stop, result)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.

@@ -73,9 +73,14 @@ class Packets:
         self._arguments = np.array([COHERENT | EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
 
     @property
-    def embree(self) -> tuple[int, int, int]:
-        """Addresses of `rtcOccluded16`, of the scene, and of the arguments."""
-        return self._occluded, self._scene, self._arguments.ctypes.data
+    def query(self) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+        """Address of `rtcOccluded16`, the scene, the arguments, their context, and sixteen numbers.
+
+        Filter functions multiply the number of a ray by the share of light that surfaces on it let pass. Opaque ones
+        leave it as it is. Each thread needs a query of its own.
+        """
+        arrays = self._arguments.view(np.int64), self._context.view(np.int64)
+        return self._occluded, self._scene, *arrays, np.ones(WIDTH, np.float32)
 
     def blocked(
         self,
@@ -101,8 +106,7 @@ class Packets:
             part: The points to trace.
             share: The result, in 255ths.
         """
-        query = self._occluded, self._scene, self._arguments.ctypes.data, np.ones(WIDTH, np.float32)
-        trace_shares(query, surface, points, texels, part.start, part.stop, share)
+        trace_shares(self.query, surface, points, texels, part.start, part.stop, share)
 
 
 class Embree(NamedTuple):
@@ -321,12 +325,8 @@ def _between(position, first, last):
 @no_type_check
 @compiled
 def trace_shares(query, surface, points, texels, first, last, share):
-    """Visible shares of texels at points of a picture: see `Packets.shares`.
-
-    `query` holds the address of `rtcOccluded16`, the scene, the address of the arguments, and sixteen numbers. A filter
-    function may multiply the number of a ray by the share of light that a surface on it lets pass.
-    """
-    address, scene, arguments, passed = query
+    """Visible shares of texels at points of a picture: see `Packets.shares` and `Packets.query`."""
+    address, scene, arguments, _, passed = query
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
@@ -358,7 +358,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
                         ray[4 + axis, lane] = direction[texel, stratum, axis]
                 whole_ray(ray)
                 passed[:] = 1.0
-                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
                 for lane in range(lanes):
                     visible[lane] += passed[lane] if above[lane] and ray[8, lane] > 0 else 0.0
             for lane in range(lanes):

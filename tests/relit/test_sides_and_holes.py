@@ -74,9 +74,12 @@ def test_the_vertices_of_the_file_are_known_among_copies_and_added_ones():
     file = np.concatenate([above.position, ground.position])
     np.testing.assert_array_equal(np.asarray(relit.mesh.position)[relit.file_vertex], file)
     first = relit.shading[0].blend
+    assert first is not None
     weight = np.asarray(first.weight)[:9] * np.linspace(0.1, 1, 9, dtype=np.float32)[:, None, None]
     given = Blend(weight, tuple(np.asarray(each)[:9] for each in first.parameter))
-    spread = np.asarray(relit.appearances({"leaf": given})["leaf"].blend.weight)
+    blend = relit.appearances({"leaf": given})["leaf"].blend
+    assert blend is not None
+    spread = np.asarray(blend.weight)
     place = [tuple(row) for row in np.asarray(relit.scene.parts[0].mesh.position).tolist()]
     assert len(spread) == len(place)
     for row, here in zip(spread, place, strict=True):  # the same on both sides

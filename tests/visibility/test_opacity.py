@@ -10,7 +10,8 @@ from jaxprt import visibility
 from jaxprt.scene import Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, join, make_mesh
 from jaxprt.scene.sides import two_sided
-from jaxprt.visibility import Occluder, blocks, texel_rays
+from jaxprt.visibility import Occluder, blocks, lamp_rays, texel_rays
+from jaxprt.visibility.lamp_rays import LampPlaces
 
 SIZE = 8
 RAMP = np.array([[[0.0], [1.0]]], np.float32)  # opacity 2 u - 1/2, clamped: half of it is in each half of the sheet
@@ -25,8 +26,8 @@ def sheet(height, across=(-1.0, 1.0)):
 
 
 def scene(**field):
-    texture = Texture(RAMP, np.eye(2, 3, dtype=np.float32), 0, ("clamp", "clamp"))
-    material = TexturedMaterial(**{"alpha_texture": texture} | field)
+    field.setdefault("alpha_texture", Texture(RAMP, np.eye(2, 3, dtype=np.float32), 0, ("clamp", "clamp")))
+    material = TexturedMaterial(**field)
     return Scene([Part("ground", make_mesh(*GROUND), TexturedMaterial()), Part("leaf", sheet(0.7), material)])
 
 
@@ -139,3 +140,28 @@ def test_rays_from_pixels_pass_what_rays_of_vertices_pass():
         assert np.mean(np.abs(share / 255 - passed) > 1 / 255) < 1e-3
         assert np.mean(share < 255) > 0.1
         assert np.any((share > 0) & (share < 255)) == (field["alpha_mode"] == "blend")
+
+
+def test_lamps_shine_through_what_lets_light_pass():
+    points = texel_rays.PicturePoints(
+        np.array([0]), np.array([[0.2, 0.3, 0.5]]), np.zeros((1, 2, 3)), *np.zeros((2, 1), int)
+    )
+    lamp = LampPlaces(  # a point light above the left half of the leaf
+        np.array([[-0.3, 5, 0]], np.float32),
+        np.zeros((1, 3), np.float32),
+        *np.array([[[0]], [[1]]]),
+        *np.array([[1], [4]]),
+    )
+
+    def light(**field):
+        mesh = scene(**field).mesh
+        corner = np.asarray(mesh.position)[np.asarray(mesh.face)[0]]
+        place, up = points.barycentric @ corner, np.array([[0.0, 1, 0]])
+        return lamp_rays.moments(Occluder(mesh), mesh, points, place, up, lamp), place
+
+    open_, place = light(alpha_texture=None, alpha=0.0, alpha_mode="mask")
+    assert np.any(open_ != 0)
+    at = place[0] + (0.7 / 5) * (lamp.place[0] - place[0])
+    assert np.all(np.abs(at[[0, 2]]) < 1)
+    np.testing.assert_array_equal(light()[0], 0)
+    np.testing.assert_allclose(light(alpha_texture=None, alpha=0.25, alpha_mode="blend")[0], 0.75 * open_, rtol=1e-5)
