@@ -90,11 +90,13 @@ class Maker:
         scale, weight = 10 * self.uniform(count, *members, 64), self.uniform(3, count, *members, 64)
         return lobe.LobeBrdf(mean, scale, weight, self.uniform(3, *members, 64), knot, jnp.asarray(0.0))
 
-    def pyramids(self, vertices: int, harmonics: int = (lobe.pyramid.DEGREE + 1) ** 2) -> lobe.LobeTransport:
-        """Visibility at all scales."""
+    def pyramids(self, vertices: int, *, diffuse: bool = True) -> lobe.LobeTransport:
+        """Visibility at all scales, with or without vectors for diffuse light."""
         shape = vertices, lobe.pyramid.scales(self.size).total
         seen = jnp.asarray(self.random.integers(256, size=shape, dtype=np.uint8))
-        return lobe.LobeTransport(seen, self.normal(harmonics, vertices), *self.place(vertices), self.size)
+        shape = lobe.diffuse.count(self.size) if diffuse else 0, vertices
+        vector = jnp.asarray(self.random.integers(256, size=shape, dtype=np.uint8))
+        return lobe.LobeTransport(seen, vector, *self.place(vertices), self.size)
 
     def clusters(self, vertices: int, terms: int, *, modes: int = 96, components: int = 16) -> Any:
         """Clustered transport."""
@@ -139,7 +141,7 @@ class Maker:
         cores = self.normal(2, 2, 2), self.normal(3, 1, 2)
         brdf = dynamic.DynamicBrdf(*cores, *maps, self.lobes(3), None, jnp.asarray(0.0))
         row = jnp.arange(vertices, dtype=jnp.int32)
-        region = dynamic.RegionTransport(self.clusters(vertices, 3), self.pyramids(vertices, 0), row)
+        region = dynamic.RegionTransport(self.clusters(vertices, 3), self.pyramids(vertices, diffuse=False), row)
         material = dynamic.Material(np.array([0.2, 0.3, 0.5]), self.uniform(3), self.uniform(vertices, 3))
         return dynamic.DynamicSystem(dynamic.DynamicTransport((region,), row), (brdf,)), [material]
 

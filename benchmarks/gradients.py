@@ -253,14 +253,14 @@ def _seen(vertices: int) -> LobeTransport:
     position, frame = points(vertices)
     count = lobe_system.pyramid.scales(SIZE).total
     pyramid = np.random.default_rng(1).integers(0, 256, (vertices, count), dtype=np.uint8)
-    vector = jax.random.normal(jax.random.key(2), ((lobe_system.pyramid.DEGREE + 1) ** 2, vertices))
-    return LobeTransport(jnp.asarray(pyramid), vector, position, frame, SIZE)
+    vector = np.random.default_rng(2).integers(0, 256, (lobe_system.diffuse.count(SIZE), vertices), dtype=np.uint8)
+    return LobeTransport(jnp.asarray(pyramid), jnp.asarray(vector), position, frame, SIZE)
 
 
 def _region(vertices: int) -> DynamicTransport:
     terms = _clustered(vertices, terms=1, components=24, modes=24, keep=1024)
     row = jnp.arange(vertices)
-    seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices)))
+    seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices), jnp.uint8))
     return DynamicTransport((RegionTransport(terms, seen, row),), row)
 
 
