@@ -237,7 +237,8 @@ def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"],
     part, base = table.part[points.corner[0]], points.carry(table.frame)
     has, scale = table.image[part, _NORMAL] >= 0, table.normal_scale[part]
     frame = directions.frame(directions.normalize(base[:, :3]), base[:, 3:6])
-    place = _coordinates(table, points)
+    coordinate, slope = _coordinates(table, points)
+    place = coordinate, slope * normal_maps.NARROWER
     mean = 2 * _read(table, points, place, _NORMAL) - 1
     normal = normal_maps.tilted(frame, jnp.where(base[:, 6] < 0, -1, 1), mean, scale)
     _, moving = _in_image(table, part, place, _NORMAL)

@@ -19,6 +19,9 @@ from jaxtyping import Array, Float, Num
 
 from jaxprt.sphere import directions
 
+# Size of the footprint with which maps are read, relative to the pixel. A look-up in a mip map averages over a box of
+# the footprint's size, widened by a tent of twice that size: together they have three times the variance of the box.
+NARROWER = 3**-0.5
 _LOWEST = 0.1  # least ratio of a normal's height to its slope: lower normals are raised to it
 _FLAT = 1e-3  # Below this, slopes may be rounding errors: a normal without height is then that of the surface.
 
@@ -80,7 +83,7 @@ def variance(
     Args:
         mean: Mean of the unit normals of the map.
         scale: Factor of the slopes of the map.
-        footprint: Longest edge of the pixel, in texels.
+        footprint: Longest edge of the footprint with which the map is read, in texels.
     """
     square = jnp.clip(jnp.sum(mean**2, -1), 1e-4, 1)
     length = jnp.sqrt(square)
