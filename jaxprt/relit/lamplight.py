@@ -69,7 +69,7 @@ class LampLight:
         points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
         fields = np.asarray(position), np.asarray(frame)[:, 2]
         moment = lamp_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, self._places)
-        return at_points(moment, position, frame, self._sources)
+        return at_points(moment, position, frame, self._sources, self._places.pieces)
 
 
 def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:
