@@ -13,27 +13,25 @@ from jaxprt.visibility.lamp_rays import LampPlaces
 
 _PLACES = 4096  # places on a surface to which rays may go
 _LEVELS = (64, 256, 1024, _PLACES)  # places whose light is added up, from far lamps to close ones
-_PIECES, _FEW = 16, 4  # pieces of each surface; of many surfaces each has fewer, as at vertices
-_MANY = 4  # surfaces
 _FLAT = 0.99  # smallest length of the sum of normals around a place, relative to their number
 _RAYS = 16  # first rays from each point, which all lamps share
 _FEWEST, _MOST = 4, 8  # of these for each lamp
 
 
-def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"]) -> LampPlaces:
+def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *, pieces: int = 4) -> LampPlaces:
     """Places on lamps.
 
     Args:
         lamps: Emitting surfaces and point lights, in the coordinates of the points that they light.
         power: The power of each lamp, in any unit. Stronger lamps get more rays, if there are many.
+        pieces: Number of pieces into which each surface is cut: 1, 4 or 16.
 
     Raises:
         ValueError: A surface has no area, or its positions are not finite.
     """
-    most = _PIECES if sum(isinstance(lamp, Mesh) for lamp in lamps) <= _MANY else _FEW
-    pieces = np.array([most if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
+    cut = np.array([pieces if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
     rows, first, count, total = [], [], [], 0
-    for lamp, own in zip(lamps, pieces, strict=True):
+    for lamp, own in zip(lamps, cut, strict=True):
         levels = _levels(lamp)
         size = np.array([len(place) for place, _ in levels])
         first.append(total + np.cumsum(size) - size)
@@ -43,8 +41,10 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"]) -
     place, area = (np.concatenate(each).astype(np.float32) for each in zip(*rows, strict=True))
     share = np.asarray(power, np.float64) / max(float(np.sum(power)), np.finfo(float).tiny)
     wanted = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
-    strata = np.where(pieces == 1, _FEWEST, np.clip(wanted, _FEWEST, _MOST)).astype(np.int64)
-    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), pieces, strata)
+    strata = np.where(
+        [isinstance(lamp, PointLight) for lamp in lamps], _FEWEST, np.clip(wanted, _FEWEST, _MOST)
+    ).astype(np.int64)
+    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), cut, strata)
 
 
 def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
