@@ -8,7 +8,7 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Int
 
 from jaxprt.compile import compile_time, known
 from jaxprt.image.pixels import Pixels
@@ -69,7 +69,7 @@ class LampLight:
             self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
         return self._places[pieces]
 
-    def row(self, number: int, index: Int[np.ndarray, " p"], on_group: Points) -> LampTransport:
+    def row(self, number: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:
         """The transport of the lamps to some points.
 
         Args:
@@ -77,7 +77,8 @@ class LampLight:
             index: Indices of the points among those of the picture; -1 in padding.
             on_group: The same points on the group.
         """
-        surface, own = self.stage.surfaces[number], np.maximum(index, 0)
+        surface, index = self.stage.surfaces[number], np.asarray(index)
+        own = np.maximum(index, 0)
         with compile_time(surface.position, surface.frame, on_group):
             position, frame = placed(surface.position, surface.frame, on_group)
         pixel = np.asarray(self.pixels.pixel)[own]

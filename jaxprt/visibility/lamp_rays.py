@@ -36,7 +36,7 @@ class LampPlaces(NamedTuple):
         place: Positions of the places, in world units.
         area: The area that each stands for, times the normal there; zero for a point light.
         first: Index of the first place of each level k of each lamp n.
-        count: Number of places of each piece at each level; 0 for a level that is not used. The last one always is.
+        per_piece: Number of places of each piece at each level; 0 for a level that is not used. The last one always is.
         pieces: Number of pieces of each lamp.
         strata: Number of first rays from each point to each lamp. Four times as many are at least one a piece.
     """
@@ -44,7 +44,7 @@ class LampPlaces(NamedTuple):
     place: Float32[np.ndarray, "s 3"]
     area: Float32[np.ndarray, "s 3"]
     first: Int64[np.ndarray, "n k"]
-    count: Int64[np.ndarray, "n k"]
+    per_piece: Int64[np.ndarray, "n k"]
     pieces: Int64[np.ndarray, " n"]
     strata: Int64[np.ndarray, " n"]
 

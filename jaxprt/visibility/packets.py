@@ -88,7 +88,7 @@ class Packets:
     @property
     def embree(self) -> tuple[int, int, int]:
         """Addresses of `rtcOccluded16`, of the scene, and of the arguments."""
-        return self._occluded, self._scene, self._arguments.ctypes.data
+        return int(self._occluded or 0), int(self._scene), int(self._arguments.ctypes.data)
 
     def blocked(
         self,

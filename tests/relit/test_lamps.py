@@ -95,7 +95,7 @@ def test_shadows_between_vertices_are_at_their_pixels():
     place = np.stack([place[:, 0], 0 * place[:, 0] + y, place[:, 1]], 1)
     board = make_mesh(place, PLANE.face, normal=PLANE.normal)
     above = PointLight("bulb", [0.2, 0.8, 0.2], np.pi)
-    floor = Part("floor", scene().part("floor").mesh, Lambert(0.5))
+    floor = Part("floor", scene().parts[0].mesh, Lambert(0.5))
     parts = [floor, Part("board", board, TexturedMaterial(**BLACK))]
     lit = prt.precompute(
         Scene(parts, [CAMERA], point_lights=[above]), system=Harmonics(degree=2), size=8, progress=False

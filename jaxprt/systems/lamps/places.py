@@ -99,6 +99,5 @@ def at_points(
             for own in moment:
                 own[row] *= share
     number = tuple(np.repeat(np.arange(len(lamps)), pieces).tolist())
-    return LampTransport(
-        *jax.device_put(tuple(own.astype(where.dtype, copy=False) for own in moment)), position, frame, number
-    )
+    solid, cosine, direction = (jax.device_put(own.astype(where.dtype, copy=False)) for own in moment)
+    return LampTransport(solid, cosine, direction, position, frame, number)
