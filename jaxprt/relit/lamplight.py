@@ -8,7 +8,7 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Int
 
 from jaxprt.compile import compile_time, known
 from jaxprt.image.pixels import Pixels
@@ -21,6 +21,11 @@ from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.places import at_points, places
 from jaxprt.visibility import lamp_rays, texel_rays
 from jaxprt.visibility.lamp_rays import LampPlaces
+
+# Pieces of a lamp, for groups with a part of a higher curvature of radiance, such as gray plastic of roughness .3 or
+# metal of .5, and for others.
+_FINE, _COARSE, _SMOOTH = 16, 4, 5.0
+_MANY = 4  # surfaces, of which more have few pieces each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,10 +54,22 @@ class LampLight:
         return [*(meshes[number] for number in part), *self.stage.point_lights]
 
     @cached_property
-    def _places(self) -> LampPlaces:
-        return places(self._sources, np.asarray(self.stage.power))
+    def _places(self) -> dict[int, LampPlaces]:
+        """Places on the lamps, by the number of pieces of each surface, as far as they were needed."""
+        return {}
 
-    def row(self, number: int, index: Int[np.ndarray, " p"], on_group: Points) -> LampTransport:
+    def _places_for(self, number: int) -> LampPlaces:
+        """Places on the lamps for the points of a group."""
+        place, bend = self.stage.place, self.stage.bend
+        # Roughness that JAX traces may become small.
+        smooth = not known(bend) or np.asarray(bend)[place.first[list(place.parts[number])]].max() > _SMOOTH
+        few = sum(lamp >= 0 for lamp in self.stage.lamp) <= _MANY
+        pieces = _FINE if smooth and few else _COARSE
+        if pieces not in self._places:
+            self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
+        return self._places[pieces]
+
+    def row(self, number: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:
         """The transport of the lamps to some points.
 
         Args:
@@ -60,7 +77,8 @@ class LampLight:
             index: Indices of the points among those of the picture; -1 in padding.
             on_group: The same points on the group.
         """
-        surface, own = self.stage.surfaces[number], np.maximum(index, 0)
+        surface, index = self.stage.surfaces[number], np.asarray(index)
+        own = np.maximum(index, 0)
         with compile_time(surface.position, surface.frame, on_group):
             position, frame = placed(surface.position, surface.frame, on_group)
         pixel = np.asarray(self.pixels.pixel)[own]
@@ -68,8 +86,9 @@ class LampLight:
         barycentric, slope = (np.asarray(each)[own] for each in (self.pixels.barycentric, self.pixels.slope))
         points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
         fields = np.asarray(position), np.asarray(frame)[:, 2]
-        moment = lamp_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, self._places)
-        return at_points(moment, position, frame, self._sources)
+        own_places = self._places_for(number)
+        moment = lamp_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, own_places)
+        return at_points(moment, position, frame, self._sources, own_places.pieces)
 
 
 def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:

@@ -45,7 +45,6 @@ class Row(eqx.Module):
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
         kept: What does not depend on the light; None if it is computed anew for each light.
-        lamps: The transport of the lamps to the points, where reflection rays need it too; None elsewhere.
     """
 
     number: int = eqx.field(static=True)
@@ -53,7 +52,6 @@ class Row(eqx.Module):
     interpolated: bool = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
     kept: Viewed | Interpolated | None
-    lamps: LampTransport | None = None
 
 
 class VertexRow(eqx.Module):
@@ -204,7 +202,7 @@ def _shaded(
     light: TracedLight | None,
 ) -> Float[Array, "p c"]:
     points, on_group = _points(picture, index)
-    transport = _lamps_at(lamps, row, index, on_group)
+    transport = None if lamps is None else lamps.row(row.number, index, on_group)
     seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera, lamps=transport)
     return _lit(surface, row.samples, arriving.at(row.number), light, index, seen)
 
@@ -240,18 +238,11 @@ def _color_of_some(
     return jax.lax.map(some, row.index)
 
 
-def _lamps_at(lamps: LampLight | None, row: Row, index: Any, on_group: Points) -> LampTransport | None:
-    """The transport of the lamps to points of a row; None to interpolate it."""
-    if row.lamps is not None or lamps is None:
-        return row.lamps
-    return lamps.row(row.number, np.asarray(index), on_group)
-
-
 def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera, lamps: LampLight | None) -> Interpolated:
     """What does not depend on the light, for a row of points to which radiance is interpolated."""
     points, on_group = canvas.points_of(pixels, stage.face, stage.shift, row.index)
     look = look_at(stage.table, stage.rough, points)
-    transport, eye = _lamps_at(lamps, row, row.index, on_group), jnp.asarray(camera.eye)
+    transport, eye = None if lamps is None else lamps.row(row.number, row.index, on_group), jnp.asarray(camera.eye)
     sharp = None if transport is None else stage.sharp_at(row.number, points)
     return between(stage.surfaces[row.number], on_group, look, eye, stage.given[row.number], sharp, transport)
 
@@ -328,12 +319,10 @@ def make(
         if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
-            transport = _lamps_at(lamps, row, index, on_group)
+            transport = None if lamps is None else lamps.row(row.number, index, on_group)
             if stores:
                 seen = _seen(stage, surface, row.number, points, on_group, camera, lamps=transport)
                 row = dataclasses.replace(row, kept=seen)
-            elif row.kept is None:
-                row = dataclasses.replace(row, lamps=transport)
             if row.number in sharp:
                 blend, own = stage.blend(row.number, points, on_group)
                 narrow = stage.sharp_at(row.number, points)

@@ -73,11 +73,12 @@ def _lit(lamp, lamps, center, normal, least, total, room):
 
 @no_type_check
 @partial(compiled, error_model="numpy")
-def _cast(query, memory, lamps, number, spot, origin, sight, weight, free):
+def _cast(query, memory, lamps, aim, origin, sight, weight, free):
     """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones.
 
-    Adds the irradiance from each place to `weight`, and to `free` that from visible places.
+    Adds the irradiance from each place to `weight` of its piece, and to `free` that from visible places.
     """
+    number, spot, piece = aim
     address, scene, arguments, _, passed = query
     ray, valid, cosine, goal = memory
     center, normal, facing, least = sight
@@ -107,8 +108,8 @@ def _cast(query, memory, lamps, number, spot, origin, sight, weight, free):
     rays, open_ = 0, 0
     for lane in range(16):
         seen = valid[lane] != 0 and ray[8, lane] > zero
-        weight[lane] += cosine[lane]
-        free[lane] += cosine[lane] * passed[lane] if seen else zero
+        weight[piece[lane], lane] += cosine[lane]
+        free[piece[lane], lane] += cosine[lane] * passed[lane] if seen else zero
         rays += 1 if cosine[lane] > zero else 0
         open_ += 1 if seen else 0
     return rays, open_
@@ -124,7 +125,7 @@ def _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free):
     """
     first, count, pieces, strata = lamps[2][lamp, -1], lamps[3][lamp, -1], lamps[4][lamp], lamps[5][lamp]
     weight[:], free[:] = 0, 0
-    number, spot = np.empty(16, np.int64), np.empty(16, np.int64)
+    number, spot, piece = np.empty(16, np.int64), np.empty(16, np.int64), np.empty(16, np.int64)
     width = count * pieces // (strata * _QUARTERS)  # 0 for a point light
     rays, open_ = 0, 0
     for turn in range(_QUARTERS):
@@ -139,15 +140,15 @@ def _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free):
                 within = (2 * (base + _STEP * own + 37 * lamp & 63) + 1) * width >> 7
                 number[lane] = first + own * width + within
                 spot[lane] = (base >> 2) + base + corner + turn & 3
-            piece = stratum * pieces // strata
-            new = _cast(query, memory, lamps, number, spot, origin, sight, weight[piece], free[piece])
+                piece[lane] = own * pieces // (strata * _QUARTERS)
+            new = _cast(query, memory, lamps, (number, spot, piece), origin, sight, weight, free)
             rays, open_ = rays + new[0], open_ + new[1]
     for lane in range(16):
         whole = weight[:, lane].sum()
         mean = free[:, lane].sum() / whole if whole > 0 else 0.0
-        for piece in range(pieces):
-            own = weight[piece, lane]
-            free[piece, lane] = free[piece, lane] / own if own > 0 else mean
+        for part in range(pieces):
+            sent = weight[part, lane]
+            free[part, lane] = free[part, lane] / sent if sent > 0 else mean
 
 
 @no_type_check
@@ -180,7 +181,7 @@ def trace(query, surface, points, fields, lamps, first, last, result):
         lamps: The fields of `lamp_rays.LampPlaces`.
         first: Index of the first point.
         last: Index after the last point.
-        result: The integrals.
+        result: The integrals of 1, of the cosine, and of the direction.
     """
     pieces, most = lamps[4], lamps[4].max()
     aligned = np.empty(13 * 16 + 16, np.float32)
@@ -205,9 +206,24 @@ def trace(query, surface, points, fields, lamps, first, last, result):
             lit = total[:own, 0].max() > 0
             if lit:
                 _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free)
+            else:
+                free[:] = 0
             for piece in range(own):
-                for moment in range(4):
-                    for lane in range(lanes):
-                        value = total[piece, moment, lane] * free[piece, lane] if lit else 0.0
-                        result[row + piece, moment, packet + lane] = value
+                _write(total[piece], free[piece], normal, row + piece, packet, lanes, result)
             row += own
+
+
+@no_type_check
+@compiled
+def _write(total, free, normal, row, packet, lanes, result):
+    """Writes the integrals of the visible part of a piece."""
+    solid, cosine, direction = result
+    for lane in range(lanes):
+        above = np.float32(0)
+        for axis in range(3):
+            value = total[1 + axis, lane] * free[lane]
+            direction[row, axis, packet + lane] = value
+            above += value * normal[axis, lane]
+        # All of the solid angle lies above the horizon, where the cosine is linear in the direction.
+        cosine[row, packet + lane] = max(above, np.float32(0))
+        solid[row, packet + lane] = total[0, lane] * free[lane]

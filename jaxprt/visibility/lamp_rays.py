@@ -36,15 +36,15 @@ class LampPlaces(NamedTuple):
         place: Positions of the places, in world units.
         area: The area that each stands for, times the normal there; zero for a point light.
         first: Index of the first place of each level k of each lamp n.
-        count: Number of places of each piece at each level; 0 for a level that is not used. The last one always is.
+        per_piece: Number of places of each piece at each level; 0 for a level that is not used. The last one always is.
         pieces: Number of pieces of each lamp.
-        strata: Number of first rays from each point to each lamp: a multiple of the number of pieces.
+        strata: Number of first rays from each point to each lamp. Four times as many are at least one a piece.
     """
 
     place: Float32[np.ndarray, "s 3"]
     area: Float32[np.ndarray, "s 3"]
     first: Int64[np.ndarray, "n k"]
-    count: Int64[np.ndarray, "n k"]
+    per_piece: Int64[np.ndarray, "n k"]
     pieces: Int64[np.ndarray, " n"]
     strata: Int64[np.ndarray, " n"]
 
@@ -56,8 +56,8 @@ def moments(
     position: Float[np.ndarray, "p 3"],
     normal: Float[np.ndarray, "p 3"],
     lamps: LampPlaces,
-) -> Float32[np.ndarray, "m 4 p"]:
-    """Integrals of 1 and of the unit direction over the visible solid angle of each piece of a lamp, at each point.
+) -> tuple[Float32[np.ndarray, "m p"], Float32[np.ndarray, "m p"], Float32[np.ndarray, "m 3 p"]]:
+    """Integrals of 1, of the cosine and of the direction over what each point sees of each piece of a lamp.
 
     Only directions above the horizons of the shading normal and of the triangle count. Padding, and triangles without
     an area, see nothing.
@@ -73,7 +73,8 @@ def moments(
     surface = occluder.position, np.asarray(mesh.normal, np.float32), occluder.face, occluder.offset
     drawn = *texel_rays.fields(points), texel_rays.pattern(points)
     fields = tuple(np.ascontiguousarray(each, np.float32) for each in (position, normal))
-    result = np.empty((int(lamps.pieces.sum()), 4, len(position)), np.float32)
+    size = int(lamps.pieces.sum()), len(position)
+    result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
     parts = [slice(i, min(i + _PART, len(position))) for i in range(0, len(position), _PART)]
     with ThreadPoolExecutor(blocks.cores()) as pool:
         list(pool.map(lambda part: occluder.lit(surface, drawn, fields, tuple(lamps), part, result), parts))

@@ -208,7 +208,7 @@ class Occluder:
         fields: tuple,
         lamps: tuple,
         part: slice,
-        result: Float32[np.ndarray, "m 4 p"],
+        result: tuple,
     ) -> None:
         """What some points of a picture see of lamps; `lamp_rays.moments` calls it.
 

@@ -80,7 +80,7 @@ class Packets:
         leave it as it is. Each thread needs a query of its own.
         """
         arrays = self._arguments.view(np.int64), self._context.view(np.int64)
-        return self._occluded, self._scene, *arrays, np.ones(WIDTH, np.float32)
+        return int(self._occluded or 0), int(self._scene), *arrays, np.ones(WIDTH, np.float32)
 
     def blocked(
         self,

@@ -9,6 +9,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import lobe
+from jaxprt.brdf import Lambert
 from jaxprt.relit import Harmonics, RelitScene, probes
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import background
@@ -84,6 +85,46 @@ def test_pictures_have_the_light_of_lamps(close):
     dim = {"bulb": PointLight("bulb", BULB.position, 0.25)}
     lamp = relit().picture(DARK, samples=1, materials=dim)
     assert np.linalg.norm(np.asarray(lamp) - picture) > 0.05 * np.linalg.norm(picture)
+
+
+def test_shadows_between_vertices_are_at_their_pixels():
+    """A board within one cell of the floor, under the bulb: the inverse square law outside of its shadow, 0 inside."""
+    low, high, y = np.array([0.05, 0.05]), np.array([0.4, 0.4]), 0.4
+    place = np.asarray(PLANE.position)[:, [0, 2]]
+    place = (place - place.min(0)) / np.ptp(place, axis=0) * (high - low) + low
+    place = np.stack([place[:, 0], 0 * place[:, 0] + y, place[:, 1]], 1)
+    board = make_mesh(place, PLANE.face, normal=PLANE.normal)
+    above = PointLight("bulb", [0.2, 0.8, 0.2], np.pi)
+    floor = Part("floor", scene().parts[0].mesh, Lambert(0.5))
+    parts = [floor, Part("board", board, TexturedMaterial(**BLACK))]
+    lit = prt.precompute(
+        Scene(parts, [CAMERA], point_lights=[above]), system=Harmonics(degree=2), size=8, progress=False
+    )
+    view = lit.picture_view(samples=1)
+    ray, eye = np.asarray(view.ray), np.asarray(EYE)
+    on_floor, on_board = (eye + (height - eye[1]) / ray[..., 1:2] * ray for height in (0.0, y))
+    way = np.asarray(above.position) - on_floor
+    through = on_floor + way * y / 0.8
+
+    def inside(where: np.ndarray, room: float) -> np.ndarray:
+        return np.all((where[..., ::2] > low - room) & (where[..., ::2] < high + room), -1)
+
+    shown = (np.abs(on_floor[..., ::2]).max(-1) < 0.95) & (ray[..., 1] < 0) & ~inside(on_board, 0.1)
+    expected = 0.5 * way[..., 1] / np.sum(way**2, -1) ** 1.5 * ~inside(through, 0)
+    clear = shown & (inside(through, 0.06) == inside(through, -0.06))
+    assert np.sum(clear & inside(through, 0)) > 3
+    got, interpolated = (
+        np.asarray(lit.picture(DARK, samples=1, shadows=shadows))[..., 0] for shadows in ("rays", "vertices")
+    )
+    assert np.linalg.norm((got - expected)[clear]) < 0.01 * np.linalg.norm(expected[clear])
+    assert np.linalg.norm((interpolated - expected)[clear]) > 0.1 * np.linalg.norm(expected[clear])
+    np.testing.assert_allclose(np.asarray(view.picture(DARK))[..., 0], got, atol=1e-6)
+
+    def total(intensity):
+        dimmed = {"bulb": PointLight("bulb", above.position, intensity)}
+        return jnp.sum(lit.picture(DARK, samples=1, materials=dimmed))
+
+    np.testing.assert_allclose(jax.grad(total)(1.0), total(1.0), rtol=1e-4)
 
 
 def test_gradients_in_color_and_strength_are_what_lamps_send():

@@ -13,36 +13,38 @@ from jaxprt.visibility.lamp_rays import LampPlaces
 
 _PLACES = 4096  # places on a surface to which rays may go
 _LEVELS = (64, 256, 1024, _PLACES)  # places whose light is added up, from far lamps to close ones
-_PIECES = 4  # pieces of each surface, as `transport.precompute` has by default
 _FLAT = 0.99  # smallest length of the sum of normals around a place, relative to their number
 _RAYS = 16  # first rays from each point, which all lamps share
 _FEWEST, _MOST = 4, 8  # of these for each lamp
 
 
-def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"]) -> LampPlaces:
+def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *, pieces: int = 4) -> LampPlaces:
     """Places on lamps.
 
     Args:
         lamps: Emitting surfaces and point lights, in the coordinates of the points that they light.
         power: The power of each lamp, in any unit. Stronger lamps get more rays, if there are many.
+        pieces: Number of pieces into which each surface is cut: 1, 4 or 16.
 
     Raises:
         ValueError: A surface has no area, or its positions are not finite.
     """
+    cut = np.array([pieces if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
     rows, first, count, total = [], [], [], 0
-    for lamp in lamps:
+    for lamp, own in zip(lamps, cut, strict=True):
         levels = _levels(lamp)
         size = np.array([len(place) for place, _ in levels])
         first.append(total + np.cumsum(size) - size)
-        count.append(size // (_PIECES if isinstance(lamp, Mesh) else 1))
+        count.append(size // own)
         rows += levels
         total += int(size.sum())
     place, area = (np.concatenate(each).astype(np.float32) for each in zip(*rows, strict=True))
-    pieces = np.array([_PIECES if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
     share = np.asarray(power, np.float64) / max(float(np.sum(power)), np.finfo(float).tiny)
     wanted = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
-    strata = np.where(pieces == 1, _FEWEST, np.clip(wanted, _FEWEST, _MOST)).astype(np.int64)
-    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), pieces, strata)
+    strata = np.where(
+        [isinstance(lamp, PointLight) for lamp in lamps], _FEWEST, np.clip(wanted, _FEWEST, _MOST)
+    ).astype(np.int64)
+    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), cut, strata)
 
 
 def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -73,29 +75,29 @@ def _order(place: Float[np.ndarray, "s 3"]) -> Int[np.ndarray, " s"]:
 
 
 def at_points(
-    moment: Float32[np.ndarray, "m 4 p"],
+    moment: tuple[Float32[np.ndarray, "m p"], Float32[np.ndarray, "m p"], Float32[np.ndarray, "m 3 p"]],
     position: Float[Array, "p 3"],
     frame: Float[Array, "p 3 3"],
     lamps: Sequence[Mesh | PointLight],
+    pieces: Int[np.ndarray, " n"],
 ) -> LampTransport:
     """The transport of lamps to the points of a picture.
 
     Args:
-        moment: The result of `jaxprt.visibility.lamp_rays.moments`.
+        moment: The result of `jaxprt.visibility.lamp_rays.moments`. That of spots is changed in place.
         position: Positions of the points.
         frame: Their shading frames; rows are tangent, bitangent, normal.
-        lamps: The lamps, in the order of their places.
+        lamps: The lamps.
+        pieces: Number of pieces of each.
     """
-    moment, where = moment.copy(), np.asarray(position)
-    sizes = [_PIECES if isinstance(lamp, Mesh) else 1 for lamp in lamps]
-    for row, lamp in zip(np.cumsum(sizes) - sizes, lamps, strict=True):
+    where = np.asarray(position)
+    for row, lamp in zip(np.cumsum(pieces) - pieces, lamps, strict=True):
         if isinstance(lamp, PointLight) and lamp.axis is not None:
             way = where - np.asarray(lamp.position, where.dtype)
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), np.finfo(where.dtype).tiny)
-            moment[row] *= lamp.share(way)
-    solid, direction = moment[:, 0], moment[:, 1:]
-    # All of it lies above the horizon, where the cosine is linear in the direction.
-    cosine = np.maximum(np.einsum("mcp,pc->mp", direction, np.asarray(frame)[:, 2]), 0)
-    arrays = (np.ascontiguousarray(each, where.dtype) for each in (solid, cosine, direction))
-    number = tuple(lamp for lamp, size in enumerate(sizes) for _ in range(size))
-    return LampTransport(*jax.device_put(tuple(arrays)), position, frame, number)
+            share = lamp.share(way)
+            for own in moment:
+                own[row] *= share
+    number = tuple(np.repeat(np.arange(len(lamps)), pieces).tolist())
+    solid, cosine, direction = (jax.device_put(own.astype(where.dtype, copy=False)) for own in moment)
+    return LampTransport(solid, cosine, direction, position, frame, number)
