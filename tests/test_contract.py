@@ -59,6 +59,16 @@ HOST = {
     "scene.mipmap.levels": "its number of results depends on the size",
     "scene.texture.bilinear": "gives numbers of texels",
     "visibility.buried": "traces rays",
+    "visibility.shown": "traces rays",
+    "visibility.texel_rays": "traces rays",
+    "visibility.lamp_rays": "traces rays",
+    "visibility.lamp_packets": "the same, in numba",
+    "image.layers": "traces rays, and gives points whose number depends on the view",
+    "image.raster.barycentric": "takes numbers of triangles; tests/image/test_layers.py",
+    "scene.normal_maps": "reads images on the host, and clamps; tests/scene/test_normal_maps.py has SciPy's answers",
+    "scene.part_opacity": "joins images on the host",
+    "scene.sides": "copies faces of scenes on the host",
+    "sphere.hats.centers": "a NumPy table",
     "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
     "image.raster.front_faces": "the same",
@@ -84,6 +94,11 @@ HOST = {
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",
     "systems.lobe.pyramid.bits": "cuts bytes",
+    "systems.lobe.pyramid.dithered": "bits, in NumPy",
+    "systems.lamps.places": "chooses places on the host",
+    "systems.bright_texels.sent": "takes indices, frames and shares; bright_texels.radiance has them all",
+    "systems.lobe.diffuse.flux": "takes unit normals; tests/systems/lobe/test_diffuse.py",
+    "systems.lobe.diffuse.at_points": "takes points; tests/systems/lobe/test_diffuse.py",
     "systems.lobe.pyramid.texel_bits": "the same",
     "systems.lobe.pyramid.pyramid": "gives bytes",
     "systems.lobe.pyramid.scales": "NumPy tables",
@@ -846,6 +861,13 @@ EXAMPLES = {
         )
     ),
     "systems.bright_texels.split": example(lambda draw: call(draw.light()), count=5),
+    "systems.bright_texels.brightest": example(
+        lambda draw: call(draw.light(), least=draw.array(0.0)), count=5, rank=9, gradient=()
+    ),
+    "systems.bright_texels.without": example(
+        lambda draw: call(draw.light(), draw.integer(96, 5), least=draw.array(0.0)), rank=20, gradient=()
+    ),
+    "systems.lamps.relight.summed": example(lambda draw: call(draw.uniform(2, 3), draw.normal(2, 4, 3))),
     "systems.bright_texels.irradiance": example(
         lambda draw: call(draw.direct(), draw.integer(96, 5), draw.uniform(5, 3)), gradient=("excess",)
     ),

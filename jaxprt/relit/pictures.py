@@ -184,7 +184,7 @@ def _color(
         return _color_of_some(picture, row, arriving, light)
     if row.interpolated:
         seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if row.kept is None else row.kept
-        color = carried(vertices[row.number], seen, None if seen.lamps is None else arriving.lamp)
+        color = carried(vertices[row.number], seen, lamp=None if seen.lamps is None else arriving.lamp)
         return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
     if row.kept is not None:
         return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
@@ -244,7 +244,8 @@ def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera, lamps: Lamp
     look = look_at(stage.table, stage.rough, points)
     transport, eye = None if lamps is None else lamps.row(row.number, row.index, on_group), jnp.asarray(camera.eye)
     sharp = None if transport is None else stage.sharp_at(row.number, points)
-    return between(stage.surfaces[row.number], on_group, look, eye, stage.given[row.number], sharp, transport)
+    given = stage.given[row.number]
+    return between(stage.surfaces[row.number], on_group, look, eye, given=given, sharp=sharp, lamps=transport)
 
 
 def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:

@@ -125,6 +125,7 @@ def between(
     points: Points,
     look: Look,
     eye: Float[Array, "3"],
+    *,
     given: Given | None,
     sharp: Float[Array, " p"] | None = None,
     lamps: LampTransport | None = None,
@@ -138,7 +139,7 @@ def between(
 
 @kept
 def carried(
-    vertices: Float[Array, "k v c"], points: Interpolated, lamp: Float[Array, "n 3"] | None = None
+    vertices: Float[Array, "k v c"], points: Interpolated, *, lamp: Float[Array, "n 3"] | None = None
 ) -> Float[Array, "p c"]:
     """Colors of some points, interpolated from the radiance of each channel at the vertices.
 

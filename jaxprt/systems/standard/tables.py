@@ -218,23 +218,28 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
     stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse")}
     mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
-    scale, weight, diffuse = (constant(each, dtype) for each in stored.values())
-    knot, error = constant(table._stored["knot"], dtype), constant(np.asarray(np.max(table.errors(count))), dtype)
-    return LobeBrdf(constant(mean / np.linalg.norm(mean, axis=0), dtype), scale, weight, diffuse, (knot,), error)
+    scale, weight, diffuse = (constant(each, dtype=dtype) for each in stored.values())
+    knot, error = (
+        constant(table._stored["knot"], dtype=dtype),
+        constant(np.asarray(np.max(table.errors(count))), dtype=dtype),
+    )
+    return LobeBrdf(constant(mean / np.linalg.norm(mean, axis=0), dtype=dtype), scale, weight, diffuse, (knot,), error)
 
 
 @functools.cache
 def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
     stored = table._stored
-    value = constant(stored["harmonics"][: (degree + 1) ** 2], dtype)
-    return HarmonicBrdf(value, (constant(stored["harmonics.knot"], dtype),), constant(stored["harmonics.error"], dtype))
+    value = constant(stored["harmonics"][: (degree + 1) ** 2], dtype=dtype)
+    return HarmonicBrdf(
+        value, (constant(stored["harmonics.knot"], dtype=dtype),), constant(stored["harmonics.error"], dtype=dtype)
+    )
 
 
 @functools.cache
 def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, Sent]:
     names = "light", "view", "factor", "error"
-    light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype) for name in names)
-    knot = (constant(table._stored["knot"], dtype),)
+    light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype=dtype) for name in names)
+    knot = (constant(table._stored["knot"], dtype=dtype),)
     return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), Sent(knot, factor)
 
 
@@ -242,7 +247,7 @@ def _dtype() -> Any:
     return jnp.result_type(float)
 
 
-def constant(value: np.ndarray, dtype: Any = None) -> jax.Array:
+def constant(value: np.ndarray, *, dtype: Any = None) -> jax.Array:
     """An array on the device, also while JAX traces a function. No program is compiled."""
     with jax.ensure_compile_time_eval():
         return jax.device_put(np.asarray(value, _dtype() if dtype is None else dtype))
