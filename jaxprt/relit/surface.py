@@ -133,7 +133,7 @@ def between(
     """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
     points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, given)
-    lit = None if lamps is None or surface.lit is None else surface.lit.at(lamps).view(eye, blend, None, sharp)
+    lit = None if lamps is None else _lit_at(surface, points, lamps, eye, blend, sharp)
     return Interpolated(points, emitted, _sight(surface, points, eye, blend), lit)
 
 
@@ -221,12 +221,25 @@ def view_of(
         reflected = reflecting.view(eye, blend, points, sharp)
     elif reflecting is not None:
         reflected = reflecting.view(eye, blend, points)
-    lit = surface.lit
-    if lit is not None:
-        lit = lit.view(eye, blend, points, sharp) if lamps is None else lit.at(lamps).view(eye, blend, None, sharp)
+    lit = None
+    if lamps is not None:
+        lit = _lit_at(surface, points, lamps, eye, blend, sharp)
+    elif surface.lit is not None:
+        lit = surface.lit.view(eye, blend, points, sharp)
     if variance is not None and widened.can_widen(system):
         return widened.view(system, eye, blend, variance), reflected, lit
     return system.view(eye, blend), reflected, lit
+
+
+def _lit_at(
+    surface: Surface, points: Points | None, lamps: LampTransport, eye: Array, blend: Blend | None, sharp: Array | None
+) -> Float[Array, "n p c"] | None:
+    """Radiance that points send to the eye, per lamp, from the transport of the lamps to the points."""
+    if surface.lit is None:
+        return None
+    if points is not None and points.normal is not None:
+        lamps = lamps.tilted(points.frame(surface.frame))
+    return surface.lit.at(lamps).view(eye, blend, None, sharp)
 
 
 @jit

@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxprt.scene import Mesh, PointLight
 from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.sphere import directions
 from jaxprt.systems.lamps.places import at_points, places
 from jaxprt.visibility import Occluder, lamp_rays, texel_rays
 
@@ -107,6 +108,10 @@ def test_point_lights_and_spots_have_one_place():
     transport = at_points(moment, *jax.device_put((np.float32(position), frame)), [bulb, spot], np.array([1, 1]))
     np.testing.assert_allclose(transport.solid_angle[0], 1 / square, rtol=1e-4)
     np.testing.assert_allclose(transport.cosine[0], way[:, 1] / square**1.5, rtol=1e-4)
+    axes = (jax.numpy.tile(np.float32(each), (len(way), 1)) for each in ([0.6, 0.8, 0.0], [0.0, 0.0, 1.0]))
+    tilted = directions.frame(*axes)
+    cosine = np.maximum(way @ [0.6, 0.8, 0.0], 0) / square**1.5
+    np.testing.assert_allclose(transport.tilted(tilted).cosine[0], cosine, rtol=1e-3, atol=1e-4)
     share = spot.share(-way / np.sqrt(square)[:, None])
     assert 0 < np.mean(share == 0) < 1
     np.testing.assert_allclose(transport.cosine[1], share * np.asarray(transport.cosine[0]), rtol=1e-3, atol=1e-6)

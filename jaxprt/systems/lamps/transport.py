@@ -70,6 +70,17 @@ class LampTransport(eqx.Module):
         """Bytes of the integrals."""
         return self.solid_angle.nbytes + self.cosine.nbytes + self.direction.nbytes
 
+    def tilted(self, frame: Float[Array, "v 3 3"]) -> "LampTransport":
+        """The transport to the same vertices with other shading frames, as of normal maps.
+
+        Only light above the horizons of both normals counts, and of a piece on the horizon all or nothing.
+
+        Args:
+            frame: The frames; rows are tangent, bitangent, normal.
+        """
+        cosine = jnp.maximum(jnp.einsum("mcv,vc->mv", self.direction, frame[:, 2], precision="highest"), 0)
+        return dataclasses.replace(self, cosine=cosine, frame=frame)
+
 
 @require.arguments(**PRECOMPUTE)
 def precompute(
