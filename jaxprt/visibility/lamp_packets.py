@@ -104,7 +104,8 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
         above = x * facing[0, lane] + y * facing[1, lane] + z * facing[2, lane]
         valid[lane] = -1 if cosine[lane] > zero and above > zero else 0
     passed[:] = 1
-    call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+    if valid.min() < 0:
+        call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
     rays, open_ = 0, 0
     for lane in range(16):
         seen = valid[lane] != 0 and ray[8, lane] > zero
@@ -117,7 +118,7 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
 
 @no_type_check
 @compiled
-def _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free):
+def _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, free):
     """Replaces `free` by the visible share of each piece of a lamp at sixteen points.
 
     The first rays go to one quarter of each stratum of the lamp. If they differ in what they meet, rays to the other
@@ -132,6 +133,8 @@ def _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free):
         if turn > 0 and (width == 0 or open_ == 0 or open_ == rays):
             break
         for stratum in range(strata):
+            if pieces <= strata and total[stratum * pieces // strata, 0].max() == 0:
+                continue  # The sixteen points see the back of this piece.
             corner = lamp + stratum * 4 // strata
             for lane in range(16):
                 base = pattern[lane]
@@ -205,7 +208,7 @@ def trace(query, surface, points, fields, lamps, first, last, result):
             _lit(lamp, lamps, center, normal, least, total, room)
             lit = total[:own, 0].max() > 0
             if lit:
-                _visible(query, memory, lamp, lamps, pattern, origin, sight, weight, free)
+                _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, free)
             else:
                 free[:] = 0
             for piece in range(own):

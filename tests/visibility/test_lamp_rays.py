@@ -98,6 +98,16 @@ def test_half_shadows_are_the_visible_part_of_the_lamp():
     np.testing.assert_array_equal(got[edge < -RADIUS - 1 / EDGE], 0)  # from everywhere in the pixel
 
 
+def test_sheets_that_emit_on_both_sides_light_as_one_side_does():
+    lamp = disk(RADIUS, HEIGHT)
+    back = make_mesh(lamp.position, np.asarray(lamp.face)[:, ::-1], normal=-np.asarray(lamp.normal))
+    assert places([lamp], np.ones(1)).per_piece[0, 0] > 0
+    assert places([join([lamp, back])], np.ones(1)).per_piece[0, 0] > 0  # a coarse level is accurate
+    screen = board(0.05, 0.3)
+    one, both = (seen([each], screen)[1][1].sum(0) for each in (lamp, join([lamp, back])))
+    assert off(both, one) < SPREAD
+
+
 def test_point_lights_and_spots_have_one_place():
     bulb = PointLight("bulb", [0.2, 0.5, -0.3], 2.0)
     spot = PointLight("spot", bulb.position, 1.0, axis=[0.3, -1.0, 0.2], cone=(0.4, 1.0))

@@ -14,6 +14,8 @@ from jaxprt.visibility.lamp_rays import LampPlaces
 _PLACES = 4096  # places on a surface to which rays may go
 _LEVELS = (64, 256, 1024, _PLACES)  # places whose light is added up, from far lamps to close ones
 _FLAT = 0.99  # smallest length of the sum of normals around a place, relative to their number
+_OPEN = 0.5  # smallest length of the sum of all normals of an open surface, relative to their number
+_CUTS = 16  # most pieces of a surface
 _RAYS = 16  # first rays from each point, which all lamps share
 _FEWEST, _MOST = 4, 8  # of these for each lamp
 
@@ -24,15 +26,19 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *
     Args:
         lamps: Emitting surfaces and point lights, in the coordinates of the points that they light.
         power: The power of each lamp, in any unit. Stronger lamps get more rays, if there are many.
-        pieces: Number of pieces into which each surface is cut: 1, 4 or 16.
+        pieces: Number of pieces into which each surface is cut: 1, 4 or 16. Surfaces that turn to all sides have twice
+            as many, up to 16.
 
     Raises:
         ValueError: A surface has no area, or its positions are not finite.
     """
-    cut = np.array([pieces if isinstance(lamp, Mesh) else 1 for lamp in lamps], np.int64)
-    rows, first, count, total = [], [], [], 0
-    for lamp, own in zip(lamps, cut, strict=True):
+    rows, first, count, cut, sides, total = [], [], [], [], [], 0
+    for lamp in lamps:
         levels = _levels(lamp)
+        # Points see half of a lamp that turns to all sides: a closed surface, or a sheet with two sides.
+        sides.append(2 if _is_closed(levels[-1][1]) else 1)
+        own = min(pieces * sides[-1], _CUTS) if isinstance(lamp, Mesh) else 1
+        cut.append(own)
         size = np.array([len(place) for place, _ in levels])
         first.append(total + np.cumsum(size) - size)
         count.append(size // own)
@@ -41,10 +47,8 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *
     place, area = (np.concatenate(each).astype(np.float32) for each in zip(*rows, strict=True))
     share = np.asarray(power, np.float64) / max(float(np.sum(power)), np.finfo(float).tiny)
     wanted = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
-    strata = np.where(
-        [isinstance(lamp, PointLight) for lamp in lamps], _FEWEST, np.clip(wanted, _FEWEST, _MOST)
-    ).astype(np.int64)
-    return LampPlaces(place, area, np.stack(first).astype(np.int64), np.stack(count).astype(np.int64), cut, strata)
+    strata = sides * np.clip(wanted, _FEWEST, [_MOST if isinstance(lamp, Mesh) else _FEWEST for lamp in lamps])
+    return LampPlaces(place, area, *(np.asarray(each, np.int64) for each in (first, count, cut, strata)))
 
 
 def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -54,7 +58,9 @@ def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
         alone = np.asarray(lamp.position, np.float64)[None], np.zeros((1, 3))
         return [(empty, empty)] * (len(_LEVELS) - 1) + [alone]
     place, area = sampled(lamp, count=_PLACES)
-    order = _order(place)
+    # Places on the two sides of a sheet are as far apart as places on opposite ends of it.
+    side = area / np.linalg.norm(area, axis=1, keepdims=True) * np.ptp(place, axis=0).max()
+    order = _order(np.concatenate([place, side], 1))
     place, area = place[order], area[order]
     whole, levels = np.linalg.norm(area, axis=1).sum(), []
     for count in _LEVELS[:-1]:
@@ -64,7 +70,13 @@ def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
     return [*levels, (place, area)]
 
 
-def _order(place: Float[np.ndarray, "s 3"]) -> Int[np.ndarray, " s"]:
+def _is_closed(area: Float[np.ndarray, "s 3"]) -> bool:
+    """Whether a surface turns to all sides, so that its areas times normals cancel."""
+    whole = np.linalg.norm(area, axis=1).sum()
+    return bool(whole > 0 and np.linalg.norm(area.sum(0)) < _OPEN * whole)
+
+
+def _order(place: Float[np.ndarray, "s k"]) -> Int[np.ndarray, " s"]:
     """Order of places, a power of two of them, by repeated halving across the longest extent."""
     order = np.arange(len(place))[None]
     while order.shape[1] > 1:
