@@ -81,7 +81,7 @@ class View:
         two_sided = mitsuba.has_flag(met.bsdf().flags(), mitsuba.BSDFFlags.BackSide)
         both = met.is_valid() & away & behind & ~two_sided, met.is_valid() & (away != behind)
         shape = height, _PLACES, width, _PLACES
-        back, undefined = (np.array(each).reshape(shape).any((1, 3)) for each in both)
+        back, undefined = (np.asarray(np.array(each).reshape(shape).any((1, 3))) for each in both)
         return back, undefined
 
 

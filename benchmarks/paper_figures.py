@@ -248,7 +248,7 @@ FIGURES: dict[str, Callable[[Figures], dict[str, np.ndarray]]] = {
 def exposed(pictures: dict[str, np.ndarray], *, brighter: float = 0.0) -> dict[str, np.ndarray]:
     """The pictures of a figure for the screen, on white, all with the exposure that the last one asks for."""
     *_, last = pictures.values()
-    stops = image.automatic_exposure(jnp.asarray(last[..., :3])) + brighter
+    stops = float(image.automatic_exposure(jnp.asarray(last[..., :3]))) + brighter
     return {title: _on_white(each, stops) for title, each in pictures.items()}
 
 
@@ -256,7 +256,7 @@ def _on_white(picture: np.ndarray, stops: float) -> np.ndarray:
     """A picture with coverage, clamped for the screen before it is laid over white, so that edges stay smooth."""
     cover = picture[..., 3:]
     color = image.expose(jnp.asarray(picture[..., :3] / np.maximum(cover, 1e-6)), stops=stops)
-    return np.asarray(image.display(cover * jnp.clip(color, 0, 1) + 1 - cover))
+    return np.asarray(image.display(jnp.asarray(cover) * jnp.clip(color, 0, 1) + 1 - cover))
 
 
 def main(options: Sequence[str] | None = None) -> None:

@@ -183,10 +183,11 @@ def _color(
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return _color_of_some(picture, row, arriving, light)
     if row.interpolated:
-        seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if row.kept is None else row.kept
+        kept = row.kept if isinstance(row.kept, Interpolated) else None
+        seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if kept is None else kept
         color = carried(vertices[row.number], seen, lamp=None if seen.lamps is None else arriving.lamp)
         return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
-    if row.kept is not None:
+    if isinstance(row.kept, Viewed):
         return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
     shade = partial(_shaded, picture, surface, row, row.index, lamps)
     return (jax.checkpoint(shade) if recompute else shade)(arriving, light)
@@ -332,10 +333,12 @@ def make(
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
     vertices = tuple(_vertex_rows(stage, between_vertices, camera, lamps, keep=keep))
-    shares, way = None, shadow
+    shares, way = None, "vertices"
     if isinstance(shadow, Environment):
-        traced, way = shadows.trace(stage.whole, pixels, camera.width, shadow, keep=False), "vertices"
+        traced = shadows.trace(stage.whole, pixels, camera.width, shadow, keep=False)
         shares = None if traced is None else put(traced.shares)
+    else:
+        way = shadow
     return PictureView(
         stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold, way, keep, shares, rays
     )

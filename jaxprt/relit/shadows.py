@@ -127,8 +127,8 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: texel_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
     pixel = np.asarray(pixels.pixel)
-    fields = (np.asarray(field) for field in (pixels.triangle, pixels.barycentric, pixels.slope))
-    points = texel_rays.PicturePoints(*fields, pixel // width, pixel % width)
+    triangle, barycentric, slope = (np.asarray(field) for field in (pixels.triangle, pixels.barycentric, pixels.slope))
+    points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
     return texel_rays.shares(mesh, caster(mesh).occluder, points, rays)
 
 
@@ -144,13 +144,13 @@ def _kept(
     rows = _rows_of(pixels.triangle)
     new = [
         number
-        for number, (own, direction, count) in enumerate(zip(texel, rays.direction, rays.count, strict=True))
+        for number, (own, direction, count) in enumerate(zip(texel, rays.direction, rays.per_texel, strict=True))
         if (row := rows.get(int(own))) is None or row[0] < _FEWER * count or not np.array_equal(row[1], direction)
     ]
     if new:
-        traced = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.count[new]))
+        traced = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.per_texel[new]))
         for number, share in zip(new, traced, strict=True):
-            rows[int(texel[number])] = int(rays.count[number]), rays.direction[number], share
+            rows[int(texel[number])] = int(rays.per_texel[number]), rays.direction[number], share
         for old in list(rows)[: max(len(rows) - 4 * TEXELS, 0)]:
             del rows[old]
     return np.stack([rows[int(own)][2] for own in texel])

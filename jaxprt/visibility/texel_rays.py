@@ -48,11 +48,11 @@ class TexelRays(NamedTuple):
 
     Attributes:
         direction: Unit directions of places within each texel, in world space.
-        count: Number of rays of each point to each texel, at most the number of places.
+        per_texel: Number of rays of each point to each texel, at most the number of places.
     """
 
     direction: Float32[np.ndarray, "t n 3"]
-    count: Integer[np.ndarray, " t"]
+    per_texel: Integer[np.ndarray, " t"]
 
 
 def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRays) -> UInt8[np.ndarray, "t p"]:
@@ -72,9 +72,9 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
     drawn = *fields(points), pattern(points)
     middle = rays.direction.mean(1)
     # Texels start at different places, so that their dither patterns do not add up.
-    first = (np.arange(len(rays.count)) * 37) % PLACES
-    texels = rays.direction, middle, np.asarray(rays.count, np.int64), first
-    share = np.empty((len(rays.count), len(points.triangle)), np.uint8)
+    first = (np.arange(len(rays.per_texel)) * 37) % PLACES
+    texels = rays.direction, middle, np.asarray(rays.per_texel, np.int64), first
+    share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
     parts = [slice(i, min(i + _PART, share.shape[1])) for i in range(0, share.shape[1], _PART)]
     with ThreadPoolExecutor(blocks.cores()) as pool:
         list(pool.map(lambda part: occluder.shares(surface, drawn, texels, part, share), parts))

@@ -74,7 +74,7 @@ def test_points_that_see_nothing_see_nothing(bad):
     if bad == "no area":
         floor = make_mesh(np.zeros((4, 3)), np.asarray(floor.face), normal=np.tile([[0.0, 1, 0]], (4, 1)))
     if bad == "below":
-        rays = TexelRays(-rays.direction, rays.count)
+        rays = TexelRays(-rays.direction, rays.per_texel)
     share = texel_rays.shares(floor, Occluder(square(-1, 1, 0.0)), points, rays)
     assert not share.any()
 

@@ -52,6 +52,6 @@ def _weights(sent: Sent, blend: Blend) -> Array:
     between = [((low, 1 - upper), (low + 1, upper)) for low, upper in axis]
     total: Array | float = 0.0
     for corner in itertools.product(*between):
-        share = math.prod(part for _, part in corner)
+        share = jnp.asarray(math.prod(part for _, part in corner))
         total = total + sent.factor[tuple(place for place, _ in corner)] * share[:, None, None]
     return jnp.einsum("vkp,vkc->vpc", total, blend.weight, precision="highest")

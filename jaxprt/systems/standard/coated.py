@@ -149,7 +149,7 @@ def _lobes(count: int, dtype: Any) -> LobeBrdf:
     flat = np.concatenate([over(np.concatenate([diffuse, diffuse * (1 - share)]), None, 0)])
     flat = np.concatenate([flat, np.broadcast_to((diffuse[[_MIRROR]] * share)[:, None], (1, knots, knots, nodes))])
     arrays = (over(mean, mean, 1), over(scale, scale, 0), over(under, above, 1), flat)
-    mean, scale, weight, diffuse = (tables.constant(each, dtype) for each in arrays)
+    mean, scale, weight, diffuse = (tables.constant(each, dtype=dtype) for each in arrays)
     return LobeBrdf(mean, scale, weight, diffuse, (table.knot[0], table.knot[0]), table.error)
 
 
@@ -162,7 +162,7 @@ def _harmonics(degree: int, dtype: Any) -> HarmonicBrdf:
     base = np.concatenate([value, value * (1 - share)], 1)[:, :, :, None]
     coat = (value[:, [_MIRROR]] * share)[:, :, None]
     whole = [np.broadcast_to(each, (rows, each.shape[1], knots, knots, nodes)) for each in (base, coat)]
-    return HarmonicBrdf(tables.constant(np.concatenate(whole, 1), dtype), (table.knot[0],) * 2, table.error)
+    return HarmonicBrdf(tables.constant(np.concatenate(whole, 1), dtype=dtype), (table.knot[0],) * 2, table.error)
 
 
 @functools.cache
@@ -173,4 +173,4 @@ def _paths(dtype: Any) -> tuple[SeparableBrdf, Sent]:
     coat = (_MEAN * factor[:, [_MIRROR]])[None]
     shape = (len(factor), len(factor))
     whole = np.concatenate([np.broadcast_to(each, (*shape, *each.shape[2:])) for each in (base, coat)], 2)
-    return brdf, Sent((sent.knot[0],) * 2, tables.constant(whole, dtype))
+    return brdf, Sent((sent.knot[0],) * 2, tables.constant(whole, dtype=dtype))
