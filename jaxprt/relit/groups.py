@@ -422,7 +422,7 @@ def surface(
     if shading.scale is not None and shading.blend is not None:
         scale = jax.device_put(np.asarray(shading.scale, dtype))
     if isinstance(system, BrightTexels):
-        position, frame = system.visibility.position, system.visibility.frame
+        position, frame = put((system.visibility.position, system.visibility.frame))
     else:
         pairs = [(np.asarray(own.mesh.position, dtype), frames(own.mesh.normal, own.mesh.tangent)) for own in members]
         position, frame = (
