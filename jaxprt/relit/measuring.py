@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
+from jaxprt.relit import refinement
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.exact import exact_pixels
 from jaxprt.scene import Environment, Mesh, Scene, builtin
@@ -55,12 +56,15 @@ class Report(NamedTuple):
         uncertainty: Estimated relative L2 error of the reference pixels under each light.
         light_seconds: Time of a new light for all vertices on this machine.
         view_seconds: Time of a new view for all vertices on this machine.
+        between_vertices: Relative L2 error of pictures by visibility between vertices, which is interpolated except for
+            the brightest texels, as `jaxprt.refine` estimates it.
         nbytes: Size of all transport and BRDFs in bytes.
     """
 
     part: tuple[PartReport, ...]
     errors: tuple[float, ...]
     uncertainty: tuple[float, ...]
+    between_vertices: float
     light_seconds: float
     view_seconds: float
     nbytes: int
@@ -73,6 +77,7 @@ class Report(NamedTuple):
             for each in self.part
         ]
         rows.append(f"pictures off by {_percent(self.errors)}, measured to {_percent(self.uncertainty)}")
+        rows.append(f"visibility between vertices off by {_percent([self.between_vertices])}")
         times = f"{1e3 * self.light_seconds:.1f} ms for a new light, {1e3 * self.view_seconds:.1f} ms for a new view"
         return "\n".join([*rows, f"in all: {self.nbytes / 1e6:.2f} MB, {times}"])
 
@@ -123,7 +128,8 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         seconds(lambda: scene.combine(arriving(), viewed)),
         seconds(lambda: scene.combine(arrived, view())),
     )
-    return Report(tuple(parts), tuple(pixels[0]), tuple(pixels[2]), new_light, new_view, scene.nbytes)
+    between = refinement.interpolation_error(scene.scene)
+    return Report(tuple(parts), tuple(pixels[0]), tuple(pixels[2]), between, new_light, new_view, scene.nbytes)
 
 
 def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.lamplight import LampLight
 from jaxprt.relit.shadows import TexelShares, TracedLight
-from jaxprt.relit.surface import Interpolated, Viewed, between, carried, from_texels, lit, view
+from jaxprt.relit.surface import Interpolated, Viewed, combine_interpolated, from_texels, lit, view, view_interpolated
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.material_table import Look
@@ -185,7 +185,7 @@ def _color(
     if row.interpolated:
         kept = row.kept if isinstance(row.kept, Interpolated) else None
         seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if kept is None else kept
-        color = carried(vertices[row.number], seen, lamp=None if seen.lamps is None else arriving.lamp)
+        color = combine_interpolated(vertices[row.number], seen, lamp=None if seen.lamps is None else arriving.lamp)
         return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
     if isinstance(row.kept, Viewed):
         return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
@@ -246,7 +246,7 @@ def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera, lamps: Lamp
     transport, eye = None if lamps is None else lamps.row(row.number, row.index, on_group), jnp.asarray(camera.eye)
     sharp = None if transport is None else stage.sharp_at(row.number, points)
     given = stage.given[row.number]
-    return between(stage.surfaces[row.number], on_group, look, eye, given=given, sharp=sharp, lamps=transport)
+    return view_interpolated(stage.surfaces[row.number], on_group, look, eye, given=given, sharp=sharp, lamps=transport)
 
 
 def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
@@ -419,14 +419,12 @@ def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
 def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]) -> Iterator[Row]:
     """The points in rows by group, number of samples, and whether radiance is interpolated."""
     for number, own in enumerate(stage.place.parts):
-        between = interpolated[number]
-        for index in canvas.rows_of(np.isin(owner, between), owner=owner):
-            yield Row(number, 1, True, index, None)
-        rest = [part for part in own if part not in between]
-        for samples in sorted({stage.samples[part] for part in rest}):
-            same = [part for part in rest if stage.samples[part] == samples]
-            for index in canvas.rows_of(np.isin(owner, same), owner=owner):
-                yield Row(number, samples, False, index, None)
+        for at_vertices in (True, False):
+            rest = [part for part in own if (part in interpolated[number]) == at_vertices]
+            for samples in sorted({stage.samples[part] for part in rest}):
+                same = [part for part in rest if stage.samples[part] == samples]
+                for index in canvas.rows_of(np.isin(owner, same), owner=owner):
+                    yield Row(number, samples, at_vertices, index, None)
 
 
 def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera: Camera) -> tuple[tuple[int, ...], ...]:

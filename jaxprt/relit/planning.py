@@ -181,10 +181,10 @@ def plan(
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     if path is not None:
         require.path("path", path)
-    environments = lights_of(scene) if environments is None else environments
+    named, environments = environments, lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
     size, key = checked(environments, asked, rate), key_of(centered(scene), environments)
-    options = {"vertices": None, "environments": None, "folder": None, "progress": progress}
+    options = {"vertices": None, "environments": named, "folder": None, "progress": progress}
     scene = centered(refinement.divided(sides.two_sided(scene), refine, **options)[0])
     mesh, views = scene.mesh, views_around(scene.mesh)
     total, plans = len(mesh.position), []

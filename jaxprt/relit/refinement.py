@@ -13,7 +13,7 @@ from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.files import objects
 from jaxprt.relit import shadows
-from jaxprt.scene import Environment, Scene, subdivision
+from jaxprt.scene import Camera, Environment, Mesh, Scene, subdivision
 from jaxprt.scene.subdivision import Division
 from jaxprt.visibility import blocks, refinement, shown
 from jaxprt.visibility.occluder import check
@@ -62,9 +62,9 @@ def refine(
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
-        error: Largest relative L2 error that linear interpolation between vertices may cause in the radiance of the
-            whole scene's surface, as if it were white and diffuse. 0 subdivides until the number of vertices is
-            reached.
+        error: Largest relative L2 error that linear interpolation between vertices may cause in pictures from the
+            scene's cameras, and from some around it and its parts, as if surfaces were white and diffuse. 0 subdivides
+            until the number of vertices is reached.
         vertices: Largest number of vertices after refinement. If this is too few for the error, the triangles with the
             largest errors are subdivided first, and a warning is given. A scene that already has more is returned
             unchanged.
@@ -134,7 +134,7 @@ def _stored(scene: Scene, folder: pathlib.Path | None, options: dict) -> MeshDiv
     if folder is None:
         return _made(scene, "", options)
     lights = [np.asarray(light.radiance) for light in options["environments"] or ()]
-    cameras = [np.concatenate([np.ravel(value) for value in (camera.eye, camera.target)]) for camera in scene.cameras]
+    cameras = [np.concatenate([np.ravel(value) for value in jax.tree.leaves(camera)]) for camera in scene.cameras]
     settings = np.asarray([options["error"], options["vertices"], refinement.ALGORITHM], np.float64)
     key = blocks.fingerprint(*(np.asarray(each) for each in (*_geometry(scene), settings, *cameras, *lights)))
     with filelock.FileLock(folder / ".division.lock"):
@@ -170,6 +170,15 @@ def _made(scene: Scene, key: str, options: dict) -> MeshDivision:
 
 def _divisions(scene: Scene, **options) -> tuple[list[Division], float]:
     mesh = scene.mesh
+    return refinement.divisions(mesh, mesh, views=_views(scene, mesh), **options)
+
+
+def interpolation_error(scene: Scene) -> float:
+    """Relative L2 error of pictures by visibility that is interpolated between vertices, as `refine` estimates it."""
+    mesh = scene.mesh
+    return refinement.interpolation_error(mesh, views=_views(scene, mesh))
+
+
+def _views(scene: Scene, mesh: Mesh) -> list[Camera]:
     check(mesh, "mesh of the scene")
-    views = shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
-    return refinement.divisions(mesh, mesh, views=views, **options)
+    return shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])

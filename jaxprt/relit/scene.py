@@ -39,6 +39,7 @@ from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, System
 
+_TEXELS = 64  # edge of the light's faces for which samples of traced texels are chosen, for systems of any size
 RAYS = 8  # reflection rays of each vertex or point of a sharp part
 
 
@@ -747,8 +748,7 @@ def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[fl
         system: The system of its group.
         lobes: The BRDF of the group as lobes; None if nothing is traced.
     """
-    samples = 1
-    if isinstance(system, BrightTexels):
-        # Powers of two, so that few programs are compiled for parts of different roughness.
-        samples = 1 << (samples_of(shading, system.visibility.size) - 1).bit_length()
+    size = system.visibility.size if isinstance(system, BrightTexels) else _TEXELS
+    # Powers of two, so that few programs are compiled for parts of different roughness.
+    samples = 1 << (samples_of(shading, size) - 1).bit_length()
     return interpolation.curvature(shading, system), samples, reflection.is_sharp(shading, lobes)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxprt.compile import known, put
+from jaxprt.compile import compile_time, known, put
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit.casting import caster
 from jaxprt.scene import Environment, Mesh, light_samples
@@ -33,7 +33,7 @@ _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
 _MORE = 16  # rays of a point beyond one for each texel, shared out by flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
-_KEPT = 4  # number of views whose traced texels are kept
+_KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
 
 _FINER: weakref.WeakKeyDictionary[Panorama, np.ndarray] = weakref.WeakKeyDictionary()
 
@@ -88,7 +88,8 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     """
     if not known(mesh, pixels, environment):
         return None
-    texel, excess, rest = bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)
+    with compile_time(environment):
+        texel, excess, rest = bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)
     size = environment.radiance.shape[-2]
     number = np.asarray(texel)
     flux = np.asarray(excess, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)).ravel()[number]
@@ -142,21 +143,26 @@ def _kept(
 ) -> UInt8[np.ndarray, "t p"]:
     """The shares of texels, of which only those are traced that were not traced before."""
     rows = _rows_of(pixels.triangle)
-    new = [
-        number
-        for number, (own, direction, count) in enumerate(zip(texel, rays.direction, rays.per_texel, strict=True))
-        if (row := rows.get(int(own))) is None or row[0] < _FEWER * count or not np.array_equal(row[1], direction)
-    ]
+    share = np.empty((len(texel), len(pixels.triangle)), np.uint8)
+    new = []
+    for number, (place, direction, count) in enumerate(zip(texel, rays.direction, rays.per_texel, strict=True)):
+        before = rows.get(int(place))
+        if before is None or before[0] < _FEWER * count or not np.array_equal(before[1], direction):
+            new.append(number)
+        else:
+            share[number] = before[2]
     if new:
-        traced = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.per_texel[new]))
-        for number, share in zip(new, traced, strict=True):
-            rows[int(texel[number])] = int(rays.per_texel[number]), rays.direction[number], share
-        for old in list(rows)[: max(len(rows) - 4 * TEXELS, 0)]:
-            del rows[old]
-    return np.stack([rows[int(own)][2] for own in texel])
+        share[new] = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.per_texel[new]))
+    with _LOCK:
+        for number in new:
+            rows[int(texel[number])] = int(rays.per_texel[number]), rays.direction[number], share[number]
+        for place in list(rows)[: max(len(rows) - _MOST, 0)]:
+            del rows[place]
+    return share
 
 
-def _rows_of(triangle: Any) -> dict:
+def _rows_of(triangle: Any) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
+    """The traced texels of a view, which its array of triangles identifies."""
     key = id(triangle)
     with _LOCK:
         alive, rows = _VIEWS.get(key, (lambda: None, None))

@@ -120,7 +120,7 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
 
 
 @kept
-def between(
+def view_interpolated(
     surface: Surface,
     points: Points,
     look: Look,
@@ -138,7 +138,7 @@ def between(
 
 
 @kept
-def carried(
+def combine_interpolated(
     vertices: Float[Array, "k v c"], points: Interpolated, *, lamp: Float[Array, "n 3"] | None = None
 ) -> Float[Array, "p c"]:
     """Colors of some points, interpolated from the radiance of each channel at the vertices.

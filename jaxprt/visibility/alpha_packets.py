@@ -8,7 +8,7 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, Integer, UInt8
+from jaxtyping import Bool, Float32, Int, Int32, Integer
 from numba import carray  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import types
 from numba.extending import intrinsic
@@ -94,15 +94,6 @@ class AlphaPackets:
         _empty_context(context, arguments, _PASSED)
         context[_FIELD] = passed.ctypes.data
         return self._occluded, self._scene, arguments, context, passed
-
-    def shares(
-        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
-    ) -> None:
-        """Traces the rays of some points of a picture to texels, as `packets.Packets.shares` does.
-
-        Of translucent surfaces, the share of light that passes counts.
-        """
-        packets.trace_shares(self.query, surface, points, texels, part.start, part.stop, share)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
         """The first triangle that stops each ray (-1 for none), its distance, and the barycentric coordinates.
@@ -339,15 +330,12 @@ def _empty_context(context, arguments, mode):
 
 @no_type_check
 @packets.compiled
-def _begin(ray, lane, slot, far):
-    """The fields of a ray besides its origin and direction."""
+def _no_hit(ray):
+    """Sets the fields of RTCRayHit16 that tell that nothing is hit."""
     number = ray.view(np.uint32)
-    ray[3, lane] = 0.0  # near
-    ray[7, lane] = 0.0  # time
-    ray[8, lane] = far
-    number[9, lane] = 0xFFFFFFFF  # mask
-    number[10, lane] = slot
-    number[11, lane] = 0  # flags
+    for row in range(17, 24):
+        for lane in range(16):
+            number[row, lane] = 0xFFFFFFFF
 
 
 @no_type_check
@@ -356,10 +344,7 @@ def _passed(address, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
     context[_FIELD] = share.ctypes.data
-    memory = np.empty(14 * 16 + 16, np.float32)
-    first = (-memory.ctypes.data // 4) % 16
-    ray = memory[first : first + 12 * 16].reshape(12, 16)
-    valid = memory[first + 12 * 16 : first + 13 * 16].view(np.int32)
+    ray, valid = packets.room(12)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -368,7 +353,7 @@ def _passed(address, scene, origin, direction, point, way, share):
             for axis in range(3):
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
-            _begin(ray, lane, at, 1e37)
+            packets.begin(ray, lane, at, 1e37)
         packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
             if ray[8, lane] < 0:
@@ -397,11 +382,8 @@ def _stopped(origin, direction, point, way, share):
 def _first(address, scene, origin, direction, face, part, distance, weight):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _FIRST)
-    memory = np.empty(26 * 16 + 16, np.float32)
-    first = (-memory.ctypes.data // 4) % 16
-    ray = memory[first : first + 24 * 16].reshape(24, 16)
+    ray, valid = packets.room(24)
     number = ray.view(np.uint32)
-    valid = memory[first + 24 * 16 : first + 25 * 16].view(np.int32)
     for packet in range(0, len(origin), 16):
         count = min(16, len(origin) - packet)
         for lane in range(16):
@@ -410,9 +392,8 @@ def _first(address, scene, origin, direction, face, part, distance, weight):
             for axis in range(3):
                 ray[axis, lane] = origin[at, axis]
                 ray[4 + axis, lane] = direction[at, axis]
-            _begin(ray, lane, at, 1e37)
-            for row in range(17, 24):
-                number[row, lane] = 0xFFFFFFFF
+            packets.begin(ray, lane, at, 1e37)
+        _no_hit(ray)
         packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
             at = packet + lane
@@ -431,11 +412,8 @@ def _collected(address, scene, origin, direction, far, hidden, count, place, fac
     context[_FIELD], context[_FIELD + 1] = count.ctypes.data, place.ctypes.data
     context[_FIELD + 2], context[_FIELD + 3] = face.ctypes.data, alpha.ctypes.data
     context[_FIELD + 4] = hidden.ctypes.data
-    memory = np.empty(26 * 16 + 16, np.float32)
-    first = (-memory.ctypes.data // 4) % 16
-    ray = memory[first : first + 24 * 16].reshape(24, 16)
+    ray, valid = packets.room(24)
     number = ray.view(np.uint32)
-    valid = memory[first + 24 * 16 : first + 25 * 16].view(np.int32)
     for packet in range(0, len(direction), 16):
         rays = min(16, len(direction) - packet)
         for lane in range(16):
@@ -444,9 +422,8 @@ def _collected(address, scene, origin, direction, far, hidden, count, place, fac
             for axis in range(3):
                 ray[axis, lane] = origin[axis]
                 ray[4 + axis, lane] = direction[at, axis]
-            _begin(ray, lane, at, far[at])
-            for row in range(17, 24):
-                number[row, lane] = 0xFFFFFFFF
+            packets.begin(ray, lane, at, far[at])
+        _no_hit(ray)
         packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
         for lane in range(rays):
             at = packet + lane

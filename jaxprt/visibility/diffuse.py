@@ -35,7 +35,7 @@ class DiffuseTracer:
     double: Bool[np.ndarray, " f"]
 
     def __init__(self, mesh: Mesh, occluder: Mesh, samples: LightSamples, pool: ThreadPoolExecutor):
-        self._samples, self._pool, self._given = samples, pool, (mesh, occluder)
+        self._samples, self._pool = samples, pool
         # NumPy arrays, so that new shapes do not cause compilation.
         mesh, occluder = jax.tree.map(np.asarray, (mesh, occluder))
         self._mesh, self._rays = mesh, Occluder(occluder)
@@ -56,10 +56,6 @@ class DiffuseTracer:
         start = start_points(self._mesh, self._rays)
         result[vertex] = self._light(start[vertex], np.asarray(self._mesh.normal, np.float64)[vertex])
         return result
-
-    def occluder(self, mesh: Mesh) -> Occluder:
-        """The triangles of a mesh for rays: those that cast shadows, if they are the same."""
-        return self._rays if mesh is self._given[0] and self._given[1] is mesh else Occluder(mesh)
 
     def at(
         self,

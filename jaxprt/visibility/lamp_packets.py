@@ -9,6 +9,7 @@ from typing import no_type_check
 
 import numpy as np
 
+from jaxprt.visibility import packets
 from jaxprt.visibility.packets import call, compiled, start, whole_ray
 
 _CLOSE = 6.0  # smallest distance to a place, in radii of a disk of its area
@@ -187,10 +188,7 @@ def trace(query, surface, points, fields, lamps, first, last, result):
         result: The integrals of 1, of the cosine, and of the direction.
     """
     pieces, most = lamps[4], lamps[4].max()
-    aligned = np.empty(13 * 16 + 16, np.float32)
-    begin = (-aligned.ctypes.data // 4) % 16
-    ray = aligned[begin : begin + 12 * 16].reshape(12, 16)
-    valid = aligned[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
+    ray, valid = packets.room(12)
     memory = ray, valid, np.zeros(16, np.float32), np.zeros((6, 16), np.float32)
     origin, pattern = np.zeros((4, 3, 16), np.float32), np.zeros(16, np.int64)
     center, normal = np.zeros((3, 16), np.float32), np.zeros((3, 16), np.float32)

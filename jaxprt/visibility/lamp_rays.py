@@ -70,12 +70,19 @@ def moments(
         normal: Their shading normals.
         lamps: Places on the lamps.
     """
+    from jaxprt.visibility import lamp_packets  # numba takes half a second to import
+
     surface = occluder.position, np.asarray(mesh.normal, np.float32), occluder.face, occluder.offset
     drawn = *texel_rays.fields(points), texel_rays.pattern(points)
     fields = tuple(np.ascontiguousarray(each, np.float32) for each in (position, normal))
     size = int(lamps.pieces.sum()), len(position)
     result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
     parts = [slice(i, min(i + _PART, len(position))) for i in range(0, len(position), _PART)]
+    packed = occluder.from_pixels()
+
+    def trace(part: slice) -> None:
+        lamp_packets.trace(packed.query, surface, drawn, fields, tuple(lamps), part.start, part.stop, result)
+
     with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(lambda part: occluder.lit(surface, drawn, fields, tuple(lamps), part, result), parts))
+        list(pool.map(trace, parts))
     return result

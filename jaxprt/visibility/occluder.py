@@ -2,11 +2,12 @@
 
 import threading
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float32, Integer, UInt8
+from jaxtyping import Bool, Float32, Integer
 
 from jaxprt.scene.mesh import Mesh
 
@@ -187,10 +188,8 @@ class Occluder:
             partial = self._partial
         return partial.passed(origin, direction, point, way)
 
-    def shares(
-        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
-    ) -> None:
-        """Visible shares of texels at some points of a picture; `texel_rays.shares` calls it.
+    def from_pixels(self) -> Any:
+        """The Embree scene for rays from the points of pictures.
 
         Raises:
             RuntimeError: The Embree library that embreex ships has no packets of rays.
@@ -199,29 +198,7 @@ class Occluder:
             packed = self._packed if self.opacity is None else self._partial
         if packed is None:
             raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
-        packed.shares(surface, points, texels, part, share)
-
-    def lit(
-        self,
-        surface: tuple,
-        points: tuple,
-        fields: tuple,
-        lamps: tuple,
-        part: slice,
-        result: tuple,
-    ) -> None:
-        """What some points of a picture see of lamps; `lamp_rays.moments` calls it.
-
-        Raises:
-            RuntimeError: The Embree library that embreex ships has no packets of rays.
-        """
-        from jaxprt.visibility import lamp_packets  # numba takes half a second to import
-
-        with self._building:
-            packed = self._packed if self.opacity is None else self._partial
-        if packed is None:
-            raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
-        lamp_packets.trace(packed.query, surface, points, fields, lamps, part.start, part.stop, result)
+        return packed
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, no_type_check
 import llvmlite.ir
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Integer, UInt8
+from jaxtyping import Bool, Float32, Integer
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -93,20 +93,6 @@ class Packets:
         found = np.empty(len(point), np.bool_)
         _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
         return found
-
-    def shares(
-        self, surface: tuple, points: tuple, texels: tuple, part: slice, share: UInt8[np.ndarray, "t p"]
-    ) -> None:
-        """Traces the rays of some points of a picture to texels; `jaxprt.visibility.texel_rays` explains the arguments.
-
-        Args:
-            surface: Positions and normals of vertices, triangles, and the distance from each at which rays start.
-            points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
-            texels: Directions of the places in each texel, of its middle, number of rays, and first place.
-            part: The points to trace.
-            share: The result, in 255ths.
-        """
-        trace_shares(self.query, surface, points, texels, part.start, part.stop, share)
 
 
 class Embree(NamedTuple):
@@ -253,12 +239,21 @@ def compiled(function: Callable, **options: Any) -> Callable:
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
 @compiled
-def _blocked(address, scene, arguments, origin, direction, point, way, found):
-    # RTCRay16: twelve rows of sixteen values, aligned to 64 bytes.
-    memory = np.empty(13 * 16 + 16, np.float32)
+def room(rows):
+    """Memory of a packet, aligned to 64 bytes: rows of sixteen values, and which rays are valid.
+
+    RTCRay16 has 12 rows, RTCRayHit16 24.
+    """
+    memory = np.empty((rows + 1) * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
-    ray = memory[first : first + 12 * 16].reshape(12, 16)
-    valid = memory[first + 12 * 16 : first + 13 * 16].view(np.int32)
+    last = first + rows * 16
+    return memory[first:last].reshape(rows, 16), memory[last : last + 16].view(np.int32)
+
+
+@no_type_check
+@compiled
+def _blocked(address, scene, arguments, origin, direction, point, way, found):
+    ray, valid = room(12)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -325,15 +320,22 @@ def _between(position, first, last):
 @no_type_check
 @compiled
 def trace_shares(query, surface, points, texels, first, last, share):
-    """Visible shares of texels at points of a picture: see `Packets.shares` and `Packets.query`."""
+    """Visible shares of texels at points of a picture; `jaxprt.visibility.texel_rays.shares` explains the method.
+
+    Args:
+        query: What packets of rays need; see `Packets.query`.
+        surface: Positions and normals of vertices, triangles, and the distance from each at which rays start.
+        points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
+        texels: Directions of the places in each texel, of its middle, number of rays, and first place.
+        first: Index of the first point.
+        last: Index after the last point.
+        share: The result, in 255ths [t, p].
+    """
     address, scene, arguments, _, passed = query
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
-    memory = np.empty(13 * 16 + 16, np.float32)
-    begin = (-memory.ctypes.data // 4) % 16
-    ray = memory[begin : begin + 12 * 16].reshape(12, 16)
-    valid = memory[begin + 12 * 16 : begin + 13 * 16].view(np.int32)
+    ray, valid = room(12)
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
     above, visible = np.empty(16, np.bool_), np.empty(16)
     for packet in range(first, last, 16):
@@ -367,13 +369,27 @@ def trace_shares(query, surface, points, texels, first, last, share):
 
 @no_type_check
 @compiled
-def whole_ray(ray):
-    """Fills in the fields of sixteen rays that are always the same."""
+def begin(ray, lane, slot, far):
+    """Sets the fields of a ray besides its origin and direction.
+
+    Args:
+        ray: The packet.
+        lane: Index of the ray in the packet.
+        slot: Number of the ray, for filter functions.
+        far: Where the ray ends; Embree sets it to minus infinity after a hit.
+    """
     number = ray.view(np.uint32)
+    ray[3, lane] = 0.0  # near
+    ray[7, lane] = 0.0  # time
+    ray[8, lane] = far
+    number[9, lane] = 0xFFFFFFFF  # mask
+    number[10, lane] = slot
+    number[11, lane] = 0  # flags
+
+
+@no_type_check
+@compiled
+def whole_ray(ray):
+    """Sets these fields of sixteen rays without an end, which are numbered by their place in the packet."""
     for lane in range(16):
-        ray[3, lane] = 0.0  # near
-        ray[7, lane] = 0.0  # time
-        ray[8, lane] = 1e37  # far; minus infinity after a hit
-        number[9, lane] = 0xFFFFFFFF  # mask
-        number[10, lane] = lane
-        number[11, lane] = 0  # flags
+        begin(ray, lane, lane, 1e37)

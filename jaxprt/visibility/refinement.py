@@ -26,7 +26,7 @@ from jaxprt.scene.subdivision import Division, Edges
 from jaxprt.visibility import blocks, shown
 from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.diffuse import DiffuseTracer
-from jaxprt.visibility.occluder import check
+from jaxprt.visibility.occluder import Occluder, check
 
 ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
 
@@ -63,9 +63,10 @@ def refine(
     Args:
         mesh: The mesh.
         error: Largest allowed relative L2 error of interpolation, for the radiance of a white diffuse surface: the
-            root mean squared error over the surface's area, divided by the root mean squared radiance. It is estimated
-            from the points where rays are traced. Glossy surfaces need finer meshes. With 0 the mesh is subdivided
-            until it has the largest allowed number of vertices.
+            root mean squared error over pictures of the mesh from three sides, divided by the root mean squared
+            radiance. A fifth of the square is that of the whole surface's area, for other views. It is estimated from
+            the points where rays are traced. Glossy surfaces need finer meshes. With 0 the mesh is subdivided until it
+            has the largest allowed number of vertices.
         vertices: Largest allowed number of vertices. If this is too few to reach `error`, the largest errors are
             removed first, and a warning states the remaining error. A mesh that already has more is not subdivided.
         environments: Lights under which the error must hold. If None, an average over lights with a natural spectrum
@@ -127,8 +128,7 @@ def divisions(
         ThreadPoolExecutor(blocks.cores()) as pool,
         tqdm.tqdm(desc="refine", unit="vertex", unit_scale=True, disable=not progress) as bar,
     ):
-        tracer = DiffuseTracer(mesh, occluder, samples, pool)
-        surface = _Surface(mesh, tracer, points, shown.places(mesh, tracer.occluder(mesh), views))
+        surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points, _seen(mesh, views))
         while True:
             count, squares = len(surface.position), surface.squares()
             left = float(squares.sum(0).max()) ** 0.5
@@ -149,6 +149,23 @@ def divisions(
             stacklevel=3,
         )
     return result, left
+
+
+def interpolation_error(mesh: Mesh, *, views: Sequence[Camera]) -> float:
+    """Relative L2 error of pictures that interpolation of visibility between vertices causes, as `refine` defines it.
+
+    Args:
+        mesh: The mesh, which casts the shadows.
+        views: Cameras of the pictures.
+    """
+    samples, points = light_samples.natural(size=_SIZE, degree=_DEGREE), round(_HIDDEN * _FINEST**-2)
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(blocks.cores()) as pool:
+        surface = _Surface(mesh, DiffuseTracer(mesh, mesh, samples, pool), points, _seen(mesh, views))
+        return float(surface.squares().sum(0).max()) ** 0.5
+
+
+def _seen(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Points, Float[np.ndarray, " p"]]:
+    return shown.places(mesh, Occluder(mesh), views)
 
 
 class _Surface:

@@ -12,13 +12,13 @@ from jaxprt.visibility.hits import first_fronts
 from jaxprt.visibility.occluder import Occluder
 
 EDGE = 64  # rays along an edge of a picture
-_MOST = 16  # cameras at most
+_MOST = 16  # largest number of cameras
 _TURNS = ((0.5, 0.3), (2.6, 0.6), (4.7, 0.15))  # azimuth and elevation of the cameras around the scene
 _CLOSER = ((0.9, 0.4), (3.6, 0.25))  # and around parts
 
 
 def cameras(mesh: Mesh, given: Sequence[Camera], parts: Sequence[Mesh]) -> list[Camera]:
-    """Cameras from which a scene is likely to be seen: its own, some around it, and some around its largest parts.
+    """Cameras from which a scene is likely to be seen: its own, some around it, and some around its parts.
 
     Args:
         mesh: The mesh of all parts.
@@ -28,15 +28,12 @@ def cameras(mesh: Mesh, given: Sequence[Camera], parts: Sequence[Mesh]) -> list[
     size = {"width": EDGE, "height": EDGE}
     around = [orbit(mesh, azimuth=azimuth, elevation=elevation, **size) for azimuth, elevation in _TURNS]
     chosen = [*given[: _MOST // 2], *around]
+    # Parts with many triangles are what scenes are about.
     solid = [part for part in parts if len(part.face)] if len(parts) > 1 else []
-    for part in sorted(solid, key=_extent)[: (_MOST - len(chosen)) // len(_CLOSER)]:
+    order = sorted(solid, key=lambda part: -len(part.face))
+    for part in order[: (_MOST - len(chosen)) // len(_CLOSER)]:
         chosen += [orbit(part, azimuth=azimuth, elevation=elevation, **size) for azimuth, elevation in _CLOSER]
     return chosen
-
-
-def _extent(mesh: Mesh) -> float:
-    """Minus the number of triangles: parts with many are what scenes are about."""
-    return -float(len(mesh.face))
 
 
 def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[Points, Float[np.ndarray, " p"]]:

@@ -66,6 +66,8 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
         points: The points.
         rays: Rays to the texels.
     """
+    from jaxprt.visibility import packets  # numba takes half a second to import
+
     position = np.asarray(mesh.position, np.float32)
     face = np.ascontiguousarray(mesh.face, np.int32)
     surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
@@ -76,8 +78,13 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
     texels = rays.direction, middle, np.asarray(rays.per_texel, np.int64), first
     share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
     parts = [slice(i, min(i + _PART, share.shape[1])) for i in range(0, share.shape[1], _PART)]
+    packed = occluder.from_pixels()
+
+    def trace(part: slice) -> None:
+        packets.trace_shares(packed.query, surface, drawn, texels, part.start, part.stop, share)
+
     with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(lambda part: occluder.shares(surface, drawn, texels, part, share), parts))
+        list(pool.map(trace, parts))
     return share
 
 
